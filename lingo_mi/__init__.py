@@ -1,0 +1,10 @@
+"""Sparse-view X-ray CT with 3D Gaussians: exact line integrals in Mitsuba 3 / Dr.Jit.
+
+`import lingo_mi` and `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba. The geometry, image,
+metric, file and phantom modules load without Mitsuba.
+"""
+from .runtime import find_libllvm
+
+find_libllvm()  # before anything loads Dr.Jit
+
+__version__ = '0.1.0'
