@@ -1,11 +1,6 @@
 """The balanced splat: footprints to an image and back, with work shared out by pixel count.
 
-A *team* is eight lanes working on one Gaussian at a time, each lane on one detector row, four pixels (a *packet*) at a
-step. Teams are few, their number is fixed, and a prefix sum over the Gaussians' costs gives each the same share, so that one
-scene-sized Gaussian is shared by all and a launch never changes its size or its kernel.
-
-On the CPU every team owns a copy of the image and adds to it without atomics (which would take most of the time); the
-copies are summed at the end. On the GPU there are many teams, one image and atomic additions.
+Every lane works on one detector row of a Gaussian, four pixels (a packet) at a step; `balance` shares the rows out.
 
 Backward is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers. Nothing is
 stored between forward and backward but the footprints.
@@ -20,11 +15,10 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from .balance import LANES, PACKET, Work, block_range, deposit, first_item, load, pack, position, span
 from .footprint import NAMES, Footprints
 
-LANES = 8    # rows that a team works on side by side
-PACKET = 4   # pixels in a step of a lane
-SETUP = 6    # cost of a team's visit to eight rows, in packets
+SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 LOG2E = 1.4426950408889634
 
@@ -55,58 +49,31 @@ class _Splat(dr.CustomOp):
 
 
 class _Plan:
-    """The work of one image: packed footprints and the prefix sum of their costs."""
+    """The work of one image: packed footprints, shared out by their pixels."""
 
     def __init__(self, values, rest, height, width, extent):
         self.count, self.height, self.width = dr.width(values[0]), height, width
         self.packets = -(-width // PACKET)
-        self.extent = dr.opaque(mi.Float, extent)
-        self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        self.teams = 4 * dr.thread_count() if self.on_cpu else 4096
-        blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
-        block_cost = mi.UInt32(rest.width) // PACKET + SETUP
-        ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
-        self.packed = _pack(mi.Vector4f, mi.Float, (*values, mi.Float(0)))
-        self.whole = _pack(mi.Vector4i, mi.Int32, (rest.column, rest.row, rest.row_begin, rest.row_end))
-        self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
-        dr.eval(self.packed, self.whole, blocks, block_cost, ends)
-
-    def _work(self):
-        """Every lane's share: the arguments that all three kernels have in common."""
-        total = dr.gather(mi.UInt64, self.ends, self.count - 1)
-        lane = dr.arange(mi.UInt32, self.teams * LANES)
-        share = total // self.teams + 1
-        begin = mi.UInt64(lane // LANES) * share
-        return dict(lane=lane, begin=begin, end=dr.minimum(begin + share, total), packed=self.packed, whole=self.whole,
-                    blocks=self.blocks, block_cost=self.block_cost, ends=self.ends,
-                    count=dr.opaque(mi.UInt32, self.count), extent2=dr.square(self.extent),
-                    packets=dr.opaque(mi.Int32, self.packets))
+        self.work = Work(mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES,
+                         mi.UInt32(rest.width) // PACKET + SETUP)
+        self.packed = pack(mi.Vector4f, mi.Float, (*values, mi.Float(0)))
+        self.whole = pack(mi.Vector4i, mi.Int32, (rest.column, rest.row, rest.row_begin, rest.row_end))
+        dr.eval(self.packed, self.whole)
+        self.arguments = dict(packed=self.packed, whole=self.whole, extent2=dr.opaque(mi.Float, extent * extent),
+                              packets=dr.opaque(mi.Int32, self.packets))
 
     def image(self):
-        return self._add_up(_forward, {})
+        return self._crop(self.work.add_up(_forward, self.packets * self.height, **self.arguments))
 
     def tangent(self, tangents):
-        moved = _pack(mi.Vector4f, mi.Float, (*tangents, mi.Float(0)))
+        moved = pack(mi.Vector4f, mi.Float, (*tangents, mi.Float(0)))
         dr.eval(moved)
-        return self._add_up(_tangent, dict(moved=moved))
+        return self._crop(self.work.add_up(_tangent, self.packets * self.height, **self.arguments, moved=moved))
 
-    def _add_up(self, kernel, more):
-        """Run a kernel that adds to images, sum the teams' copies and drop the padding."""
-        stride = self.packets * self.height
-        copies = self.teams if self.on_cpu else 1
-        target = dr.zeros(mi.Float, copies * stride * PACKET)
-        dr.make_opaque(target)
-        work = self._work()
-        base = work['lane'] // LANES * dr.opaque(mi.UInt32, stride) if self.on_cpu else mi.UInt32(0)
-        dr.eval(kernel(**work, **more, target=target, base=mi.Int32(base), private=self.on_cpu), target)
-        i = dr.arange(mi.UInt32, self.height * self.width)
-        width = dr.opaque(mi.UInt32, self.width)
-        at = i // width * dr.opaque(mi.UInt32, self.packets * PACKET) + i % width
-        stride = dr.opaque(mi.UInt32, stride * PACKET)
-        result = dr.zeros(mi.Float, self.height * self.width)
-        for copy in range(copies):
-            result += dr.gather(mi.Float, target, at + copy * stride)
-        return result
+    def _crop(self, padded):
+        """Drop the padding of rows to whole packets."""
+        i, width = dr.arange(mi.UInt32, self.height * self.width), dr.opaque(mi.UInt32, self.width)
+        return dr.gather(mi.Float, padded, i // width * dr.opaque(mi.UInt32, self.packets * PACKET) + i % width)
 
     def gradient(self, grad_image):
         """Derivatives of the footprints' numbers, a tuple of Float [N], from that of the image."""
@@ -116,55 +83,16 @@ class _Plan:
         upstream = dr.gather(mi.Float, grad_image, row * width + column, column < width)
         out = [dr.zeros(mi.Float, self.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
-        dr.eval(_backward(**self._work(), upstream=upstream, out=out), out)
+        dr.eval(_backward(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
         return tuple(out)
-
-
-def _pack(Packet, Element, columns):
-    """Interleave columns [N] into rows of whole packets, which a lane fetches with few loads."""
-    count, packets = dr.width(columns[0]), len(columns) // PACKET
-    target = dr.empty(Element, count * packets * PACKET)
-    i = dr.arange(mi.UInt32, count)
-    for j in range(packets):
-        dr.scatter(target, Packet(*columns[PACKET * j:PACKET * (j + 1)]), i * packets + j, mode=dr.ReduceMode.Permute)
-    return target
-
-
-@dr.syntax
-def _first(begin, end, ends, count):
-    """The Gaussian in which a team's share begins, and where that Gaussian's own work begins."""
-    g = mi.UInt32(0)
-    size = dr.select(begin < end, count, 0)
-    while size > 0:
-        middle = g + size // 2
-        if dr.gather(mi.UInt64, ends, middle) <= begin:
-            g = middle + 1
-            size -= size // 2 + 1
-        else:
-            size //= 2
-    return g, dr.gather(mi.UInt64, ends, g - 1, (g > 0) & (begin < end))
-
-
-def _blocks(g, start, begin, end, blocks, block_cost):
-    """The blocks of eight rows of Gaussian g that begin within a team's share."""
-    cost = mi.UInt64(dr.gather(mi.UInt32, block_cost, g))
-    cost = dr.maximum(cost, 1)  # a masked lane reads 0, and an integer division by it would kill the process
-    first = dr.select(begin > start, (dr.maximum(begin, start) - start + cost - 1) // cost, 0)
-    last = (dr.maximum(end, start) - start + cost - 1) // cost
-    return mi.UInt32(first), mi.UInt32(dr.minimum(mi.UInt64(dr.gather(mi.UInt32, blocks, g)), last))
-
-
-def _load(g, packed):
-    """The eleven numbers of Gaussian g, in the order of footprint.NAMES."""
-    return [x for j in range(3) for x in dr.gather(mi.Vector4f, packed, g * 3 + j)][:len(NAMES)]
 
 
 def _row(c, whole, y, extent2, packets):
     """Constants of row y of a footprint and its packets [begin, end).
 
-    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), the t of pixel centre 0, begin and end.
+    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0, begin and end.
     """
-    _, mx, my, shear, e1, e2, e11, e12, e22, fx, fy = c
+    _, mx, my, shear, e1, e2, e11, e12, e22, fx, fy, _ = c
     dy = mi.Float(y - whole.y) + (.5 - fy)
     m = dr.square(my * dy)
     d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
@@ -173,19 +101,8 @@ def _row(c, whole, y, extent2, packets):
     a, b, c0 = dr.square(mx) - extent2 * e11, .5 * extent2 * d1, extent2 * d0 - m
     root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
     offset = (fx - .5) - shear * dy
-    far = 1e8
-    low = mi.Int32(dr.clip(dr.ceil((b - root) / a + offset), -far, far)) + whole.x
-    high = mi.Int32(dr.clip(dr.floor((b + root) / a + offset), -far, far)) + whole.x
-    empty = (y >= whole.w) | (high < low) | (high < 0)
-    begin = dr.maximum(low, 0) // PACKET
-    end = dr.select(empty, begin, dr.minimum(high // PACKET + 1, packets))
+    begin, end = span((b - root) / a, (b + root) / a, offset, whole.x, y >= whole.w, packets)
     return dy, m, d0, d1, offset, begin, end
-
-
-def _position(packet, whole, offset):
-    """t of the four pixels of a packet."""
-    t = mi.Float(packet * PACKET - whole.x) - offset
-    return mi.Vector4f(t, t + 1, t + 2, t + 3)
 
 
 def _shape(t, mx, m, d0, d1, e11):
@@ -200,23 +117,20 @@ def _shape(t, mx, m, d0, d1, e11):
 
 @dr.syntax
 def _forward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, target, base, private):
-    g, start = _first(begin, end, ends, count)
+    g, start = first_item(begin, end, ends, count)
     while (g < count) & (start < end):
-        block, stop = _blocks(g, start, begin, end, blocks, block_cost)
-        c = _load(g, packed)
+        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+        c = load(packed, g)
         w = dr.gather(mi.Vector4i, whole, g)
         while block < stop:
             y = w.z + mi.Int32(block * LANES + lane % LANES)
             dy, m, d0, d1, offset, packet, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
             while packet < last:
-                t = _position(packet, w, offset)
+                t = position(packet, w.x, offset)
                 _, _, shape = _shape(t, c[1], m, d0, d1, c[6])
                 value = c[0] * shape
-                if dr.hint(private, mode='scalar'):
-                    dr.scatter(target, dr.gather(mi.Vector4f, target, line + packet) + value, line + packet)
-                else:
-                    dr.scatter_add(target, value, line + packet)
+                deposit(target, value, line + packet, private)
                 packet += 1
             block += 1
         start = dr.gather(mi.UInt64, ends, g)
@@ -226,10 +140,10 @@ def _forward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, e
 
 @dr.syntax
 def _backward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, upstream, out):
-    g, start = _first(begin, end, ends, count)
+    g, start = first_item(begin, end, ends, count)
     while (g < count) & (start < end):
-        block, stop = _blocks(g, start, begin, end, blocks, block_cost)
-        c = _load(g, packed)
+        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+        c = load(packed, g)
         w = dr.gather(mi.Vector4i, whole, g)
         sums = [mi.Float(0) for _ in NAMES]
         while block < stop:
@@ -239,7 +153,7 @@ def _backward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, 
             s, n0, n1, n2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
             h0, h1, h2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
             while packet < last:
-                t = _position(packet, w, offset)
+                t = position(packet, w.x, offset)
                 inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 h, but for the amplitude
                 value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
@@ -261,7 +175,7 @@ def _backward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, 
 
 def _chain(sums, c, dy, s, n0, n1, n2, h0, h1, h2):
     """Add a row's part to the eleven sums, from its moments in t."""
-    amplitude, mx, my, shear, e1, e2, e11, e12, e22, _, _ = c
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     half = -.5 * amplitude
     n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
     # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy.
@@ -276,23 +190,20 @@ def _chain(sums, c, dy, s, n0, n1, n2, h0, h1, h2):
 @dr.syntax
 def _tangent(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, moved, target, base,
              private):
-    g, start = _first(begin, end, ends, count)
+    g, start = first_item(begin, end, ends, count)
     while (g < count) & (start < end):
-        block, stop = _blocks(g, start, begin, end, blocks, block_cost)
-        c, dc = _load(g, packed), _load(g, moved)
+        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+        c, dc = load(packed, g), load(moved, g)
         w = dr.gather(mi.Vector4i, whole, g)
         while block < stop:
             y = w.z + mi.Int32(block * LANES + lane % LANES)
             dy, m, d0, d1, offset, packet, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
             while packet < last:
-                t = _position(packet, w, offset)
+                t = position(packet, w.x, offset)
                 inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
                 value = shape * _tangent_factor(c, dc, t, dy, d1, inverse, ratio)
-                if dr.hint(private, mode='scalar'):
-                    dr.scatter(target, dr.gather(mi.Vector4f, target, line + packet) + value, line + packet)
-                else:
-                    dr.scatter_add(target, value, line + packet)
+                deposit(target, value, line + packet, private)
                 packet += 1
             block += 1
         start = dr.gather(mi.UInt64, ends, g)
@@ -302,8 +213,8 @@ def _tangent(lane, begin, end, packed, whole, blocks, block_cost, ends, count, e
 
 def _tangent_factor(c, dc, t, dy, d1, inverse, ratio):
     """The footprint's directional derivative over its shape."""
-    amplitude, mx, my, shear, e1, e2, e11, e12, e22, _, _ = c
-    d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_x, d_y = dc
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
+    d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_x, d_y, _ = dc
     t_dot = dy * d_shear - d_x - shear * d_y
     num_dot = 2 * mx * t * (d_mx * t + mx * t_dot) + 2 * my * dy * (d_my * dy - my * d_y)
     den_dot = (t * (d_e1 + d_e11 * t) + dy * (d_e2 + 2 * d_e12 * t + d_e22 * dy)

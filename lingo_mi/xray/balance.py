@@ -1,0 +1,121 @@
+"""Sharing out uneven work: a fixed number of teams, each with the same share of the total cost.
+
+An *item* (a Gaussian, a triangle) is some *blocks* of LANES rows, each at the item's own cost; the ends of the items' costs
+are a prefix sum. A *team* is LANES lanes that walk one item at a time, a lane a row. Every team takes the blocks that begin
+within its share, so that one enormous item is shared by all, an empty one costs nothing, and neither the launch nor its
+kernel ever changes.
+
+On the CPU, teams add to images of their own without atomics (which would take most of the time), and the copies are summed
+at the end, unless they were too large. On the GPU there are many teams, one image and atomic additions.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+LANES = 8    # rows that a team works on side by side
+PACKET = 4   # consecutive elements that a lane reads and writes at a time
+MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
+
+
+class Work:
+    """Items shared out among teams. blocks, block_cost: UInt32 [N], costs at least 1."""
+
+    def __init__(self, blocks, block_cost):
+        self.count = dr.width(blocks)
+        self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        self.teams = 4 * dr.thread_count() if self.on_cpu else 4096
+        self.blocks, self.block_cost = blocks, block_cost
+        self.ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
+        dr.eval(self.blocks, self.block_cost, self.ends)
+
+    def shares(self) -> dict:
+        """The arguments of a kernel that walks the items: see `first_item` and `block_range`."""
+        total = dr.gather(mi.UInt64, self.ends, self.count - 1)
+        lane = dr.arange(mi.UInt32, self.teams * LANES)
+        share = total // self.teams + 1
+        begin = mi.UInt64(lane // LANES) * share
+        return dict(lane=lane, begin=begin, end=dr.minimum(begin + share, total), blocks=self.blocks,
+                    block_cost=self.block_cost, ends=self.ends, count=dr.opaque(mi.UInt32, self.count))
+
+    def add_up(self, kernel, size: int, **arguments):
+        """Run a kernel that adds to an array of `size` packets; returns the sum, Float [size * PACKET].
+
+        The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
+        """
+        private = self.on_cpu and self.teams * size <= MOST_COPIED
+        copies = self.teams if private else 1
+        target = dr.zeros(mi.Float, copies * size * PACKET)
+        dr.make_opaque(target)
+        shares, stride = self.shares(), dr.opaque(mi.UInt32, size)
+        base = mi.Int32(shares['lane'] // LANES * stride if private else mi.UInt32(0))
+        dr.eval(kernel(**shares, **arguments, target=target, base=base, private=private), target)
+        i = dr.arange(mi.UInt32, size * PACKET)
+        result = dr.zeros(mi.Float, size * PACKET)
+        for copy in range(copies):
+            result += dr.gather(mi.Float, target, i + copy * PACKET * stride)
+        return result
+
+
+@dr.syntax
+def first_item(begin, end, ends, count):
+    """The item in which a team's share begins, and where that item's own work begins."""
+    g = mi.UInt32(0)
+    size = dr.select(begin < end, count, 0)
+    while size > 0:
+        middle = g + size // 2
+        if dr.gather(mi.UInt64, ends, middle) <= begin:
+            g = middle + 1
+            size -= size // 2 + 1
+        else:
+            size //= 2
+    return g, dr.gather(mi.UInt64, ends, g - 1, (g > 0) & (begin < end))
+
+
+def block_range(g, start, begin, end, blocks, block_cost):
+    """The blocks of eight rows of item g that begin within a team's share."""
+    cost = mi.UInt64(dr.gather(mi.UInt32, block_cost, g))
+    cost = dr.maximum(cost, 1)  # a masked lane reads 0, and an integer division by it would kill the process
+    first = dr.select(begin > start, (dr.maximum(begin, start) - start + cost - 1) // cost, 0)
+    last = (dr.maximum(end, start) - start + cost - 1) // cost
+    return mi.UInt32(first), mi.UInt32(dr.minimum(mi.UInt64(dr.gather(mi.UInt32, blocks, g)), last))
+
+
+def pack(Packet, Element, columns):
+    """Interleave columns [N] into rows of whole packets, which a lane fetches with few loads."""
+    count, packets = dr.width(columns[0]), len(columns) // PACKET
+    target = dr.empty(Element, count * packets * PACKET)
+    i = dr.arange(mi.UInt32, count)
+    for j in range(packets):
+        dr.scatter(target, Packet(*columns[PACKET * j:PACKET * (j + 1)]), i * packets + j, mode=dr.ReduceMode.Permute)
+    return target
+
+
+def load(packed, index):
+    """Row `index` of twelve numbers from an array made by `pack`."""
+    return [x for j in range(3) for x in dr.gather(mi.Vector4f, packed, index * 3 + j)]
+
+
+def span(low, high, offset, column, empty, packets):
+    """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
+    far = 1e8  # keeps what lies far outside within Int32
+    first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
+    last = mi.Int32(dr.clip(dr.floor(high + offset), -far, far)) + column
+    begin = dr.maximum(first, 0) // PACKET
+    empty |= (last < first) | (last < 0)
+    return begin, dr.select(empty, begin, dr.minimum(last // PACKET + 1, packets))
+
+
+def position(packet, column, offset):
+    """t of the elements of a packet."""
+    t = mi.Float(packet * PACKET - column) - offset
+    return mi.Vector4f(t, t + 1, t + 2, t + 3)
+
+
+@dr.syntax
+def deposit(target, value, index, private):
+    """Add a packet to a target, without atomics where the target is the team's own."""
+    if dr.hint(private, mode='scalar'):
+        dr.scatter(target, dr.gather(mi.Vector4f, target, index) + value, index)
+    else:
+        dr.scatter_add(target, value, index)
