@@ -1,0 +1,117 @@
+"""Live progress of long loops, on standard error.
+
+On a terminal: a bar with the time gone and left. Elsewhere (a file, a pipe, a batch system): one plain line
+about every 10 % or 10 seconds, without control characters.
+"""
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator
+
+LABELS = {'psnr': 'PSNR {:.2f} dB', 'psnr_2d': 'PSNR {:.2f} dB', 'psnr_3d': '3D {:.2f} dB',
+          'gaussians': '{:,} Gaussians'}
+REDRAW = 0.25   # seconds between two redraws on a terminal
+LINE = 10.      # seconds between two plain lines, where 10 % takes longer
+
+
+class Progress:
+    """Progress through `total` steps.
+
+        with Progress('Fit', 30_000) as progress:
+            for i in range(30_000):
+                ...
+                progress.update(i + 1, loss=lambda: float(loss), gaussians=n)
+
+    `update` may be called at every step: it returns at once unless there is something to draw.
+    """
+
+    def __init__(self, description: str, total: int, start: int = 0):
+        """total: steps in all; start: steps done before the loop begins (a resumed fit)."""
+        self.description, self.total, self.start = description, int(total), int(start)
+        self._done, self._fields = self.start, {}
+        self._file = sys.stderr
+        self._bar = self._task = None
+
+    def __enter__(self) -> Progress:
+        self._began = self._drawn = time.monotonic()
+        self._shown = self.start   # steps at the latest drawing
+        if self._file.isatty() and os.environ.get('TERM') != 'dumb':
+            self._bar = _bar(self._file)
+            self._task = self._bar.add_task(self.description, total=self.total, completed=self.start,
+                                            fields='')
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error):
+        if self._shown != self._done:
+            self._draw(time.monotonic())
+        if self._bar:
+            self._bar.stop()
+
+    def update(self, iteration: int, **fields):
+        """Say that `iteration` steps are done.
+
+        fields : what to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or
+                 functions without arguments that give one. A function is called only when its value is drawn,
+                 so that reading a number back from the device does not slow the loop. None is not shown.
+        """
+        self._done = iteration
+        if fields:
+            self._fields = fields
+        now = time.monotonic()
+        if self._bar:
+            due = now - self._drawn >= REDRAW
+        else:
+            due = now - self._drawn >= LINE or (iteration - self._shown) * 10 >= self.total
+        if due or iteration == self.total:
+            self._draw(now)
+
+    def _draw(self, now):
+        shown = [text for name, value in self._fields.items() if (text := _text(name, value))]
+        self._drawn, self._shown = now, self._done
+        if self._bar:
+            self._bar.update(self._task, completed=self._done, fields='  '.join(shown))
+            return
+        elapsed = now - self._began
+        share = self._done / self.total if self.total else 1.
+        parts = [f'{self._done}/{self.total} ({share:.0%})', *shown, f'{_clock(elapsed)} elapsed']
+        if self.start < self._done < self.total:
+            parts.append(f'{_clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
+        print(f'{self.description}: {", ".join(parts)}', file=self._file, flush=True)
+
+
+def track(iterable: Iterable, description: str, total: int | None = None) -> Iterator:
+    """The items of `iterable`, with progress shown. `total` is needed where `iterable` has no length."""
+    with Progress(description, len(iterable) if total is None else total) as progress:
+        for done, item in enumerate(iterable, 1):
+            yield item
+            progress.update(done)
+
+
+def _bar(file):
+    from rich.console import Console
+    from rich.progress import (BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn,
+                               TimeRemainingColumn)
+
+    # Few redraws: the thread that makes them must not compete with the loop.
+    return Progress(TextColumn('{task.description}'), BarColumn(bar_width=None), MofNCompleteColumn(),
+                    TextColumn('{task.fields[fields]}', style='cyan'), TimeElapsedColumn(),
+                    TimeRemainingColumn(), TextColumn('left'), console=Console(file=file),
+                    refresh_per_second=1 / REDRAW, expand=True)
+
+
+def _text(name, value):
+    value = value() if callable(value) else value
+    if value is None:
+        return None
+    if isinstance(value, str):
+        return f'{name} {value}'
+    return LABELS[name].format(value) if name in LABELS else f'{name} {value:.4g}'
+
+
+def _clock(seconds):
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f'{hours}:{minutes:02d}:{seconds:02d}' if hours else f'{minutes}:{seconds:02d}'
