@@ -93,7 +93,7 @@ def sections(data) -> list[Section]:
     out = []
     single = len(planes(data.volume.shape)) == 1
     compared = data.truth is not None
-    caption = ('The slice of the fan beam' if single else 'Slices through the richest part of the object, z up')
+    caption = ('The slice of the fan beam' if single else 'Slices through the object at its richest, z up')
     caption += ', in mm. Grey is density in 1/mm, white is dense. '
     if compared:
         caption += ('Reconstruction and truth share one grey scale; the difference is reconstruction minus '
