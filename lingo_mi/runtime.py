@@ -49,11 +49,14 @@ def use_variant(name: str | None = None) -> str:
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
 
 
-def register_plugins(*_):
-    """Register every plugin with the active variant; runs on import and whenever the variant changes."""
+def watch_variants():
+    """Register the plugins with the active variant, and again with whichever is set later."""
     import mitsuba as mi
 
-    if mi.variant() is None or mi.variant().startswith('scalar'):
-        return
-    from . import plugins
-    plugins.register()
+    def register(*_):
+        if 'ad' in mi.variant().split('_'):
+            from . import plugins
+            plugins.register()
+    mi.detail.add_variant_callback(register)
+    if mi.variant() is not None:
+        register()

@@ -1,0 +1,23 @@
+"""What Mitsuba knows by name, one plugin a file. Installed as `lingo_mi.plugins`.
+
+A class that derives from a Mitsuba class belongs to one variant, so every file here is loaded anew for each variant.
+"""
+import importlib
+import sys
+
+import mitsuba as mi
+
+# plugin name -> (module, what to call with it and with the plugin's constructor)
+PLUGINS = {
+    'lingo_xray': ('lingo_xray', 'register_integrator'),
+    'ct_scanner': ('ct_scanner', 'register_sensor'),
+    'ct_volume': ('ct_volume', 'register_medium'),
+}
+
+
+def register():
+    """Register all plugins with the active variant."""
+    for name, (module, registrar) in PLUGINS.items():
+        path = f'{__name__}.{module}'
+        loaded = importlib.reload(sys.modules[path]) if path in sys.modules else importlib.import_module(path)
+        getattr(mi, registrar)(name, loaded.create)

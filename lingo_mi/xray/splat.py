@@ -23,18 +23,19 @@ SETUP = 6  # cost of a team's visit to eight rows, in packets
 LOG2E = 1.4426950408889634
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float):
+def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True):
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
-    Differentiable in `footprints.values`, in forward and in reverse mode.
+    Differentiable in `footprints.values`, in forward and in reverse mode. With `primal` off the image itself is left at
+    zero, for who only wants derivatives.
     """
-    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent)
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal)
 
 
 class _Splat(dr.CustomOp):
-    def eval(self, values, rest, height, width, extent):
+    def eval(self, values, rest, height, width, extent, primal):
         self.plan = _Plan(values, rest, height, width, extent)
-        return self.plan.image()
+        return self.plan.image() if primal else dr.zeros(mi.Float, height * width)
 
     def forward(self):
         count = self.plan.count

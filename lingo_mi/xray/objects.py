@@ -1,0 +1,140 @@
+"""What attenuates in a Mitsuba scene: clouds of Gaussians, grids in cubes, closed meshes."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from . import cloud, grid
+
+# Shapes hold no Python attributes of ours, so what was learnt of a shape (a mesh's edges) is kept here, for its lifetime.
+_MESHES: dict = {}
+
+
+def find_objects(scene) -> list:
+    """The attenuating objects of a scene.
+
+    Raises InputError for an object that `lingo_xray` cannot integrate, and where there is none at all.
+    """
+    found = [thing for shape in scene.shapes() if (thing := _object(shape)) is not None]
+    if not found:
+        raise InputError('the scene has nothing that attenuates: add ellipsoids with a density, a cube with a '
+                         'heterogeneous medium or a closed mesh with a homogeneous one')
+    return found
+
+
+def _object(shape):
+    if shape.is_ellipsoids():
+        return Ellipsoids(shape)
+    medium = shape.interior_medium()
+    if medium is None:
+        return None
+    kind = str(medium).split('[')[0]
+    if kind == 'HeterogeneousMedium':
+        return GridInCube(shape, medium)
+    if kind == 'HomogeneousMedium':
+        return HomogeneousMesh(shape, medium)
+    raise InputError(f'lingo_xray does not know the medium {kind} of the shape {shape.id()!r}: use a heterogeneous or a '
+                     'homogeneous one')
+
+
+class Ellipsoids:
+    """The built-in `ellipsoids` shape with an attribute `density` [N, 1], as a cloud of Gaussians."""
+
+    def __init__(self, shape):
+        params = mi.traverse(shape)
+        if 'density' not in params:
+            raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
+        data, self.density = params['data'], params['density']
+        count = dr.width(self.density)
+        i = dr.arange(mi.UInt32, count) * 10
+
+        def column(j):
+            # Every entry is read once, so the derivative needs no atomics.
+            return dr.gather(mi.Float, data, i + j, mode=dr.ReduceMode.Permute)
+        self.centre = mi.Point3f(*(column(j) for j in range(3)))
+        self.scale = mi.Vector3f(*(column(j) for j in range(3, 6)))
+        self.rotation = mi.Vector4f(*(column(j) for j in range(6, 10)))
+        with dr.suspend_grad():
+            sound = (dr.isfinite(dr.sum(self.centre) + dr.sum(self.scale) + self.density)
+                     & (dr.min(self.scale) > 0) & (dr.squared_norm(self.rotation) > 1e-30)
+                     & dr.isfinite(dr.squared_norm(self.rotation)))
+            if not dr.all(sound):
+                first = int(dr.compress(~sound)[0])
+                raise InputError(f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and '
+                                 'rotation must be finite, the quaternion not zero, and the scales positive')
+
+    def line_integrals(self, view, extent, primal):
+        return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal)
+
+
+class GridInCube:
+    """An axis-aligned `cube` with a heterogeneous medium whose extinction is a scalar `gridvolume`."""
+
+    def __init__(self, shape, medium):
+        where = f'the medium of the shape {shape.id()!r}'
+        params = mi.traverse(medium)
+        tensor = next((v for k, v in params.items() if k.endswith('sigma_t.data')), None)
+        if tensor is None or len(tensor.shape) not in (3, 4) or (len(tensor.shape) == 4 and tensor.shape[3] != 1):
+            raise InputError(f'{where} must have a gridvolume with one channel as sigma_t')
+        volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and 'GridVolume' in str(node))
+        box, cube = volume.bbox(), shape.bbox()
+        if not (str(shape).startswith('Cube') and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
+                and np.allclose(box.max, cube.max, atol=1e-4 * np.abs(cube.max - cube.min))):
+            raise InputError(f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, and '
+                             'the gridvolume, [0, 1]^3 in its own, transforms onto the same box')
+        self.scale = params['scale'] if 'scale' in params else 1.
+        self.data, self.size = tensor.array, tensor.shape[2::-1]
+        self.low, self.high = box.min, box.max
+
+    def line_integrals(self, view, extent, primal):
+        nx, ny, nz = self.size
+        # The projector wants z fastest, Mitsuba stores x fastest.
+        i = dr.arange(mi.UInt32, nx * ny * nz)
+        z, rest = i % nz, i // nz
+        data = dr.gather(mi.Float, self.data, (z * ny + rest % ny) * nx + rest // ny, mode=dr.ReduceMode.Permute)
+        origin, direction, t_min = _rays(view, (self.low + self.high) / 2)
+        return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
+
+
+class HomogeneousMesh:
+    """A closed mesh with a homogeneous medium inside."""
+
+    def __init__(self, shape, medium):
+        from .mesh import from_mitsuba
+        if not shape.is_mesh():
+            raise InputError(f'the shape {shape.id()!r} has a homogeneous medium, but is no mesh: use ply, obj or cube')
+        params = mi.traverse(medium)
+        self.sigma = next(v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value'))
+        self.scale = params['scale'] if 'scale' in params else 1.
+        key = (id(shape), shape.vertex_count())
+        if key not in _MESHES:
+            _MESHES.clear()
+            _MESHES[key] = (shape, from_mitsuba(shape))
+        self.paths = _MESHES[key][1]
+
+    def line_integrals(self, view, extent, primal):
+        return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
+
+
+def _rays(view, near):
+    """Rays of all pixels for `grid.line_integrals`, starting on the plane through `near` parallel to the panel.
+
+    Starting near the object keeps the digits that a distant source would cost float32.
+    """
+    i = dr.arange(mi.UInt32, view.height * view.width)
+    width = dr.opaque(mi.UInt32, view.width)
+    x, y = mi.Float(i % width) + .5, mi.Float(i // width) + .5
+    near = mi.Vector3d(*near)
+    n = dr.cross(view.u, view.v)
+    Float, Vector3f = mi.Float, mi.Vector3f
+    if view.parallel:
+        t = dr.dot(n, near - view.corner) / dr.dot(n, view.source)
+        origin = Vector3f(view.corner + t * view.source) + x * Vector3f(view.u) + y * Vector3f(view.v)
+        return mi.Point3f(origin), Vector3f(view.source), -dr.inf
+    axis = view.corner - view.source
+    k = dr.dot(n, near - view.source) / dr.dot(n, axis)
+    direction = Vector3f(axis) + x * Vector3f(view.u) + y * Vector3f(view.v)
+    origin = Vector3f(view.source + k * axis) + x * Vector3f(k * view.u) + y * Vector3f(k * view.v)
+    return mi.Point3f(origin), direction, Float(-k)

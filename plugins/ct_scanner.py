@@ -1,0 +1,165 @@
+"""The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.files.scans import read_scan
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.xray.frame import View
+
+
+class CTScanner(mi.Sensor):
+    r"""
+    .. _sensor-ct_scanner:
+
+    CT scanner (:monosp:`ct_scanner`)
+    ---------------------------------
+
+    .. pluginparameters::
+
+     * - mode
+       - |string|
+       - `cone` or `parallel`. (Default: cone)
+     * - DSO, DSD
+       - |float|
+       - Distances from the source to the rotation axis and to the panel, mm.
+     * - nDetector, dDetector
+       - |string|
+       - Pixels and pixel size in mm, rows then columns: "512, 512". One number stands for both.
+     * - offDetector
+       - |string|
+       - Shift of the panel in mm, (v, u), positive v towards +z. (Default: 0)
+     * - nVoxel, dVoxel
+       - |string|
+       - The grid to reconstruct on, (x, y, z), and the voxel size in mm.
+     * - offOrigin
+       - |string|
+       - Centre of that grid in mm. (Default: 0)
+     * - views, totalAngle, startAngle
+       - |int|, |float|, |float|
+       - Evenly spaced views, degrees, the end excluded. (Default: 50, 360, 0)
+     * - angles
+       - |string|
+       - Instead: every view's angle in degrees.
+     * - test_views
+       - |int|
+       - Views held out of the fit, at angles drawn uniformly from the same range with a fixed seed. (Default: 0)
+     * - projections
+       - |string|
+       - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. An empty name is
+         none.
+     * - view
+       - |int|
+       - The view that this sensor renders. (Default: 0)
+
+    The source runs on a circle in the plane z = 0; `lingo_mi.geometry` states the frame. One view of a scanner is a sensor
+    like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scanning.scan` renders them all.
+    """
+
+    def __init__(self, props):
+        projections = props.get('projections', '')
+        self.dataset = None
+        try:
+            if projections:
+                self.dataset = read_scan(str(mi.file_resolver().resolve(projections)))
+                self.geometry = self.dataset.train.geometry
+                self.test_geometry = self.dataset.test.geometry if self.dataset.test else None
+            else:
+                self.geometry, self.test_geometry = _read(props)
+        except InputError as error:
+            raise InputError(f'ct_scanner {props.id()!r}: {error}') from None
+        self.index = props.get('view', 0)
+        if not 0 <= self.index < len(self.geometry):
+            raise InputError(f'ct_scanner {props.id()!r}: view {self.index} of a scan of {len(self.geometry)} views')
+        for name in _NAMES:  # a file of projections overrides the numbers in the scene
+            if name in props:
+                props[name]
+        props['film'] = mi.load_dict(film(*self.geometry.nDetector))
+        super().__init__(props)
+        self.frame = View.of(self.geometry.frames(), self.index, *self.geometry.nDetector)
+
+    def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
+        """The sensor of one view, of this scan or of another geometry."""
+        return mi.load_dict(describe(geometry or self.geometry, index))
+
+    def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active=True):
+        f = self.frame
+        Vector3f = mi.Vector3f
+        point = (Vector3f(f.corner) + Vector3f(f.u) * (position_sample.x * f.width)
+                 + Vector3f(f.v) * (position_sample.y * f.height))
+        if f.parallel:
+            start, direction = point - Vector3f(f.source) * (2 * self.geometry.DSD), Vector3f(f.source)
+        else:
+            start, direction = mi.Point3f(f.source), dr.normalize(point - Vector3f(f.source))
+        wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active)
+        return mi.Ray3f(mi.Point3f(start), direction, time, wavelengths), weight
+
+    def sample_ray_differential(self, time, wavelength_sample, position_sample, aperture_sample, active=True):
+        ray, weight = self.sample_ray(time, wavelength_sample, position_sample, aperture_sample, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def bbox(self):
+        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*np.array(self.frame.source).ravel()))
+
+    def to_string(self):
+        g = self.geometry
+        return (f'CTScanner[\n  mode = {g.mode}, DSO = {g.DSO:g}, DSD = {g.DSD:g},\n  nDetector = {g.nDetector}, '
+                f'dDetector = {g.dDetector}, offDetector = {g.offDetector},\n  nVoxel = {g.nVoxel}, '
+                f'dVoxel = {g.dVoxel}, offOrigin = {g.offOrigin},\n  views = {len(g)}, view = {self.index}\n]')
+
+
+create = CTScanner
+
+_NAMES = ('mode', 'DSO', 'DSD', 'nDetector', 'dDetector', 'offDetector', 'nVoxel', 'dVoxel', 'offOrigin', 'views',
+          'totalAngle', 'startAngle', 'angles', 'test_views')
+
+
+def film(rows: int, columns: int) -> dict:
+    """A panel as Mitsuba film: the default one would blur pixels and store float16."""
+    return dict(type='hdrfilm', width=columns, height=rows, rfilter=dict(type='box'), component_format='float32',
+                pixel_format='luminance')
+
+
+def describe(geometry: Geometry, index: int = 0) -> dict:
+    """A `ct_scanner` as a dictionary for `mi.load_dict`."""
+    def join(values):
+        return ', '.join(repr(float(x)) if isinstance(x, float) else str(x) for x in values)
+    g = geometry
+    return dict(type='ct_scanner', mode=g.mode, DSO=g.DSO, DSD=g.DSD, nDetector=join(g.nDetector),
+                dDetector=join(g.dDetector), offDetector=join(g.offDetector), nVoxel=join(g.nVoxel),
+                dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()), view=index)
+
+
+def _numbers(props, name, default=None):
+    value = props.get(name, default)
+    if value is None:
+        raise InputError(f'{name} is missing')
+    try:
+        return [float(x) for x in str(value).replace(',', ' ').split()]
+    except ValueError:
+        raise InputError(f'{name} = {value!r} is not a list of numbers') from None
+
+
+def _read(props):
+    """The scan's and the held-out views' geometry from a plugin's properties."""
+    total, start = props.get('totalAngle', 360.), props.get('startAngle', 0.)
+    angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(props.get('views', 50), total, start)
+    counts = {}
+    for name in ('nDetector', 'nVoxel'):
+        counts[name] = _numbers(props, name)
+        if any(n != int(n) for n in counts[name]):
+            raise InputError(f'{name} must be whole numbers, not {counts[name]}')
+    mode = props.get('mode', 'cone')
+    far = 1. if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
+    geometry = Geometry(mode=mode, DSO=_numbers(props, 'DSO', far)[0], DSD=_numbers(props, 'DSD', far)[0], angles=angles,
+                        dDetector=_numbers(props, 'dDetector'), dVoxel=_numbers(props, 'dVoxel'),
+                        offDetector=_numbers(props, 'offDetector', 0.), offOrigin=_numbers(props, 'offOrigin', 0.), **counts)
+    held_out = props.get('test_views', 0)
+    if held_out < 0:
+        raise InputError(f'test_views must not be negative, but is {held_out}')
+    if not held_out:
+        return geometry, None
+    drawn = np.sort(np.random.default_rng(0).uniform(0, total, held_out)) + start
+    from dataclasses import replace
+    return geometry, replace(geometry, angles=np.radians(drawn))

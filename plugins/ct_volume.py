@@ -1,0 +1,54 @@
+"""The medium `ct_volume`: a CT volume or a phantom as Mitsuba's own heterogeneous medium."""
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.phantoms import make
+
+
+def create(props):
+    r"""
+    .. _medium-ct_volume:
+
+    CT volume (:monosp:`ct_volume`)
+    -------------------------------
+
+    .. pluginparameters::
+
+     * - filename
+       - |string|
+       - A CT volume: NIfTI, NRRD, MHA/MHD, NPY/NPZ, a TIFF stack or a DICOM folder (see `lingo_mi.files.volumes`).
+     * - phantom
+       - |string|
+       - Instead of a file: `foot`, `chest`, `shepp_logan`, `gaussians` or `mesh`.
+     * - size
+       - |int|
+       - Voxels along the phantom's sides. (Default: 256)
+     * - seed
+       - |int|
+       - Seed of the phantom's random texture. (Default: 0)
+     * - mu_water
+       - |float|
+       - Attenuation of water in 1/mm, for a file in HU; without it HU are mapped to densities in [0, 1].
+     * - to_world
+       - |transform|
+       - Where the volume is: as for a `gridvolume`, the voxels fill the unit cube of its local frame. The voxel
+         size in the file is *not* used; the scanner's grid says where the volume lies.
+
+    It loads the values and hands them to Mitsuba's `heterogeneous` medium with a `gridvolume`; everything else (rendering
+    with volume path tracers, `mi.traverse`, gradients) is Mitsuba's own. Place it in a shape of type `cube`.
+    """
+    filename, phantom = props.get('filename', ''), props.get('phantom', '')
+    size, seed = props.get('size', 256), props.get('seed', 0)
+    mu_water = props.get('mu_water', 0.)
+    to_world = props.get('to_world', mi.ScalarTransform4f())
+    if bool(filename) == bool(phantom):
+        raise InputError('ct_volume needs either a filename or a phantom')
+    if phantom:
+        data = make(phantom, size, seed).data
+    else:
+        data = read_volume(str(mi.file_resolver().resolve(filename)), mu_water=mu_water or None).data
+    grid = np.ascontiguousarray(data.transpose(2, 1, 0))[..., None]
+    volume = dict(type='gridvolume', grid=mi.VolumeGrid(grid), to_world=to_world, raw=True)
+    return mi.load_dict(dict(type='heterogeneous', sigma_t=volume, albedo=0., id=props.id()))

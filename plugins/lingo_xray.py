@@ -1,0 +1,91 @@
+"""The integrator `lingo_xray`: exact X-ray line integrals, forward and backward."""
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.errors import InputError
+from lingo_mi.xray.objects import find_objects
+from lingo_mi.xray.sensors import view_of
+
+
+class LingoXray(mi.ad.integrators.common.ADIntegrator):
+    r"""
+    .. _integrator-lingo_xray:
+
+    X-ray line integrals (:monosp:`lingo_xray`)
+    -------------------------------------------
+
+    .. pluginparameters::
+
+     * - extent
+       - |float|
+       - Cut-off of Gaussians in standard deviations. The relative error of the image falls from about 6e-3 at 3 to
+         2e-4 at 4, 4e-6 at 5 and rounding (1e-7) from 6 on; the time grows with the square. (Default: 5)
+     * - output
+       - |string|
+       - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral).
+         (Default: `line_integral`)
+
+    Beer-Lambert line integrals through everything in the scene that attenuates:
+
+    - `ellipsoids` shapes with a `density` attribute: a cloud of 3D Gaussians, in closed form (see
+      `lingo_mi.xray.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
+    - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation;
+    - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
+
+    Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
+    centres: one evaluation a pixel, without random numbers, whatever the sample count. Sensors: `ct_scanner`,
+    `perspective` and `orthographic`. A scanner's integrals through Gaussians end at its panel, a camera's do not.
+
+    Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`. Gradients reach the Gaussians' centres, scales, rotations and
+    densities, the grid's values and its scale, in forward and in reverse mode.
+    """
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.extent = props.get('extent', 5.)
+        self.output = props.get('output', 'line_integral')
+        if not 1 <= self.extent <= 20:
+            raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {self.extent:g}')
+        if self.output not in ('line_integral', 'transmission'):
+            raise InputError(f"lingo_xray: output is 'line_integral' or 'transmission', not {self.output!r}")
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if not develop:
+            raise InputError('lingo_xray renders with develop=True only: there are no samples to accumulate')
+        with dr.suspend_grad():
+            image = self._image(scene, sensor)
+            if evaluate:
+                dr.eval(image)
+            return image
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        image = self._image(scene, sensor)
+        dr.forward_to(image)
+        return dr.grad(image)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        # A line integral is linear in what was splatted, so its image need not be computed again.
+        image = self._image(scene, sensor, primal=self.output == 'transmission')
+        dr.backward_from(image * grad_in)
+
+    def _image(self, scene, sensor, primal=True):
+        """The image as a tensor [height, width, channels of the film]."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        view = view_of(sensor)
+        total = dr.zeros(mi.Float, view.height * view.width)
+        for thing in find_objects(scene):
+            total += thing.line_integrals(view, self.extent, primal)
+        if self.output == 'transmission':
+            total = dr.exp(-total)
+        film = sensor.film()
+        film.prepare([])
+        channels = film.develop().shape[2]
+        if channels > 1:
+            total = dr.repeat(total, channels)
+        return mi.TensorXf(total, shape=(view.height, view.width, channels))
+
+    def to_string(self):
+        return f'LingoXray[extent = {self.extent:g}, output = {self.output}]'
+
+
+create = LingoXray
