@@ -1,0 +1,271 @@
+"""The pickle of NAF and SAX-NeRF (X3D): one dictionary with the scanner, the projections and the true volume.
+
+Facts of the format, from the generator and the readers that use it:
+
+- Lengths are in mm, but the projections were computed in metres: their values are density times metres.
+- `projections` are [n, v, u], rows along -z: TIGRE's rows, which run along +z, are flipped before they are
+  stored.
+- `offDetector` is (u, v) and reaches TIGRE as (v, u), positive v towards +z. (NAF's own ray code adds the
+  second entry along -z instead; the stored projections come from TIGRE, so TIGRE's sign is followed.)
+- `nDetector` and `dDetector` are (v, u) to TIGRE and R2-Gaussian but (u, v) to NAF. The projections' shape
+  decides; a square panel is read as (v, u).
+- `image` is [x, y, z]; the held-out views are `val`, in some files `test`.
+
+A pickle is a program. Here it may only build dictionaries, lists, tuples, strings, numbers and numeric
+arrays: each of the few NumPy names it may mention stands for code of this module, so that not even NumPy's
+own functions run.
+"""
+from __future__ import annotations
+
+import math
+import pickle
+
+import numpy as np
+
+from ..errors import InputError
+from ..scan import Dataset
+from .arrays import numeric
+from .paths import one_line, reading, replacing
+from .tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+
+
+class _Refused(Exception):
+    """The pickle asks for something that is not data."""
+
+
+class _DType:
+    """Stands for numpy.dtype: a numeric type and a byte order, nothing else."""
+
+    __slots__ = ('value',)
+
+    def __init__(self, name):
+        try:
+            self.value = np.dtype(name) if isinstance(name, str) else None
+        except TypeError:
+            self.value = None
+        if self.value is None or self.value.kind not in 'biufc':
+            raise _Refused(f'the array type {name!r}')
+
+    def __setstate__(self, state):
+        if not (isinstance(state, tuple) and len(state) >= 5 and state[1] in ('<', '>', '|', '=')
+                and all(x is None for x in state[2:5])):
+            raise _Refused('an array type with fields')
+        if self.value.itemsize > 1:
+            self.value = self.value.newbyteorder(state[1])
+
+
+def _array(shape, dtype, data, order='C') -> np.ndarray:
+    if not (isinstance(dtype, _DType) and isinstance(data, (bytes, bytearray)) and isinstance(shape, tuple)
+            and all(isinstance(n, int) and n >= 0 for n in shape)):
+        raise _Refused('an array that does not hold plain numbers')
+    if math.prod(shape) * dtype.value.itemsize != len(data):
+        raise _Refused('an array whose size does not match its shape')
+    return np.frombuffer(data, dtype.value).reshape(shape, order=order)
+
+
+class _Array:
+    """Stands for a numpy.ndarray, whose own __setstate__ the pickle must not reach."""
+
+    __slots__ = ('value',)
+
+    def __init__(self, value=None):
+        self.value = value
+
+    def __setstate__(self, state):
+        if not (isinstance(state, tuple) and len(state) == 5):
+            raise _Refused('an array of an unknown version')
+        _, shape, dtype, fortran, data = state
+        self.value = _array(shape, dtype, data, 'F' if fortran else 'C')
+
+
+class _Name:
+    """What a global name of the pickle stands for. It has no attributes, so the pickle cannot change it."""
+
+    __slots__ = ()
+
+
+class _ReconstructName(_Name):
+    __slots__ = ()
+
+    def __call__(self, *_):
+        return _Array()
+
+
+class _NdarrayName(_Name):
+    __slots__ = ()
+
+    def __call__(self, shape, dtype, buffer):
+        return _Array(_array(shape, dtype, buffer))
+
+
+class _FrombufferName(_Name):
+    __slots__ = ()
+
+    def __call__(self, buffer, dtype, shape, order):
+        return _Array(_array(shape, dtype, buffer, 'F' if order == 'F' else 'C'))
+
+
+class _ScalarName(_Name):
+    __slots__ = ()
+
+    def __call__(self, dtype, data):
+        return _array((), dtype, data)[()]
+
+
+class _DTypeName(_Name):
+    __slots__ = ()
+
+    def __call__(self, name, *_):
+        return _DType(name)
+
+
+class _EncodeName(_Name):
+    """_codecs.encode: how protocol 2 writes bytes."""
+
+    __slots__ = ()
+
+    def __call__(self, text, encoding):
+        if not isinstance(text, str) or encoding != 'latin1':
+            raise _Refused('a text encoding other than latin1')
+        return text.encode('latin1')
+
+
+_NAMES = {
+    ('numpy', 'ndarray'): _NdarrayName(),
+    ('numpy', 'dtype'): _DTypeName(),
+    ('_codecs', 'encode'): _EncodeName(),
+}
+for _core in ('numpy.core', 'numpy._core'):  # NumPy 1, NumPy 2
+    _NAMES[f'{_core}.multiarray', '_reconstruct'] = _ReconstructName()
+    _NAMES[f'{_core}.multiarray', 'scalar'] = _ScalarName()
+    _NAMES[f'{_core}.numeric', '_frombuffer'] = _FrombufferName()
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module, name):
+        try:
+            return _NAMES[module, name]
+        except KeyError:
+            raise _Refused(f'the global {module}.{name}') from None
+
+    def persistent_load(self, pid):
+        raise _Refused('a persistent object')
+
+
+def _resolve(value, depth=0):
+    """`value` with arrays for their stand-ins; only plain data passes."""
+    if depth > 32:
+        raise _Refused('data nested more than 32 deep')
+    if isinstance(value, _Array):
+        return value.value
+    if isinstance(value, dict):
+        return {key: _resolve(v, depth + 1) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_resolve(v, depth + 1) for v in value)
+    if value is None or isinstance(value, (bool, int, float, complex, str, bytes, bytearray, np.generic)):
+        return value
+    if isinstance(value, _DType):
+        return value.value
+    raise _Refused(f'a value of type {type(value).__name__}')
+
+
+def load_pickle(path):
+    """The plain data in a pickle, protocols 0 to 5 of Python 3, written by NumPy 1 or 2.
+
+    Raises InputError if the file is missing, truncated, or holds anything but dictionaries, lists, tuples,
+    strings, numbers and numeric arrays; the message names the refused global. No code named by the file is
+    run.
+    """
+    with reading(path), open(path, 'rb') as stream:
+        try:
+            return _resolve(_Unpickler(stream).load())
+        except _Refused as refused:
+            raise InputError(f'{path}: the pickle asks for {one_line(refused)}, which plain scan data does '
+                             'not need; do not trust this file, or export it again as arrays and '
+                             'numbers') from None
+        except OSError:
+            raise
+        except Exception as error:  # a damaged pickle may fail in any way at all
+            raise InputError(f'{path}: is truncated, damaged or not a pickle ({one_line(error)}); '
+                             'fetch it again') from None
+
+
+def _split(data, name, where):
+    split = data[name]
+    if not isinstance(split, dict) or not {'projections', 'angles'} <= split.keys():
+        raise InputError(f"{where}: '{name}' must be a dictionary with 'projections' [n, v, u] and 'angles' "
+                         "[n]")
+    arrays = []
+    for key, ndim in (('projections', 3), ('angles', 1)):
+        label = f"{where}: {name}['{key}']"
+        try:
+            array = np.asarray(split[key])
+        except ValueError:
+            raise InputError(f'{label} is not an array; store {ndim} dimensions of numbers') from None
+        if array.shape[:1] == (0,):
+            raise InputError(f'{label} has no views; give at least one')
+        arrays.append(numeric(array, label, ndim))
+    projections, angles = arrays
+    count = data.get('numTrain' if name == 'train' else 'numVal')
+    if len(angles) != len(projections) or count not in (None, len(angles)):
+        raise InputError(f"{where}: '{name}' has {len(projections)} projections and {len(angles)} angles, "
+                         f"and the file announces {'none' if count is None else count}; these must agree")
+    return projections, angles
+
+
+def read(path) -> Dataset:
+    """Reads a NAF / SAX-NeRF pickle.
+
+    Required: DSO, DSD (cone beam), nDetector, dDetector or sDetector, nVoxel, dVoxel or sVoxel (mm), and
+    train: {projections [n, v, u], angles [n] radians}. Optional: val or test, image [x, y, z], mode ('cone'),
+    offOrigin, offDetector (u, v), numTrain, numVal. Other keys are ignored.
+
+    Returns a Dataset with projections in density times mm (the file's, times 1000). Raises InputError if the
+    file is missing, damaged, refused (see `load_pickle`) or contradicts itself.
+    """
+    data = load_pickle(path)
+    if not isinstance(data, dict) or 'train' not in data:
+        raise InputError(f"{path}: is not a NAF scan: a dictionary with the key 'train' is needed")
+    scans = {}
+    for name in ('train', 'val', 'test'):
+        if data.get(name) is None or (name == 'test' and 'val' in scans):
+            continue
+        projections, angles = _split(data, name, path)
+        geometry = to_geometry(data, angles, path, detector_shape=projections.shape[1:], offset_order='uv')
+        scans[name] = make_scan(geometry, projections.astype(np.float32) * np.float32(1000), path)
+    volume = data.get('image')
+    if volume is not None:
+        volume = numeric(np.asarray(volume), f"{path}: 'image'", 3)
+    return make_dataset(scans['train'], scans.get('val', scans.get('test')), volume, path)
+
+
+class _Pickler(pickle.Pickler):
+    def reducer_override(self, obj):
+        # NumPy 2 would name numpy._core, which NumPy 1 cannot import; these two names are common to both.
+        if type(obj) is np.ndarray:
+            return np.ndarray, (obj.shape, obj.dtype, bytearray(np.ascontiguousarray(obj).data.cast('B')))
+        return NotImplemented
+
+
+def write(path, dataset: Dataset) -> None:
+    """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
+
+    Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v).
+    For a panel that is not square NAF's own code wants nDetector as (u, v); R2-Gaussian's and this module's
+    readers do not. Raises InputError if the file cannot be written or the test views have another scanner.
+    """
+    check_one_scanner(dataset, path)
+    start, total = angle_range(dataset.train.geometry.angles)
+    data = {
+        **from_geometry(dataset.train.geometry, offset_order='uv'),
+        'numTrain': len(dataset.train), 'numVal': 0 if dataset.test is None else len(dataset.test),
+        'accuracy': 0.5, 'filter': None, 'totalAngle': total, 'startAngle': start, 'randomAngle': False,
+        'convert': False, 'rescale_slope': 1.0, 'rescale_intercept': 0.0, 'normalize': True, 'noise': 0,
+    }
+    for name, scan in (('train', dataset.train), ('val', dataset.test)):
+        if scan is not None:
+            data[name] = {'projections': scan.projections / np.float32(1000), 'angles': scan.geometry.angles}
+    if dataset.volume is not None:
+        data['image'] = np.asarray(dataset.volume, np.float32)
+    with replacing(path) as temporary, open(temporary, 'wb') as stream:
+        _Pickler(stream, protocol=5).dump(data)

@@ -1,0 +1,81 @@
+"""Opening and replacing files: one clear line for whatever the file system refuses, and never half a file."""
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import InputError
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an exception on one line, without its trailing full stop."""
+    return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
+
+
+@contextmanager
+def reading(path):
+    """Turns what the file system says about `path` while it is read into an InputError."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f'{error.filename or path}: there is no such file; check the path') from None
+    except OSError as error:
+        raise InputError(f'{error.filename or path}: cannot be read ({error.strerror or one_line(error)}); '
+                         'check the path and its permissions') from None
+
+
+@contextmanager
+def _temporary(path, remove):
+    path = Path(path)
+    # The suffix stays at the end because several libraries choose the format by it.
+    temporary = path.with_name(f'.{os.getpid()}.{path.name}')
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f'{path}: cannot be written ({error.strerror or one_line(error)}); '
+                         'check that the folder exists and may be written to') from None
+    finally:
+        remove(temporary)
+
+
+def _remove_file(path):
+    try:
+        path.unlink()
+    except OSError:  # renamed away, or never made
+        pass
+
+
+@contextmanager
+def replacing(path):
+    """Yields a temporary path beside `path`, which takes its place when the block ends without an error.
+
+    Raises InputError if the file cannot be written.
+    """
+    with _temporary(path, _remove_file) as temporary:
+        yield temporary
+
+
+@contextmanager
+def new_folder(path):
+    """Yields a temporary folder, which becomes `path` when the block ends without an error.
+
+    Raises InputError if `path` exists and is not an empty folder, or cannot be written.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f'{path}: exists already; remove it or give another name')
+    with _temporary(path, lambda folder: shutil.rmtree(folder, ignore_errors=True)) as temporary:
+        temporary.mkdir()
+        yield temporary
+
+
+def optional(module: str):
+    """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
+    import importlib
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise InputError(f"this format needs the package {module}: pip install 'lingo_mi[formats]'") from None

@@ -1,0 +1,125 @@
+"""Clouds of 3D Gaussians in PLY files that Mitsuba's `ellipsoids` shape and 3DGS viewers both read.
+
+Binary little endian, all properties float32, in the order that Mitsuba's `ellipsoids` plugin demands:
+
+    x y z  nx ny nz  f_dc_0..2  opacity  density  scale_0..2  rot_0..3
+
+scale is stored as its logarithm, rot with the real part first. `density` is ours; Mitsuba makes it the
+attribute `density`. The plugin takes a file for a 3DGS cloud, and would misread `density`, only if `opacity`
+directly precedes `scale_0`: here `density` does, so f_dc and opacity become plain attributes. They are there
+for viewers alone: mid-grey, and the logit of the opacity of a ray through the centre, 1 - exp(-density sqrt(2
+pi) s) with s the geometric mean of the scales. `read_ply` ignores them.
+"""
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from .paths import reading, replacing
+
+_CENTRE = 'x', 'y', 'z'
+_SCALE = 'scale_0', 'scale_1', 'scale_2'
+_ROT = 'rot_0', 'rot_1', 'rot_2', 'rot_3'
+_PROPERTIES = (*_CENTRE, 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'density', *_SCALE, *_ROT)
+_TYPES = {'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1', 'short': '<i2', 'int16': '<i2',
+          'ushort': '<u2', 'uint16': '<u2', 'int': '<i4', 'int32': '<i4', 'uint': '<u4', 'uint32': '<u4',
+          'float': '<f4', 'float32': '<f4', 'double': '<f8', 'float64': '<f8'}
+
+
+def _check(where, centres, scales, quaternions, density):
+    n = len(density)
+    if n == 0:
+        raise InputError(f'{where}: the cloud is empty; at least one Gaussian is needed')
+    for name, array, shape in (('centres', centres, (n, 3)), ('scales', scales, (n, 3)),
+                               ('quaternions', quaternions, (n, 4)), ('density', density, (n,))):
+        if array.shape != shape:
+            raise InputError(f'{where}: {name} must have the shape {shape}, not {array.shape}')
+        if not np.isfinite(array).all():
+            bad = int(np.argwhere(~np.isfinite(array))[0, 0])
+            raise InputError(f'{where}: {name} of Gaussian {bad} is not finite; remove that Gaussian')
+    if not (scales > 0).all():
+        raise InputError(f'{where}: the scale of Gaussian {int(np.argwhere(scales <= 0)[0, 0])} is not '
+                         'positive')
+    norm = np.linalg.norm(quaternions, axis=1)
+    if not (norm > 0).all():
+        raise InputError(f'{where}: the quaternion of Gaussian {int(np.argmin(norm))} is zero; it must have '
+                         'a direction')
+
+
+def write_ply(path, centres, scales, quaternions, density) -> None:
+    """Writes a cloud, whole or not at all.
+
+    centres [N, 3] and scales [N, 3] (standard deviations, > 0) in one unit of length, quaternions [N, 4] (x,
+    y, z, w; normalised here), density [N] at the centres. Raises InputError for wrong shapes, values that are
+    not finite, scales that are not positive, zero quaternions, an empty cloud, or a file that cannot be
+    written.
+    """
+    centres, scales, quaternions, density = (np.asarray(a, float)
+                                             for a in (centres, scales, quaternions, density))
+    density = density.reshape(-1) if density.shape[1:] == (1,) else density
+    if density.ndim != 1:
+        raise InputError(f'{path}: density must have one dimension, not the shape {density.shape}')
+    _check(path, centres, scales, quaternions, density)
+    quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    depth = np.maximum(density, 0) * np.sqrt(2 * np.pi) * np.exp(np.log(scales).mean(1))
+    # logit(1 - exp(-t)) = log(exp(t) - 1), kept where viewers' sigmoid does not saturate
+    opacity = np.log(np.expm1(np.clip(depth, 1e-4, 10)))
+    zeros = np.zeros((len(density), 6))
+    table = np.concatenate([centres, zeros, opacity[:, None], density[:, None], np.log(scales),
+                            quaternions[:, [3, 0, 1, 2]]], 1)
+    header = ''.join(['ply\nformat binary_little_endian 1.0\n', f'element vertex {len(table)}\n',
+                      *(f'property float {name}\n' for name in _PROPERTIES), 'end_header\n'])
+    with replacing(path) as temporary, open(temporary, 'wb') as stream:
+        stream.write(header.encode('ascii') + np.ascontiguousarray(table, '<f4').tobytes())
+
+
+def _header(stream, where):
+    """(number of vertices, dtype of one vertex); leaves the stream at the first vertex."""
+    def fail(what):
+        raise InputError(f'{where}: {what}; a binary little-endian PLY file of Gaussians is needed')
+
+    if stream.readline(16).strip() != b'ply':
+        fail('is not a PLY file')
+    lines = []
+    while not lines or lines[-1] != ['end_header']:
+        line = stream.readline(256)
+        if not line or len(lines) > 1000:
+            fail('its header has no end')
+        lines.append(line.decode('ascii', 'replace').split())
+    lines = [line for line in lines[:-1] if line and line[0] not in ('comment', 'obj_info')]
+    if lines[:1] != [['format', 'binary_little_endian', '1.0']]:
+        fail('is not in the format binary_little_endian 1.0')
+    elements = [line for line in lines if line[0] == 'element']
+    if len(elements) != 1 or elements[0][1:2] != ['vertex'] or not elements[0][-1].isdigit():
+        fail("must have the one element 'vertex'")
+    fields = [line for line in lines if line[0] == 'property']
+    if any(len(f) != 3 or f[1] not in _TYPES for f in fields) or len({f[-1] for f in fields}) != len(fields):
+        fail('has lists, unknown types or repeated names among its properties')
+    return int(elements[0][2]), np.dtype([(f[2], _TYPES[f[1]]) for f in fields])
+
+
+def read_ply(path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Reads a cloud: (centres [N, 3], scales [N, 3], quaternions [N, 4] (x, y, z, w), density [N]), float32.
+
+    Properties may come in any order; all but centre, scale, rot and density are ignored. Raises InputError if
+    the file is missing, truncated, has no density, or holds values that `write_ply` would refuse.
+    """
+    with reading(path), open(path, 'rb') as stream:
+        n, dtype = _header(stream, path)
+        missing = [name for name in (*_CENTRE, 'density', *_SCALE, *_ROT) if name not in (dtype.names or ())]
+        if missing:
+            raise InputError(f'{path}: has no property {missing[0]}; write the cloud with lingo_mi')
+        body = stream.read()
+    if len(body) != n * dtype.itemsize:
+        raise InputError(f'{path}: has {len(body)} bytes of data, but {n} Gaussians need '
+                         f'{n * dtype.itemsize}; it is truncated or damaged, write it again')
+    rows = np.frombuffer(body, dtype)
+
+    def take(names):
+        return np.stack([rows[name] for name in names], -1).astype(np.float32)
+
+    with np.errstate(over='ignore'):
+        scales = np.exp(take(_SCALE))
+    cloud = take(_CENTRE), scales, take((*_ROT[1:], _ROT[0])), rows['density'].astype(np.float32)
+    _check(path, *cloud)
+    return cloud

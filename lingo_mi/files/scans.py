@@ -1,0 +1,271 @@
+"""Scans in every format: `read_scan` finds the reader, `write_scan` the writer.
+
+Besides the NAF pickle (`naf`) and the R2-Gaussian folder (`r2`):
+
+Projections with a geometry file: `scan.npy` [n, v, u] and `scan.yml`, TIGRE's names, lengths in mm, angles in
+degrees:
+
+    DSO, DSD               distances from the source to the axis and to the panel (not needed for a parallel
+                           beam)
+    nDetector              pixels (v, u)
+    dDetector / sDetector  size of a pixel / of the panel (v, u), either
+    nVoxel                 voxels (x, y, z)
+    dVoxel / sVoxel        size of a voxel / of the volume (x, y, z), either
+    angles                 a list; or totalAngle (360) and startAngle (0): n angles evenly spaced, the end
+                           excluded
+    mode, offOrigin, offDetector   optional: cone or parallel; (x, y, z); TIGRE's (v, u), positive v towards
+                                   +z
+    input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
+
+Any other name is refused, so that a misspelt or unsupported one is not lost; TIGRE's accuracy and filter,
+which do not describe the scanner, are passed over.
+
+A folder of EXR images: `geometry.yml` as above (with `test_angles` if there are held-out views),
+`train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
+
+The Helsinki Tomography Challenge 2022 as .npz: `sinogram_<name>` [angles, pixels] of a fan beam, which is a
+cone beam with one row.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from ..errors import InputError
+from ..geometry import circular
+from ..scan import Dataset, Scan
+from . import arrays, naf, r2
+from .images import read_exr, write_exr
+from .paths import new_folder, one_line, reading, replacing
+from .tigre import check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from .volumes import first_voxel, read_volume, write_volume
+
+_KEYS = {'DSO', 'DSD', 'nDetector', 'dDetector', 'sDetector', 'nVoxel', 'dVoxel', 'sVoxel', 'mode',
+         'offOrigin',
+         'offDetector', 'angles', 'totalAngle', 'startAngle', 'input', 'I0', 'test_angles', 'accuracy',
+         'filter'}
+
+
+# ---- geometry files ----------------------------------------------------------------------------------------
+
+def _load_yaml(path) -> dict:
+    try:
+        with reading(path):
+            values = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except InputError:
+        raise
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: is not valid YAML ({one_line(error)}); correct it') from None
+    if not isinstance(values, dict):
+        raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
+    unknown = sorted(str(key) for key in values.keys() - _KEYS)
+    if unknown:
+        raise InputError(f'{path}: {one_line(unknown[0])} is not a name of the scan geometry or not '
+                         f'supported; the names are {", ".join(sorted(_KEYS))}')
+    return values
+
+
+def _number(values, key, default, where):
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise InputError(f'{where}: {key} must be one number, not {value!r}')
+    return float(value)
+
+
+def _angles(values, key, n, where):
+    """n angles in radians."""
+    if values.get(key) is None:
+        return circular(n, _number(values, 'totalAngle', 360., where),
+                        _number(values, 'startAngle', 0., where))
+    try:
+        angles = np.radians(np.asarray(values[key], float))
+    except (TypeError, ValueError):
+        raise InputError(f'{where}: {key} must be a list of numbers, in degrees') from None
+    if angles.shape != (n,):
+        raise InputError(f'{where}: {key} lists {angles.size} angles, but there are {n} projections; these '
+                         'must agree')
+    return angles
+
+
+def _line_integrals(projections, values, where, projections_path):
+    kind = values.get('input', 'line_integral')
+    if kind not in ('line_integral', 'intensity'):
+        raise InputError(f"{where}: input must be line_integral or intensity, not {kind!r}")
+    if kind == 'line_integral':
+        return projections
+    if values.get('I0') is None:
+        raise InputError(f'{where}: input: intensity needs I0, the intensity without an object; add it')
+    i0 = _number(values, 'I0', None, where)
+    if i0 <= 0:
+        raise InputError(f'{where}: I0 must be positive, not {i0:g}')
+    if not projections.min() > 0:
+        bad = tuple(int(i) for i in np.argwhere(projections <= 0)[0])
+        raise InputError(f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
+                         'so it has no logarithm; mask or repair dead pixels first')
+    return np.log(i0 / projections.astype(float))
+
+
+def _dump_yaml(path, geometry, **more):
+    values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist(), **more}
+    path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
+
+
+def _read_npy(path, geometry):
+    if geometry is None:
+        beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
+        geometry = next((p for p in beside if p.exists()), None)
+        if geometry is None:
+            raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name '
+                             'the file')
+    projections = arrays.load(path, 3)
+    values = _load_yaml(geometry)
+    angles = _angles(values, 'angles', len(projections), geometry)
+    g = to_geometry(values, angles, geometry)
+    return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path))
+
+
+def _write_npy(path, dataset):
+    path = Path(path)
+    if path.suffix != '.npy':
+        raise InputError(f'{path}: projections are written as .npy with a .yml beside it; give a name that '
+                         'ends in .npy')
+    if dataset.test is not None or dataset.volume is not None:
+        raise InputError(f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
+                         'instead, or drop the test views and the volume')
+    # Geometry first: without its projections it is never taken for a scan.
+    with replacing(path.with_suffix('.yml')) as temporary:
+        _dump_yaml(temporary, dataset.train.geometry, input='line_integral')
+    arrays.save(path, dataset.train.projections)
+
+
+# ---- EXR folders -------------------------------------------------------------------------------------------
+
+def _read_stack(folder):
+    files = sorted(folder.glob('*.exr'))
+    if not files:
+        raise InputError(f'{folder}: holds no .exr views; give at least one')
+    images = [read_exr(file) for file in files]
+    for file, image in zip(files, images):
+        if image.shape != images[0].shape:
+            raise InputError(f'{file}: has the shape {image.shape}, but the first view has '
+                             f'{images[0].shape}; all views need one panel')
+    return np.stack(images)
+
+
+def _read_exr_folder(folder):
+    where = folder / 'geometry.yml'
+    values = _load_yaml(where)
+    scans = {}
+    for split, key in (('train', 'angles'), ('test', 'test_angles')):
+        if split == 'test' and not (folder / split).is_dir() and values.get(key) is None:
+            continue
+        if split == 'test' and values.get(key) is None:
+            raise InputError(f'{where}: test_angles is missing, but there is a folder of test views; add it, '
+                             'in degrees')
+        projections = _read_stack(folder / split)
+        geometry = to_geometry(values, _angles(values, key, len(projections), where), where)
+        scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
+    volume = folder / 'volume.nii.gz'
+    return make_dataset(scans['train'], scans.get('test'),
+                        read_volume(volume).data if volume.exists() else None, volume)
+
+
+def _write_exr_folder(path, dataset):
+    check_one_scanner(dataset, path)
+    more = {'input': 'line_integral'}
+    if dataset.test is not None:
+        more['test_angles'] = np.degrees(dataset.test.geometry.angles).tolist()
+    with new_folder(path) as folder:
+        for split, scan in (('train', dataset.train), ('test', dataset.test)):
+            if scan is not None:
+                (folder / split).mkdir()
+                for i, image in enumerate(scan.projections):
+                    write_exr(folder / split / f'{i:04d}.exr', image)
+        geometry = dataset.train.geometry
+        if dataset.volume is not None:
+            write_volume(folder / 'volume.nii.gz', dataset.volume, geometry.dVoxel, first_voxel(geometry))
+        _dump_yaml(folder / 'geometry.yml', geometry, **more)
+
+
+# ---- Helsinki Tomography Challenge 2022 --------------------------------------------------------------------
+
+def _read_htc(path, name):
+    data = arrays.load_many(path)
+    names = sorted(key[len('sinogram_'):] for key in data if key.startswith('sinogram_'))
+    if not names or not {'DSO', 'DSD', 'dDetector', 'angles_deg'} <= data.keys():
+        raise InputError(f'{path}: is no scan of the Helsinki Tomography Challenge (sinogram_<name>, DSO, '
+                         'DSD, dDetector, '
+                         'angles_deg), the only .npz scan that can be read; give .npy with a .yml beside it')
+    if name not in names:
+        raise InputError(f'{path}: has no sinogram {name!r}; it has {", ".join(names)}')
+    sinogram = arrays.numeric(data[f'sinogram_{name}'], f'{path}: sinogram_{name}', 2)
+    degrees = arrays.numeric(data['angles_deg'], f'{path}: angles_deg', 1)
+    if len(degrees) != len(sinogram):
+        raise InputError(f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these '
+                         'must agree')
+    if len(degrees) > 1 and np.isclose(degrees[-1] - degrees[0], 360):
+        degrees, sinogram = degrees[:-1], sinogram[:-1]
+    pixel = data['dDetector']
+    # Their source is at DSO (sin a, -cos a, 0) and their columns run along (cos a, sin a): ours at a - 90
+    # degrees. The row is as high as a pixel is wide; the slice is one voxel of the challenge's reference
+    # reconstructions.
+    geometry = to_geometry(
+        {'DSO': data['DSO'], 'DSD': data['DSD'], 'nDetector': (1, sinogram.shape[1]), 'dDetector': pixel,
+         'nVoxel': (512, 512, 1), 'dVoxel': 0.1483}, np.radians(degrees - 90), path)
+    return Dataset(make_scan(geometry, sinogram[:, None, :], path))
+
+
+# ---- any format --------------------------------------------------------------------------------------------
+
+def read_scan(path, geometry=None, name: str = 'ta') -> Dataset:
+    """Reads a scan; the format follows from the path.
+
+    path       .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: Helsinki
+               Tomography Challenge; a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR
+               views)
+    geometry   the geometry file of an .npy; without it, the .yml or .yaml of the same stem
+    name       which sinogram of an .npz
+
+    Returns a Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are
+    None where the format has none. Raises InputError if a file is missing, damaged, unknown, or contradicts
+    its geometry.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if geometry is not None and suffix != '.npy':
+        raise InputError(f'{path}: carries its own geometry; a geometry file goes with .npy projections only')
+    if path.is_dir():
+        if (path / r2.META).exists():
+            return r2.read(path)
+        if (path / 'geometry.yml').exists():
+            return _read_exr_folder(path)
+        raise InputError(f'{path}: has neither {r2.META} (R2-Gaussian) nor geometry.yml (EXR views); give a '
+                         'folder of a scan')
+    with reading(path):
+        open(path, 'rb').close()
+    if suffix in ('.pickle', '.pkl'):
+        return naf.read(path)
+    if suffix == '.npy':
+        return _read_npy(path, geometry)
+    if suffix == '.npz':
+        return _read_htc(path, name)
+    raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
+
+
+_WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _write_npy}
+
+
+def write_scan(path, dataset: Dataset | Scan, kind: str) -> None:
+    """Writes a scan that `read_scan` reads back, whole or not at all.
+
+    kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`
+           and its .yml, for training views alone
+
+    Raises InputError if the kind is unknown, a folder exists already, the file cannot be written, or the
+    format cannot hold the data.
+    """
+    if kind not in _WRITERS:
+        raise InputError(f'{kind!r} is no kind of scan file; choose one of {", ".join(_WRITERS)}')
+    _WRITERS[kind](path, Dataset(dataset) if isinstance(dataset, Scan) else dataset)

@@ -1,0 +1,359 @@
+"""CT volumes: NIfTI, NRRD/MetaImage, NumPy, raw bytes, TIFF stacks and DICOM folders in; NIfTI out.
+
+A volume is indexed [x, y, z] in the order of the file: nothing is flipped, and the affine says how the voxels
+lie in the world.
+
+Values become density by these rules, the first that applies:
+
+1. A NIfTI file that `write_volume` wrote is returned unchanged.
+2. Hounsfield units, recognised by a minimum of -500 or less, by DICOM or by `hu=True`: with `mu_water`
+   (1/mm), mu_water (1 + HU / 1000), not below 0, in 1/mm; without, clipped to [-1000, 2000] and mapped to
+   [0, 1] (R2-Gaussian's rule).
+3. Anything else is a density: float values up to 1 stay; others are divided by their maximum. Negative
+   fractions down to -10 % of the maximum are the noise of a reconstruction and become 0; other negative
+   values are refused as ambiguous, unless `hu=False` says that they are to become 0 too.
+"""
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import Geometry
+from . import arrays
+from .arrays import numeric
+from .paths import one_line, optional, reading, replacing
+
+_OURS = 'lingo_mi: '
+_TO_MM = {'meter': 1000., 'mm': 1., 'micron': 1e-3, 'unknown': 1.}
+_LPS_TO_RAS = np.diag([-1., -1., 1., 1.])
+# Raw files known by their content: SHA-1 of the git blob -> shape [x, y, z], type. The first is the
+# rotational C-arm scan `foot` of the volvis.org collection.
+_KNOWN_RAW = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uint8')}
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A CT volume.
+
+    data      float32 [x, y, z], density
+    spacing   voxel size (x, y, z), mm
+    affine    float64 [4, 4], voxel index to the centre of the voxel in the world, mm; NIfTI's axes (right,
+              anterior, superior) for the medical formats
+    unit      '1/mm'; 'normalised' for densities scaled to [0, 1]; or the description of a file of ours
+    """
+
+    data: np.ndarray
+    spacing: tuple[float, float, float]
+    affine: np.ndarray
+    unit: str
+
+
+def centred_affine(shape, spacing) -> np.ndarray:
+    """The affine [4, 4] of a volume of `shape` voxels of `spacing` mm whose middle is the world's origin."""
+    spacing = np.asarray(spacing, float)
+    affine = np.diag([*spacing, 1.])
+    affine[:3, 3] = spacing / 2 - np.asarray(shape) * spacing / 2
+    return affine
+
+
+def first_voxel(geometry: Geometry) -> np.ndarray:
+    """World position [3] of the first voxel's centre: offOrigin - sVoxel / 2 + dVoxel / 2, mm."""
+    return np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 + np.array(geometry.dVoxel) / 2
+
+
+# ---- values ------------------------------------------------------------------------------------------------
+
+def _density(data, path, hu, mu_water):
+    """(float32 density, unit) by rules 2 and 3 of the module."""
+    low, high = float(data.min()), float(data.max())
+    if hu is None:
+        hu = low <= -500
+        # Whole numbers are looked for in the values: a header's slope makes floats of integers.
+        if not hu and low < 0 and (low < -0.1 * high or not (data != np.round(data)).any()):
+            raise InputError(f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
+                             'or not; say which with hu=True or hu=False')
+    if hu:
+        data = data.astype(np.float32)
+        if mu_water is not None:
+            return np.maximum((data + 1000) * np.float32(mu_water / 1000), 0), '1/mm'
+        return (np.clip(data, -1000, 2000) + 1000) / 3000, 'normalised'
+    if mu_water is not None:
+        raise InputError(f'{path}: mu_water was given, but the values ({low:g} to {high:g}) do not look like '
+                         'Hounsfield units; leave mu_water out, or say hu=True')
+    if not high > 0:
+        raise InputError(f'{path}: the volume is empty: no value is above 0')
+    keep = data.dtype.kind == 'f' and high <= 1
+    data = np.maximum(data.astype(np.float32), 0)
+    return (data if keep else data / np.float32(high)), 'normalised'
+
+
+# ---- formats: each returns (numeric array [x, y, z], affine or None) ---------------------------------------
+
+def _nifti(path):
+    import nibabel
+    description, to_mm = '', 1.
+    try:
+        with reading(path):
+            image = nibabel.load(path)
+            data = np.asanyarray(image.dataobj)
+            if isinstance(image, nibabel.Nifti1Image):
+                description = bytes(image.header['descrip'].item()).decode('utf-8', 'replace')
+                to_mm = _TO_MM.get(image.header.get_xyzt_units()[0], 1.)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged header fails inside nibabel in many ways
+        raise InputError(f'{path}: is damaged or not a NIfTI file ({one_line(error)}); '
+                         'fetch it again') from None
+    while data.ndim > 3 and data.shape[-1] == 1:
+        data = data[..., 0]
+    return data, np.diag([to_mm, to_mm, to_mm, 1.]) @ image.affine, description
+
+
+def _itk(path):
+    sitk = optional('SimpleITK')
+    with reading(path):
+        open(path, 'rb').close()
+    try:
+        image = sitk.ReadImage(str(path))
+    except RuntimeError as error:
+        raise InputError(f'{path}: cannot be read by SimpleITK ({one_line(error)[-160:]}); '
+                         'check the header, and for .mhd the raw file that it names') from None
+    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
+        raise InputError(f'{path}: has {image.GetDimension()} dimensions and '
+                         f'{image.GetNumberOfComponentsPerPixel()} values a voxel; a 3D volume of single '
+                         'values is needed')
+    affine = np.eye(4)
+    affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
+    affine[:3, 3] = image.GetOrigin()
+    return sitk.GetArrayFromImage(image).transpose(2, 1, 0), _LPS_TO_RAS @ affine
+
+
+def _npz(path):
+    volumes = {name: a for name, a in arrays.load_many(path).items() if a.ndim == 3}
+    if len(volumes) != 1:
+        raise InputError(f'{path}: holds {len(volumes)} arrays of 3 dimensions; save exactly one')
+    return next(iter(volumes.values()))
+
+
+def git_blob_sha1(content: bytes) -> str:
+    """The name that git gives to a file of this content."""
+    return hashlib.sha1(b'blob %d\0' % len(content) + content).hexdigest()
+
+
+def _raw(path, shape, dtype):
+    with reading(path):
+        content = Path(path).read_bytes()
+    if shape is None or dtype is None:
+        known = _KNOWN_RAW.get(git_blob_sha1(content))
+        if known is None:
+            raise InputError(f'{path}: raw bytes have no header; give the shape (x, y, z) and the dtype')
+        shape, dtype = known
+    try:
+        dtype, shape = np.dtype(dtype), tuple(int(n) for n in shape)
+    except (TypeError, ValueError):
+        raise InputError(f'{path}: shape {shape!r} or dtype {dtype!r} is not understood; '
+                         'give for example (256, 256, 256) and uint8') from None
+    if len(shape) != 3 or min(shape) < 1:
+        raise InputError(f'{path}: the shape must be 3 positive numbers (x, y, z), not {shape}')
+    expected = int(np.prod(shape)) * dtype.itemsize
+    if len(content) != expected:
+        raise InputError(f'{path}: has {len(content)} bytes, but {shape} of {dtype} needs {expected}; '
+                         'correct the shape or the dtype')
+    return np.frombuffer(content, dtype).reshape(shape[::-1]).transpose(2, 1, 0)
+
+
+def _natural(path):
+    """Sorts slice_9 before slice_10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+
+
+def _tiff_file(tifffile, path):
+    try:
+        with reading(path):
+            return tifffile.imread(path)
+    except InputError:
+        raise
+    except Exception as error:  # damaged files fail inside tifffile and its codecs in many ways
+        raise InputError(f'{path}: is damaged or not a TIFF file ({one_line(error)}); '
+                         'write it again') from None
+
+
+def _tiff(files, path):
+    tifffile = optional('tifffile')
+    slices = [_tiff_file(tifffile, file) for file in files]
+    if len(slices) == 1:
+        return (slices[0][None] if slices[0].ndim == 2 else slices[0]).transpose()
+    for file, image in zip(files, slices):
+        if image.ndim != 2 or image.shape != slices[0].shape:
+            raise InputError(f'{file}: has the shape {image.shape}, but the slices of a folder must be 2D '
+                             f'and of one size (the first is {slices[0].shape})')
+    return np.stack(slices).transpose()
+
+
+def _dicom(folder):
+    pydicom = optional('pydicom')
+    slices = []
+    for file in sorted(f for f in folder.iterdir() if f.is_file()):
+        try:
+            with reading(file):
+                data = pydicom.dcmread(file)
+        except pydicom.errors.InvalidDicomError:
+            continue  # notes and indices lie beside the slices
+        if 'PixelData' in data:
+            slices.append((file, data))
+    if not slices:
+        raise InputError(f'{folder}: holds neither DICOM nor TIFF slices; give the folder that directly '
+                         'holds them')
+    series = {str(s.get('SeriesInstanceUID')) for _, s in slices}
+    if len(series) > 1:
+        raise InputError(f'{folder}: holds {len(series)} DICOM series; put one series in a folder of its own')
+    try:
+        return _stack_dicom(folder, slices)
+    except (AttributeError, KeyError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f'{folder}: a DICOM slice lacks geometry or has unreadable pixels '
+                         f'({one_line(error)}); export the series again, uncompressed') from None
+
+
+def _stack_dicom(folder, slices):
+    first = slices[0][1]
+    x_axis, y_axis = np.reshape(np.asarray(first.ImageOrientationPatient, float), (2, 3))
+    normal = np.cross(x_axis, y_axis)
+    row_step, column_step = (float(d) for d in first.PixelSpacing)  # between rows (y), between columns (x)
+    for file, s in slices:
+        if ((s.Rows, s.Columns) != (first.Rows, first.Columns) or int(s.get('NumberOfFrames', 1)) != 1
+                or not np.allclose(np.asarray(s.PixelSpacing, float), [row_step, column_step], rtol=1e-4)
+                or not np.allclose(np.asarray(s.ImageOrientationPatient, float), [*x_axis, *y_axis],
+                                   atol=1e-3)):
+            raise InputError(f'{file}: differs from the other slices in size, pixel spacing or orientation; '
+                             'remove it')
+    slices = sorted(((np.asarray(s.ImagePositionPatient, float) @ normal, file, s) for file, s in slices),
+                    key=lambda item: item[0])
+    depth = np.array([d for d, _, _ in slices])
+    steps = np.diff(depth)
+    if len(steps) == 0:
+        step = float(first.SliceThickness)
+    else:
+        step = float(np.median(steps))
+        uneven = np.abs(steps - step) > max(0.01 * step, 1e-3)
+        if step <= 0 or uneven.any():
+            i = int(np.argmax(uneven))
+            raise InputError(f'{folder}: the slices are not evenly spaced: {steps[i]:g} mm from '
+                             f'{slices[i][1].name} to {slices[i + 1][1].name}, {step:g} mm elsewhere; '
+                             'add the missing or remove the extra slices')
+    data = np.stack([np.float32(s.get('RescaleSlope', 1)) * s.pixel_array
+                     + np.float32(s.get('RescaleIntercept', 0)) for _, _, s in slices])
+    affine = np.eye(4)
+    affine[:3, :3] = np.stack([x_axis * column_step, y_axis * row_step, normal * step], 1)
+    affine[:3, 3] = np.asarray(slices[0][2].ImagePositionPatient, float)
+    return data.transpose(2, 1, 0), _LPS_TO_RAS @ affine
+
+
+# ---- in and out --------------------------------------------------------------------------------------------
+
+def read_volume(path, mu_water: float | None = None, shape=None, dtype=None, spacing=None,
+                hu: bool | None = None) -> Volume:
+    """Reads a CT volume; the format follows from the name.
+
+    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd (SimpleITK); .npy, .npz with one 3D array,
+               [x, y, z]; .tif, .tiff or a folder of them, [z][y, x], sorted by name (tifffile); a folder of
+               DICOM slices, sorted by position (pydicom); .raw, or any file if shape and dtype are given
+    mu_water   attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1]
+    shape      of raw bytes, (x, y, z), x fastest
+    dtype      of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3
+               `foot`
+    spacing    voxel size in mm, one number or (x, y, z), for formats that carry none (1 mm otherwise)
+    hu         whether the values are Hounsfield units, where that cannot be told from them
+
+    The values become density as the module's text says. Raises InputError if the file is missing, damaged,
+    empty, not 3D, not finite or ambiguous, slices are unevenly spaced, or a package of the `formats` extra is
+    missing.
+    """
+    path = Path(path)
+    name, description, affine = path.name.lower(), '', None
+    if mu_water is not None and not (np.isfinite(mu_water) and mu_water > 0):
+        raise InputError(f'mu_water must be positive, in 1/mm, not {mu_water!r}; water at 60 keV has 0.0206')
+    if path.is_dir():
+        with reading(path):
+            tiffs = sorted((f for f in path.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=_natural)
+        if tiffs:
+            data = _tiff(tiffs, path)
+        else:
+            data, affine = _dicom(path)
+            hu = True if hu is None else hu
+    elif shape is not None and dtype is not None or name.endswith('.raw'):
+        data = _raw(path, shape, dtype)
+    elif name.endswith(('.nii', '.nii.gz', '.hdr', '.img')):
+        data, affine, description = _nifti(path)
+    elif name.endswith(('.nrrd', '.nhdr', '.mha', '.mhd')):
+        data, affine = _itk(path)
+    elif name.endswith('.npy'):
+        data = arrays.load(path, 3)
+    elif name.endswith('.npz'):
+        data = _npz(path)
+    elif name.endswith(('.tif', '.tiff')):
+        data = _tiff([path], path)
+    elif name.endswith('.dcm'):
+        raise InputError(f'{path}: is a single DICOM slice; give the folder of the series')
+    else:
+        with reading(path):
+            open(path, 'rb').close()
+        raise InputError(f'{path}: is no known volume format; give .nii.gz, .nrrd, .mhd, .npy, .tif, a '
+                         'folder of slices, or shape and dtype of raw bytes')
+    data = numeric(data, path, 3)
+    if affine is None:
+        steps = np.atleast_1d(np.asarray(1. if spacing is None else spacing, float))
+        if steps.shape not in ((1,), (3,)) or not (np.isfinite(steps).all() and steps.min() > 0):
+            raise InputError(f'spacing must be one or three positive numbers, in mm, not {spacing!r}')
+        affine = centred_affine(data.shape, np.broadcast_to(steps, 3))
+    elif spacing is not None:
+        raise InputError(f'{path}: carries its own voxel size; leave spacing out')
+    sides = np.linalg.norm(affine[:3, :3], axis=0)
+    if not np.isfinite(affine).all() or not sides.min() > 0:
+        raise InputError(f'{path}: the header has no valid voxel size; correct its affine')
+    if description.startswith(_OURS) and data.dtype.kind == 'f':
+        density, unit = data.astype(np.float32), description[len(_OURS):]
+    else:
+        density, unit = _density(data, path, hu, mu_water)
+    return Volume(np.ascontiguousarray(density, np.float32), tuple(float(s) for s in sides), affine, unit)
+
+
+def write_volume(path, data, spacing, origin=None, description: str = 'normalised') -> None:
+    """Writes a float32 NIfTI file, whole or not at all, that `read_volume` returns unchanged.
+
+    path          .nii or .nii.gz
+    data          [x, y, z], finite
+    spacing       voxel size (x, y, z), mm
+    origin        world position of the first voxel's centre, mm (see `first_voxel`); None centres the volume
+                  at 0
+    description   what the values are, for example 'normalised' or '1/mm'; about 65 bytes fit
+
+    Raises InputError for another suffix, a wrong shape, values that are not finite, or a file that cannot be
+    written.
+    """
+    import nibabel
+    path = Path(path)
+    if not path.name.endswith(('.nii', '.nii.gz')):
+        raise InputError(f'{path}: volumes are written as NIfTI; give a name that ends in .nii or .nii.gz')
+    data = numeric(np.asarray(data), path, 3)
+    spacing = np.broadcast_to(np.asarray(spacing, float), 3)
+    if not (np.isfinite(spacing).all() and spacing.min() > 0):
+        raise InputError(f'{path}: the voxel size must be positive, not {tuple(spacing)}')
+    affine = centred_affine(data.shape, spacing)
+    if origin is not None:
+        affine[:3, 3] = origin
+    text = (_OURS + description).encode('utf-8')
+    if len(text) > 79:
+        raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room '
+                         'for 79')
+    image = nibabel.Nifti1Image(np.asarray(data, np.float32), affine)
+    image.header.set_xyzt_units('mm')
+    image.header['descrip'] = text
+    with replacing(path) as temporary:
+        nibabel.save(image, temporary)
