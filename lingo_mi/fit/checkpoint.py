@@ -1,0 +1,47 @@
+"""Checkpoints: all that a fit needs to go on as if it had never stopped."""
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .state import PARAMETERS, State
+
+
+def save(path, state: State, extra: dict, arrays: dict | None = None):
+    """Write a state and plain values (`extra`, as JSON) atomically: a crash leaves the earlier checkpoint whole.
+
+    arrays   further NumPy arrays to keep, by name
+    """
+    path = Path(path)
+    columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
+    temporary = path.with_name(path.name + '.partial')
+    with open(temporary, 'wb') as file:
+        np.savez(file, gradient=state.gradient, seen=state.seen, born=state.born, extra=np.array(json.dumps(extra)),
+                 **columns, **{f'array.{k}': v for k, v in (arrays or {}).items()})
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def load(path) -> tuple[State, dict, dict]:
+    """The state, the plain values and the further arrays of a checkpoint.
+
+    Raises InputError where the file is missing or is no checkpoint. The file cannot run code.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {k: file[k] for k in file.files}
+        state = State(*({k: data[f'{group}.{k}'] for k in PARAMETERS} for group in ('values', 'first', 'second')),
+                      data['gradient'], data['seen'], data['born'])
+        extra = json.loads(str(data['extra']))
+    except FileNotFoundError:
+        raise InputError(f'{path}: there is no checkpoint to resume from; run without --resume') from None
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f'{path}: this is not a checkpoint of a fit ({type(error).__name__}); remove it and start '
+                         'again without --resume') from None
+    return state, extra, {k[6:]: v for k, v in data.items() if k.startswith('array.')}

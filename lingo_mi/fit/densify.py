@@ -1,0 +1,102 @@
+"""Adaptive density control: pure functions from state to state, in NumPy.
+
+R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one split in
+two. A clone and its original take half the density each, which keeps the mass. The halves of a split are smaller by 1.6;
+R2 gives them half the density too, so that three quarters of the mass vanish; with `split_keeps_mass` they get what
+keeps it. Afterwards faint and stray Gaussians are removed. Adam's moments travel with their Gaussian; new ones start at
+zero.
+"""
+from __future__ import annotations
+
+import numpy as np
+
+from .settings import Settings
+from .state import PARAMETERS, State, activate, inverse_scale, inverse_softplus
+
+SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
+
+
+def densify(state: State, settings: Settings, half, rng) -> State:
+    """Clone, split and prune once, then clear the statistic.
+
+    half   half the volume's sides, [3]: Gaussians centred outside are removed
+    rng    numpy Generator; places the halves of splits
+    """
+    mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
+    _, scale, _, _ = activate(state, settings.scale_min, settings.scale_max)
+    strong = mean >= settings.densify_threshold
+    if len(state) + strong.sum() > settings.max_gaussians:
+        strong[:] = False
+    large = scale.max(1) > settings.split_size
+    state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
+                  settings, rng)
+    return prune(state, settings, half)
+
+
+def clone(state: State, chosen) -> State:
+    """Copy the chosen Gaussians [N] to the end; original and copy get half the density each."""
+    halved = _with_density(state, chosen, .5)
+    return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
+
+
+def split(state: State, chosen, settings: Settings, rng) -> State:
+    """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
+    parents = np.flatnonzero(chosen).repeat(2)
+    low, high = settings.scale_min, settings.scale_max
+    centre, scale, rotation, _ = activate(state, low, high)
+    factor = .5 * SHRINK ** 3 if settings.split_keeps_mass else .5
+    children = _fresh(_with_density(state, chosen, factor), parents)
+    offset = rng.normal(size=(len(parents), 3)) * scale[parents]
+    children.values['centre'] = (centre[parents] + _rotate(rotation[parents], offset)).astype(np.float32)
+    smaller = np.clip(scale[parents] / SHRINK, low * 1.01, high * .99)
+    children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32)
+    return _append(_take(state, ~chosen), children)
+
+
+def prune(state: State, settings: Settings, half) -> State:
+    """Remove Gaussians whose density is below the bound or whose centre left the volume; clear the statistic."""
+    centre, _, _, density = activate(state, settings.scale_min, settings.scale_max)
+    keep = (density >= settings.prune_density) & (np.abs(centre) <= np.asarray(half)).all(1)
+    kept = _take(state, keep)
+    kept.gradient[:], kept.seen[:] = 0, 0
+    return kept
+
+
+def _with_density(state, chosen, factor):
+    """The state with the chosen densities multiplied."""
+    values = dict(state.values)
+    raw = values['density'].astype(float)
+    raw[chosen] = inverse_softplus(np.logaddexp(0., raw[chosen]) * factor)
+    values['density'] = raw.astype(np.float32)
+    return State(values, state.first, state.second, state.gradient, state.seen, state.born)
+
+
+def _take(state, index):
+    def pick(columns):
+        return {k: v[index] for k, v in columns.items()}
+    return State(pick(state.values), pick(state.first), pick(state.second), state.gradient[index], state.seen[index],
+                 state.born[index])
+
+
+def _fresh(state, index):
+    """Newborn copies of Gaussians: their parameters, no moments, no statistic."""
+    taken = _take(state, index)
+    n = len(taken)
+    zeros = {k: np.zeros((n, size), np.float32) for k, size in PARAMETERS.items()}
+    return State(taken.values, zeros, {k: v.copy() for k, v in zeros.items()}, np.zeros(n, np.float32),
+                 np.zeros(n, np.float32), np.ones(n, bool))
+
+
+def _append(state, more):
+    def join(a, b):
+        return {k: np.concatenate([a[k], b[k]]) for k in PARAMETERS}
+    return State(join(state.values, more.values), join(state.first, more.first), join(state.second, more.second),
+                 np.concatenate([state.gradient, more.gradient]), np.concatenate([state.seen, more.seen]),
+                 np.concatenate([state.born, more.born]))
+
+
+def _rotate(q, v):
+    """Rotate vectors [N, 3] by unit quaternions (x, y, z, w) [N, 4]."""
+    u, w = q[:, :3], q[:, 3:]
+    c = 2 * np.cross(u, v)
+    return v + w * c + np.cross(u, c)

@@ -1,0 +1,63 @@
+"""A fit's state on the device: activation, Adam and the way to the host and back."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .settings import Settings
+from .state import PARAMETERS, State
+
+BETA1, BETA2 = .9, .999  # Adam's usual decay of the moments
+
+
+def _types():
+    return dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
+
+
+class DeviceState:
+    """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `seen` Float [N]."""
+
+    def __init__(self, state: State):
+        types = _types()
+
+        def upload(columns):
+            return {k: types[k](np.ascontiguousarray(columns[k].T if size > 1 else columns[k][:, 0]))
+                    for k, size in PARAMETERS.items()}
+        self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
+        self.gradient, self.seen = mi.Float(state.gradient), mi.Float(state.seen)
+        self.born = state.born
+        # A single Gaussian's arrays of width one would otherwise be literals, and be compiled in.
+        dr.make_opaque(self.values, self.first, self.second, self.gradient, self.seen)
+
+    def __len__(self) -> int:
+        return len(self.born)
+
+    def host(self) -> State:
+        """The state as NumPy arrays."""
+        def download(columns):
+            return {k: np.ascontiguousarray(np.array(columns[k], np.float32).reshape(size, -1).T)
+                    for k, size in PARAMETERS.items()}
+        return State(download(self.values), download(self.first), download(self.second), self.gradient.numpy(),
+                     self.seen.numpy(), self.born)
+
+    def gaussians(self, settings: Settings):
+        """Centres, standard deviations, quaternions (not normalised) and densities; differentiable."""
+        v = self.values
+        low, high = dr.opaque(mi.Float, settings.scale_min), dr.opaque(mi.Float, settings.scale_max - settings.scale_min)
+        scale = low + high / (1 + dr.exp(-v['scale']))
+        # softplus without overflow
+        density = dr.maximum(v['density'], 0) + dr.log(1 + dr.exp(-dr.abs(v['density'])))
+        return v['centre'], scale, v['rotation'], density
+
+    def adam(self, gradients: dict, rates: dict, step: int, epsilon: float):
+        """One Adam step (Kingma and Ba 2015); `step` counts from 1, for the bias correction."""
+        # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
+        c1, c2 = dr.opaque(mi.Float, 1 / (1 - BETA1 ** step)), dr.opaque(mi.Float, 1 / (1 - BETA2 ** step))
+        for name, g in gradients.items():
+            m = BETA1 * self.first[name] + (1 - BETA1) * g
+            v = BETA2 * self.second[name] + (1 - BETA2) * g * g
+            rate = dr.opaque(mi.Float, rates[name])
+            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + epsilon)
+            self.first[name], self.second[name] = m, v
+        dr.eval(self.values, self.first, self.second, self.gradient, self.seen)

@@ -1,0 +1,147 @@
+"""The loop of a fit: views in turn, densification, measurements on the way, checkpoints."""
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from ..errors import InputError
+from ..lingo.initialise import InitialCloud
+from ..scan import Scan
+from . import checkpoint
+from .densify import densify
+from .device import DeviceState
+from .settings import Settings
+from .state import State, start
+from .step import Stepper
+
+CHECKPOINT_SECONDS = 30.
+
+
+@dataclass
+class Fitted:
+    """What a fit gives.
+
+    state       the final state (host)
+    stepper     renders and voxelizes it
+    settings    as used
+    initial     centres the fit started from [N, 3]
+    history     a list of measurements over time: iteration, seconds, loss, gaussians, and whatever `measure` gives
+    seconds     spent in steps, over all sessions
+    info        how the initial cloud came about
+    """
+
+    state: State
+    stepper: Stepper
+    settings: Settings
+    initial: np.ndarray
+    history: list = field(default_factory=list)
+    seconds: float = 0.
+    info: dict = field(default_factory=dict)
+
+
+def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int = 0, measure=None, progress=None,
+        path: Path | None = None, resume: bool = False) -> Fitted:
+    """Fit a cloud to a scan.
+
+    scan       the views to fit
+    initial    where to start; may be None with `resume`
+    seed       of the views' order, the total variation's cubes and splits
+    measure    called as measure(stepper, state) at a few iterations; returns numbers for the history
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement)
+    path       checkpoint file, written every 30 seconds, at Ctrl-C and at the end
+    resume     go on from `path`: the same steps as without the interruption
+    """
+    settings = bounded(settings, scan)
+    stepper = Stepper(scan, settings)
+    rng = np.random.default_rng(seed)
+    if resume:
+        host, extra, arrays = checkpoint.load(path)
+        _same_fit(extra, settings, scan, path)
+        rng.bit_generator.state = extra['rng']
+        points, order = arrays['initial'], [int(i) for i in arrays['order']]
+        iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
+        state = DeviceState(host)
+    else:
+        points, order = initial.points.astype(np.float32), []
+        iteration, seconds, history, info = 0, 0., [], dict(initial.info)
+        state = DeviceState(start(points, initial.spacing, initial.density, settings.scale_min, settings.scale_max))
+    marks = set(measure_at(settings.iterations))
+    clock = saved = time.perf_counter()
+
+    def store():
+        if path is not None:
+            checkpoint.save(path, state.host(), dict(
+                rng=rng.bit_generator.state, iteration=iteration, seconds=seconds + time.perf_counter() - clock,
+                history=history, info=info, settings=asdict(settings), views=len(scan)),
+                dict(initial=points, order=np.array(order, int)))
+    try:
+        while iteration < settings.iterations:
+            while len(order) < settings.batch:  # every view once before any a second time
+                order += rng.permutation(len(scan)).tolist()
+            views, rest = order[:settings.batch], order[settings.batch:]
+            loss = stepper.step(state, views, iteration, rng)
+            order, iteration = rest, iteration + 1
+            if (settings.densify_from < iteration < settings.densify_until
+                    and iteration % settings.densify_every == 0):
+                state = DeviceState(densify(state.host(), settings, stepper.half, rng))
+                if len(state) == 0:
+                    raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+            if iteration in marks:
+                dr.sync_thread()
+                value = float(loss[0])
+                if not np.isfinite(value):
+                    raise InputError(f'the loss is not finite at iteration {iteration}: lower the rates, or check the '
+                                     'projections')
+                seconds += time.perf_counter() - clock
+                entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
+                history.append(entry | (measure(stepper, state) if measure else {}))
+                clock = time.perf_counter()  # measuring is not fitting
+            if progress is not None:
+                last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
+                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
+            if time.perf_counter() - saved > CHECKPOINT_SECONDS:
+                store()
+                saved = time.perf_counter()
+        dr.sync_thread()
+    finally:
+        # Also on Ctrl-C, between two steps or within one: a step replaces the state's arrays only at its end.
+        store()
+    seconds += time.perf_counter() - clock
+    return Fitted(state.host(), stepper, settings, points, history, seconds, info)
+
+
+def measure_at(iterations: int) -> list[int]:
+    """Iterations to measure at: twelve, denser at the beginning, the last one among them."""
+    return sorted({max(1, round(iterations * share ** 1.5)) for share in np.linspace(0, 1, 13)[1:]})
+
+
+def bounded(settings: Settings, scan: Scan) -> Settings:
+    """The settings with the largest scale so small that no Gaussian in the volume can reach the source.
+
+    Beyond it the integral of a cone beam's Gaussian is no footprint (see `xray.footprint`).
+    """
+    g = scan.geometry
+    if g.mode == 'parallel':
+        return settings
+    frames = g.normalised_frames()
+    room = np.linalg.norm(frames.source, axis=1).min() - np.linalg.norm(g.half)
+    largest = .9 * room / settings.extent
+    if largest <= settings.scale_min:
+        raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
+    return replace(settings, scale_max=min(settings.scale_max, largest))
+
+
+def _same_fit(extra, settings, scan, path):
+    """Raise InputError where a checkpoint belongs to another fit."""
+    now = asdict(settings)
+    before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
+    changed = [k for k in now if before.get(k) != now[k]]
+    if extra['views'] != len(scan):
+        changed.append('views')
+    if changed:
+        raise InputError(f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
+                         'settings, or start again without --resume')

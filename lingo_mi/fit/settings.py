@@ -1,0 +1,139 @@
+"""The settings of a fit and the three recipes: every number named, with its source."""
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a fit does. Lengths are in the normalised frame, where the volume's longest side is 2; `rate_*` are Adam's step
+    sizes (first, last), decayed log-linearly. Defaults are R2-Gaussian's published values.
+
+    Length of the run
+    iterations         Adam steps
+    decay_steps        iterations over which the rates fall from first to last; 0 stands for `iterations`
+    batch              views a step
+
+    Start
+    init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume)
+    n_points           Gaussians to start with (paper: 50k)
+    init_density       'lsq', 'paper' or 'raw' for `lingo` (see `lingo_mi.lingo.density`); `r2` has its own
+    density_passes     sweeps of multiplicative density updates over all views before the first step (own)
+
+    Forward model
+    extent             cut-off in standard deviations (R2: 3)
+
+    Loss (paper, section III-C)
+    lambda_ssim        weight of 1 - SSIM (0.25)
+    lambda_tv          weight of the total variation of a random cube (0.05)
+    tv_size            voxels along its sides (32)
+    loss_scale         'none'; 'dynamic', the paper's T_g + 1 / (4 T_g) on the whole loss; or 'statistic', the same
+                       factor on the densification statistic alone (Adam cancels a constant factor anyway)
+
+    Adam
+    rate_centre, rate_density, rate_scale, rate_rotation
+    epsilon            added to the root of the second moment (R2: 1e-15)
+
+    Densification
+    densify_from, densify_until, densify_every   iterations (500, 15000, 100)
+    densify_threshold  mean gradient of the projected centre, in normalised device units (5e-5)
+    split_size         Gaussians with a larger standard deviation split, others clone (R2: 0.1 of the longest side)
+    split_keeps_mass   whether the halves of a split weigh what their parent did (R2: no)
+    prune_density      Gaussians below vanish, as do those outside the volume (1e-5)
+    max_gaussians      no densification beyond (500k)
+
+    Bounds
+    scale_min, scale_max   standard deviations (R2: 5e-4 and 0.5 of the longest side)
+    """
+
+    iterations: int = 30_000
+    decay_steps: int = 30_000
+    batch: int = 1
+    init: str = 'r2'
+    n_points: int = 50_000
+    init_density: str = 'lsq'
+    density_passes: int = 0
+    extent: float = 3.
+    lambda_ssim: float = .25
+    lambda_tv: float = .05
+    tv_size: int = 32
+    loss_scale: str = 'none'
+    rate_centre: tuple[float, float] = (2e-4, 2e-5)
+    rate_density: tuple[float, float] = (1e-2, 1e-3)
+    rate_scale: tuple[float, float] = (5e-3, 5e-4)
+    rate_rotation: tuple[float, float] = (1e-3, 1e-4)
+    epsilon: float = 1e-15
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    densify_threshold: float = 5e-5
+    split_size: float = .2
+    split_keeps_mass: bool = False
+    prune_density: float = 1e-5
+    max_gaussians: int = 500_000
+    scale_min: float = 1e-3
+    scale_max: float = 1.
+
+    def __post_init__(self):
+        def require(good, message):
+            if not good:
+                raise InputError(message)
+        require(self.iterations >= 1, f'iterations must be at least 1, not {self.iterations}')
+        require(self.batch >= 1, f'batch must be at least 1, not {self.batch}')
+        require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
+        require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
+        require(self.loss_scale in ('none', 'dynamic', 'statistic'),
+                f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
+        require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
+        require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
+        require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
+        for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'):
+            rate = getattr(self, name)
+            require(len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}')
+
+    def rate(self, name: str, iteration: int) -> float:
+        """Adam's step size for 'centre', 'density', 'scale' or 'rotation' at an iteration, counted from 0."""
+        first, last = getattr(self, f'rate_{name}')
+        share = min(iteration / max(self.decay_steps or self.iterations, 1), 1.)
+        return first ** (1 - share) * last ** share
+
+    def changed(self, **values) -> Settings:
+        """These settings with some of them replaced; values may be strings, as from a command line.
+
+        Raises InputError for an unknown name or a value of the wrong kind.
+        """
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        parsed = {}
+        for name, value in values.items():
+            if name not in known:
+                raise InputError(f'unknown setting {name!r}: one of {", ".join(known)}')
+            parsed[name] = _parse(name, value, known[name])
+        return replace(self, **parsed)
+
+
+def _parse(name, value, like):
+    if not isinstance(value, str):
+        return value
+    try:
+        if isinstance(like, tuple):
+            numbers = tuple(float(x) for x in value.split(','))
+            return numbers * 2 if len(numbers) == 1 else numbers
+        if isinstance(like, bool):
+            return {'true': True, 'false': False}[value.lower()]
+        if isinstance(like, int) and float(value) != int(float(value)):
+            raise ValueError
+        return int(float(value)) if isinstance(like, int) else type(like)(value)
+    except (ValueError, KeyError):
+        kind = {bool: 'true or false', int: 'a whole number', float: 'a number', tuple: 'two numbers, first,last'}[type(like)]
+        raise InputError(f'setting {name} must be {kind}, not {value!r}') from None
+
+
+R2 = Settings()
+LINGO = Settings(init='lingo', loss_scale='dynamic')
+FAST = Settings(
+    init='lingo', iterations=600, decay_steps=0, rate_centre=(4e-3, 4e-4), rate_density=(5e-2, 5e-3),
+    rate_scale=(5e-2, 5e-3), rate_rotation=(2e-2, 2e-3))
+
+METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2}

@@ -1,0 +1,72 @@
+"""The state of a fit: everything that a step changes, and how raw parameters become Gaussians."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+PARAMETERS = {'centre': 3, 'scale': 3, 'rotation': 4, 'density': 1}
+
+
+@dataclass
+class State:
+    """N Gaussians under optimisation, on the host: NumPy arrays, float32 but for `born`.
+
+    values             raw parameters by name, [N, 3 | 3 | 4 | 1]; see `activate`
+    first, second      Adam's moments, like `values`
+    gradient, seen     densification statistic: summed norms of the projected centre's gradient, and how often [N]
+    born               whether a Gaussian came from a clone or a split [N]
+    """
+
+    values: dict[str, np.ndarray]
+    first: dict[str, np.ndarray]
+    second: dict[str, np.ndarray]
+    gradient: np.ndarray
+    seen: np.ndarray
+    born: np.ndarray = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.born)
+
+
+def start(points, spacing, density, scale_min: float, scale_max: float) -> State:
+    """The state that begins a fit: isotropic Gaussians, unrotated, without moments.
+
+    points [N, 3], spacing [N] standard deviations, density [N] at the centres; normalised frame.
+    """
+    n = len(points)
+    scale = np.clip(spacing, scale_min + 1e-5, scale_max - 1e-5)[:, None].repeat(3, 1)
+    values = dict(centre=np.asarray(points), scale=inverse_scale(scale, scale_min, scale_max),
+                  rotation=np.tile([0., 0., 0., 1.], (n, 1)), density=inverse_softplus(np.asarray(density))[:, None])
+    values = {k: np.ascontiguousarray(v, np.float32) for k, v in values.items()}
+    zeros = {k: np.zeros_like(v) for k, v in values.items()}
+    return State(values, zeros, {k: v.copy() for k, v in zeros.items()}, np.zeros(n, np.float32),
+                 np.zeros(n, np.float32), np.zeros(n, bool))
+
+
+def activate(state: State, scale_min: float, scale_max: float):
+    """Centres, standard deviations, unit quaternions (x, y, z, w) and densities, float64 [N, ...].
+
+    Scales by a sigmoid between the bounds, densities by softplus: both R2-Gaussian's.
+    """
+    v = {k: x.astype(float) for k, x in state.values.items()}
+    rotation = v['rotation'] / np.linalg.norm(v['rotation'], axis=1, keepdims=True)
+    scale = scale_min + (scale_max - scale_min) / (1 + np.exp(-v['scale']))
+    return v['centre'], scale, rotation, softplus(v['density'][:, 0])
+
+
+def softplus(x):
+    """ln(1 + e^x), without overflow."""
+    return np.logaddexp(0., x)
+
+
+def inverse_softplus(y):
+    """x with softplus(x) = y; y below 1e-30 counts as that, since 0 has no inverse."""
+    y = np.maximum(y, 1e-30)
+    return y + np.log(-np.expm1(-y))
+
+
+def inverse_scale(scale, low: float, high: float):
+    """Raw scale of a standard deviation strictly between the bounds."""
+    share = (scale - low) / (high - low)
+    return np.log(share) - np.log1p(-share)
