@@ -1,0 +1,78 @@
+"""Test objects made by formula: no file, no download, no Mitsuba.
+
+    from lingo_mi import phantoms
+    phantoms.names()                        # ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
+    foot = phantoms.make('foot', 128)
+    foot.data, foot.spacing                 # float32 [x, y, z] in [0, 1], (2.0, 2.0, 2.0) mm
+
+Every phantom is a cube centred on the origin of the world frame. A seed decides textures, vessels and random
+clouds.
+"""
+from __future__ import annotations
+
+import importlib
+import operator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import Geometry
+
+_NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
+
+
+class Analytic(Protocol):
+    """What knows its own line integrals."""
+
+    def project(self, geometry: Geometry) -> np.ndarray:
+        """Exact line integrals, float32 [view, v, u], density times mm."""
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """A voxelised test object.
+
+    data      float32 [x, y, z] in [0, 1], voxel averages or centre values as the phantom's module says
+    spacing   voxel size, mm, (x, y, z)
+    name      its name in the registry
+    analytic  the same object with exact projections, or None where there is no closed form
+    """
+
+    data: np.ndarray
+    spacing: tuple[float, float, float]
+    name: str
+    analytic: Analytic | None = None
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """World position of the centre of the first voxel, mm."""
+        return tuple(-s * (n - 1) / 2 for s, n in zip(self.spacing, self.data.shape))
+
+
+def names() -> tuple[str, ...]:
+    """The phantoms that `make` knows, sorted."""
+    return _NAMES
+
+
+def make(name: str, size: int, seed: int = 0) -> Phantom:
+    """The phantom `name` on size^3 voxels.
+
+    seed  non-negative integer; ignored by phantoms without randomness (mesh, shepp_logan)
+
+    Raises InputError for an unknown name, a size outside 8..512 or a negative seed.
+    """
+    if name not in _NAMES:
+        raise InputError(f"there is no phantom {name!r}: choose one of {', '.join(_NAMES)}")
+    try:
+        size, seed = operator.index(size), operator.index(seed)
+    except TypeError:
+        raise InputError(f'size and seed must be whole numbers, not {size!r} and {seed!r}') from None
+    if not 8 <= size <= 512:
+        raise InputError(f'the phantom size must be 8 to 512 voxels a side, not {size}')
+    if seed < 0:
+        raise InputError(f'the seed must not be negative, not {seed}')
+    module = importlib.import_module(f'.{name}', __name__)
+    data, side, analytic = module.build(size, seed)
+    return Phantom(data, (side / size,) * 3, name, analytic)

@@ -1,0 +1,55 @@
+"""The default scan of a phantom: X3D's circular cone beam, simulated without noise."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import Geometry, circular
+from ..scan import Dataset, Scan
+from . import Phantom
+
+
+def default_geometry(phantom: Phantom, angles) -> Geometry:
+    """X3D's scanner about a phantom.
+
+    DSD 1500 and DSO 1000 mm, 512 x 512 pixels of 1/256 of the phantom's side (1 mm for a cube of 256 mm).
+    """
+    pixel = phantom.spacing[0] * phantom.data.shape[0] / 256
+    return Geometry(DSO=1000., DSD=1500., nDetector=(512, 512), dDetector=(pixel, pixel),
+                    nVoxel=phantom.data.shape, dVoxel=phantom.spacing, angles=angles)
+
+
+def simulate(phantom: Phantom, geometry: Geometry,
+             progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Noise-free line integrals, float32 [view, v, u], density times mm.
+
+    Exact projections of the object where the phantom has them, else exact ones of its trilinear voxels, which
+    need an active Mitsuba variant. progress: called as progress(views done, views) after every view.
+    """
+    if phantom.analytic is None:
+        from ..xray import grid
+        return grid.project(phantom.data, geometry, progress)
+    out = np.empty((len(geometry), *geometry.nDetector), np.float32)
+    for i in range(len(geometry)):
+        out[i] = phantom.analytic.project(geometry.subset([i]))[0]
+        if progress:
+            progress(i + 1, len(geometry))
+    return out
+
+
+def scan(phantom: Phantom, views: int = 50, seed: int = 0,
+         progress: Callable[[int, int], None] | None = None) -> Dataset:
+    """The default scan: `views` evenly spaced over [0, 180) degrees to fit, as many random ones in it held
+    out.
+
+    seed decides the held-out angles. Raises InputError unless views is at least 1.
+    """
+    if views < 1:
+        raise InputError(f'a scan needs at least one view, not {views}')
+    angles = np.concatenate([circular(views, 180.),
+                             np.sort(np.random.default_rng(seed).uniform(0, np.pi, views))])
+    geometry = default_geometry(phantom, angles)
+    both = Scan(geometry, simulate(phantom, geometry, progress))
+    return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)
