@@ -220,6 +220,7 @@ def test_mitsuba_meshes():
     (BOX.vertices, BOX.faces + 1, 'does not exist'),
     (BOX.vertices, BOX.faces[:0], 'at least one face'),
     (BOX.vertices[:, :2], BOX.faces, 'needs vertices'),
+    (BOX.vertices * 0, BOX.faces, 'no extent'),
 ])
 def test_unusable_meshes(vertices, faces, message):
     with pytest.raises(InputError, match=f"'casting'.*{message}|{message}.*'casting'") as error:

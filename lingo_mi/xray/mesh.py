@@ -147,6 +147,8 @@ def _closed(vertices, faces, name):
     if not np.isfinite(vertices[faces]).all():
         raise InputError(f'a vertex of the mesh {name!r} is not finite: mend or remove it')
     vertices, faces = _merge(vertices, faces)
+    if not len(faces):
+        raise InputError(f'the mesh {name!r} has no extent: every face has two corners in one place')
     start, end = faces.ravel(), np.roll(faces, -1, 1).ravel()
     count = len(vertices)
     there, back = np.sort(start * count + end), np.sort(end * count + start)
