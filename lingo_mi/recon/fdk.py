@@ -1,0 +1,165 @@
+"""Filtered backprojection: FDK for cone and fan beams, FBP for parallel beams (NumPy and Dr.Jit).
+
+Feldkamp, Davis, Kress, "Practical cone-beam algorithm", JOSA A 1 (1984). With tau the pixel size at the axis,
+w the distance of a voxel from the source along the central ray over DSO, and h the band-limited ramp of Kak
+and Slaney ("Principles of Computerized Tomographic Imaging", 1988, section 3.3),
+
+    f(x) = sum over views  dbeta / w^2  tau (h * [cosine p])(u(x), v(x))
+
+where the view weights dbeta sum to pi (`view_weights`). A parallel beam has w = 1 and no cosine.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import fft
+
+from ..errors import InputError
+from ..geometry import Geometry
+from ..lingo.camera import camera_matrices
+from ..scan import Scan
+
+# Apodisation of the ramp over |frequency| in units of the Nyquist frequency, f in [0, 1].
+WINDOWS = {
+    'ram-lak': lambda f: np.ones_like(f),
+    'shepp-logan': lambda f: np.sinc(f / 2),
+    'cosine': lambda f: np.cos(np.pi / 2 * f),
+    'hamming': lambda f: 0.54 + 0.46 * np.cos(np.pi * f),
+    'hann': lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
+}
+
+
+BATCH = 4  # views a launch: shares the index arithmetic and the volume's memory traffic
+
+
+def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
+    """Frequency response [size // 2 + 1] of the ramp for n pixels of size tau, zero-padded to twice as many.
+
+    It is the transform of the sampled band-limited kernel h(0) = 1 / (4 tau^2), h(odd k) = -1 / (pi k tau)^2,
+    times tau: unlike a ramp sampled in frequency, it keeps the mean right.
+
+    Raises InputError for an unknown window.
+    """
+    if window not in WINDOWS:
+        raise InputError(f'filter {window!r} is unknown: use one of {", ".join(WINDOWS)}')
+    size = fft.next_fast_len(2 * n, real=True)
+    k = np.minimum(np.arange(size), size - np.arange(size))
+    kernel = np.where(k % 2 == 1, -1 / (np.pi * np.maximum(k, 1) * tau) ** 2, 0.)
+    kernel[0] = 1 / (4 * tau ** 2)
+    response = tau * fft.rfft(kernel).real
+    return response * WINDOWS[window](np.linspace(0, 1, len(response)))
+
+
+def view_weights(geometry: Geometry) -> np.ndarray:
+    """The angle that every view stands for, [view] radians: half the gaps to its neighbours on the circle.
+
+    Angles are taken modulo a full turn (parallel: half a turn, after which a parallel beam repeats). Repeated
+    views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum
+    to pi, as they do for half a turn. An open span above half a turn is scaled to pi as a whole: there is no
+    Parker weighting, rays that were measured twice count twice. A span below half a turn keeps its own angle
+    (a limited-angle scan lacks density).
+    """
+    turn = np.pi if geometry.mode == 'parallel' else 2 * np.pi
+    angle = np.mod(geometry.angles, turn)
+    order = np.argsort(angle, kind='stable')
+    n = len(angle)
+    if n == 1:
+        return np.array([np.pi])
+    gap = np.diff(angle[order], append=angle[order[0]] + turn)  # gap after each view
+    distinct = np.sort(gap[gap > 1e-6])
+    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
+    if distinct[-1] > 1.5 * typical:  # an open span: the views at its ends stand for a typical step
+        gap[np.argmax(gap)] = typical
+    weight = np.empty(n)
+    weight[order] = (gap + np.roll(gap, 1)) / 2
+    return weight * min(1., np.pi / gap.sum())
+
+
+def voxel_matrices(geometry: Geometry) -> np.ndarray:
+    """Projection matrices [view, 3, 4] from voxel indices (i, j, k, 1) to (x w, y w, w), float64.
+
+    x, y are continuous pixel positions as in `Frames`; w is the distance from the source along the panel's
+    normal over its value at the axis (parallel: 1).
+    """
+    out = camera_matrices(geometry.frames())
+    if geometry.mode == 'cone':
+        out *= geometry.DSD / geometry.DSO  # w = 1 on the axis instead of the panel
+    first = np.array(geometry.offOrigin) + (np.array(geometry.dVoxel) - geometry.sVoxel) / 2
+    out[:, :, 3] += out[:, :, :3] @ first
+    out[:, :, :3] *= geometry.dVoxel
+    return out
+
+
+def filtered(projections, geometry: Geometry, window: str = 'ram-lak') -> np.ndarray:
+    """Cosine-weighted, ramp-filtered projections, float32 [view, v, u], per mm."""
+    n_v, n_u = geometry.nDetector
+    tau = geometry.dDetector[1]
+    if geometry.mode == 'cone':
+        u = (np.arange(n_u) - (n_u - 1) / 2) * geometry.dDetector[1] + geometry.offDetector[1]
+        v = (np.arange(n_v) - (n_v - 1) / 2) * geometry.dDetector[0] - geometry.offDetector[0]
+        cosine = geometry.DSD / np.sqrt(geometry.DSD ** 2 + u ** 2 + v[:, None] ** 2)
+        projections = projections * cosine.astype(np.float32)
+        tau *= geometry.DSO / geometry.DSD
+    response = ramp(n_u, tau, window).astype(np.float32)
+    size = fft.next_fast_len(2 * n_u, real=True)
+    return fft.irfft(fft.rfft(projections, size, workers=-1) * response, size, workers=-1)[..., :n_u]
+
+
+def _add_views(volume, views, geometry):
+    """Adds views, each (image, matrix, weight), to the volume: bilinear, nothing outside the panel."""
+    (n_v, n_u), (_, ny, nz) = geometry.nDetector, geometry.nVoxel
+    index = dr.arange(mi.UInt, int(np.prod(geometry.nVoxel)))
+    row = index // nz
+    i = row // ny
+    voxel = mi.Vector3f(mi.Float(i), mi.Float(row - i * ny), mi.Float(index - row * nz))
+    for image, matrix, weight in views:
+        x, y, w = (dr.fma(m[0], voxel.x, dr.fma(m[1], voxel.y, dr.fma(m[2], voxel.z, m[3]))) for m in matrix)
+        inv = dr.rcp(w)
+        x, y = dr.fma(x, inv, -0.5), dr.fma(y, inv, -0.5)
+        # The panel ends half a pixel outside the outermost pixel centres.
+        seen = (w > 0) & (x > -0.5) & (x < n_u - 0.5) & (y > -0.5) & (y < n_v - 0.5)
+        x, y = dr.clip(x, 0, n_u - 1), dr.clip(y, 0, n_v - 1)
+        x0, y0 = mi.UInt(x), mi.UInt(y)
+        x1, y1 = dr.minimum(x0 + 1, n_u - 1), dr.minimum(y0 + 1, n_v - 1)
+        # The image is stored v fastest, like the volume's z.
+        p = [dr.gather(mi.Float, image, column * n_v + line, seen)
+             for column in (x0, x1) for line in (y0, y1)]
+        fy = y - mi.Float(y0)
+        value = dr.lerp(dr.lerp(p[0], p[1], fy), dr.lerp(p[2], p[3], fy), x - mi.Float(x0))
+        volume = dr.fma(dr.select(seen, weight * inv * inv, 0), value, volume)
+    return volume
+
+
+def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
+    """Reconstruct a volume by filtered backprojection: float32 [x, y, z], density per mm.
+
+    scan       cone (one detector row: fan) or parallel, detector offsets included; the panel must see the
+               whole width of the object, otherwise the truncated rows are filtered as they are
+    filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'
+    progress   called as progress(views done, views) after every few views
+
+    A voxel outside a view's panel gets nothing from that view. With one detector row only the slice in the
+    plane of the fan is meaningful. One compiled kernel serves all views.
+
+    Raises InputError for an unknown filter.
+    """
+    geometry = scan.geometry
+    ramp(geometry.nDetector[1], 1., filter)  # an unknown name must fail before the work
+    volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    dr.make_opaque(volume)
+    matrices, weights = voxel_matrices(geometry), view_weights(geometry)
+    n = len(geometry)
+    for start in range(0, n, BATCH):
+        images = filtered(scan.projections[start:start + BATCH], geometry, filter).transpose(0, 2, 1)
+        views = []
+        for i in range(start, start + BATCH):  # the last batch is filled with views of weight zero
+            weight, i = (weights[i], i) if i < n else (0., start)
+            views.append((mi.Float(np.ascontiguousarray(images[i - start]).ravel()),
+                          [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
+                          dr.opaque(mi.Float, float(weight))))
+        volume = _add_views(volume, views, geometry)
+        dr.eval(volume)
+        if progress:
+            progress(min(start + BATCH, n), n)
+    return volume.numpy().reshape(geometry.nVoxel)
