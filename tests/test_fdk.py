@@ -1,25 +1,18 @@
 """Filtered backprojection: densities, positions, spans, filters, and a measured fan-beam scan."""
-import os
-from pathlib import Path
-
+import drjit as dr
 import numpy as np
 import pytest
 
-from lingo_mi.runtime import use_variant
-
-use_variant()
-
-import drjit as dr  # noqa: E402
-
-from lingo_mi.errors import InputError  # noqa: E402
-from lingo_mi.geometry import Geometry, circular  # noqa: E402
-from lingo_mi.recon.fdk import WINDOWS, fdk, ramp, view_weights, voxel_matrices  # noqa: E402
-from lingo_mi.scan import Scan  # noqa: E402
+from lingo_mi.errors import InputError
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.recon.fdk import WINDOWS, fdk, ramp, view_weights, voxel_matrices
+from lingo_mi.scan import Scan
 
 
 def geometry(mode='cone', angles=None, **changes):
     settings = dict(DSO=300., DSD=450., nDetector=(64, 72), dDetector=(3., 3.), nVoxel=(32, 36, 28),
-                    dVoxel=(4., 3.6, 4.4), angles=circular(360, start=3) if angles is None else angles, mode=mode,
+                    dVoxel=(4., 3.6, 4.4), mode=mode,
+                    angles=circular(360, start=3) if angles is None else angles,
                     offOrigin=(5., -4., 3.), offDetector=(4., -7.))
     return Geometry(**{**settings, **changes})
 
@@ -39,7 +32,7 @@ def ellipsoids(geo, *bodies):
 
 
 def centres(geo):
-    axes = [(np.arange(n) + 0.5) * d - n * d / 2 + o for n, d, o in zip(geo.nVoxel, geo.dVoxel, geo.offOrigin)]
+    axes = [(np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geo.nVoxel, geo.dVoxel, geo.offOrigin)]
     return np.stack(np.meshgrid(*axes, indexing='ij'), -1)
 
 
@@ -60,12 +53,13 @@ def test_ball_density_and_position_with_offsets(mode):
 
 def test_asymmetric_phantom_axis_by_axis():
     geo = geometry(angles=circular(120))
-    bodies = [(np.array([30., 0., 0.]), np.array([12.] * 3), 0.01), (np.array([0., 30., 0.]), np.array([12.] * 3), 0.02),
-              (np.array([0., 0., 30.]), np.array([12.] * 3), 0.03), (np.array([0., -30., 0.]), np.array([12.] * 3), 0.04)]
+    axes = np.array([12., 12., 12.])
+    bodies = [(np.array([30., 0., 0.]), axes, 0.01), (np.array([0., 30., 0.]), axes, 0.02),
+              (np.array([0., 0., 30.]), axes, 0.03), (np.array([0., -30., 0.]), axes, 0.04)]
     volume, x = fdk(ellipsoids(geo, *bodies)), centres(geo)
     for centre, _, density in bodies:
         inside = np.linalg.norm(x - centre, axis=-1) < 7
-        assert abs(volume[inside].mean() / density - 1) < 0.06  # the cone's missing data off the central plane
+        assert abs(volume[inside].mean() / density - 1) < 0.06  # a cone misses data off the central plane
         opposite = np.linalg.norm(x + centre * [1, 0, 1], axis=-1) < 7
         if centre[1] == 0:
             assert abs(volume[opposite].mean()) < 0.2 * density
@@ -93,7 +87,8 @@ def test_view_weights():
     np.testing.assert_allclose(full, np.pi / 8)
     np.testing.assert_allclose(view_weights(geometry(angles=circular(8, 180))), np.pi / 8)
     np.testing.assert_allclose(view_weights(geometry('parallel', circular(8))), np.pi / 8)
-    np.testing.assert_allclose(view_weights(geometry(angles=circular(9, 90))), np.radians(10))  # limited angle
+    limited = view_weights(geometry(angles=circular(9, 90)))
+    np.testing.assert_allclose(limited, np.radians(10))
     np.testing.assert_allclose(view_weights(geometry(angles=[1.])), np.pi)
     doubled = view_weights(geometry(angles=np.append(circular(8), 2 * np.pi)))  # the first view twice
     np.testing.assert_allclose(doubled.sum(), np.pi)
@@ -132,14 +127,15 @@ def test_fan_beam_of_one_row():
     assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.01
 
 
-def test_measured_fan_beam():
-    folder = os.environ.get('LINGO_MI_DATA')
-    if not folder or not (Path(folder) / 'htc2022_fan.npz').exists():
-        pytest.skip('LINGO_MI_DATA does not name a folder with htc2022_fan.npz')
-    data = np.load(Path(folder) / 'htc2022_fan.npz')
+def test_measured_fan_beam(data):
+    file = data / 'htc2022_fan.npz'
+    if not file.exists():
+        pytest.skip(f'LINGO_MI_DATA holds no {file.name}')
+    data = np.load(file)
     voxel = 0.1483
-    geo = Geometry(float(data['DSO']), float(data['DSD']), (1, 560), float(data['dDetector']), (512, 512, 1), voxel,
-                   np.radians(data['angles_deg'][:-1]))  # the last view repeats the first
+    angles = np.radians(data['angles_deg'][:-1])  # the last view repeats the first
+    geo = Geometry(float(data['DSO']), float(data['DSD']), (1, 560), float(data['dDetector']), (512, 512, 1),
+                   voxel, angles)
     volume = fdk(Scan(geo, data['sinogram_ta'][:-1, None]))[..., 0]
     reference = data['fbp_ta']
     assert np.corrcoef(volume.ravel(), reference.ravel())[0, 1] > 0.99

@@ -1,22 +1,18 @@
-"""The voxel projector against closed forms, float64 quadrature, its own transpose, and the axis conventions."""
+"""The voxel projector against closed forms, float64 quadrature, its own transpose, and the conventions."""
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.runtime import use_variant
-
-use_variant()
-
-import drjit as dr  # noqa: E402
-import mitsuba as mi  # noqa: E402
-
-from lingo_mi.errors import InputError  # noqa: E402
-from lingo_mi.geometry import Geometry, circular  # noqa: E402
-from lingo_mi.xray.grid import backproject, line_integrals, project, view_rays, view_table  # noqa: E402
+from lingo_mi.errors import InputError
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.xray.grid import backproject, line_integrals, project, view_rays, view_table
 
 
 def scan(mode='cone', n=4, **changes):
-    settings = dict(DSO=200., DSD=300., nDetector=(17, 21), dDetector=(3., 2.6), nVoxel=(9, 11, 7), dVoxel=(4., 3., 5.),
-                    angles=circular(n, start=11), mode=mode, offOrigin=(3., -2., 1.), offDetector=(2., -4.))
+    settings = dict(DSO=200., DSD=300., nDetector=(17, 21), dDetector=(3., 2.6), nVoxel=(9, 11, 7),
+                    dVoxel=(4., 3., 5.), angles=circular(n, start=11), mode=mode,
+                    offOrigin=(3., -2., 1.), offDetector=(2., -4.))
     return Geometry(**{**settings, **changes})
 
 
@@ -51,7 +47,8 @@ def quadrature(volume, box_min, voxel, origin, direction, n=40001):
             out.append(0.)
             continue
         t = t0 + (np.arange(n) + 0.5) / n * (t1 - t0)
-        out.append(interpolate(volume, box_min, voxel, o + t[:, None] * d).mean() * (t1 - t0) * np.linalg.norm(d))
+        mean = interpolate(volume, box_min, voxel, o + t[:, None] * d).mean()
+        out.append(mean * (t1 - t0) * np.linalg.norm(d))
     return np.array(out)
 
 
@@ -76,7 +73,8 @@ def test_against_quadrature(shape):
     origin, direction = rays(rng, 40, box_min, box_max)
     expected = quadrature(volume, box_min, voxel, origin, direction)
     assert np.count_nonzero(expected) > 30
-    np.testing.assert_allclose(integrate(volume, box_min, box_max, origin, direction), expected, rtol=2e-5, atol=2e-5)
+    result = integrate(volume, box_min, box_max, origin, direction)
+    np.testing.assert_allclose(result, expected, rtol=2e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
@@ -99,7 +97,8 @@ def test_constant_cube_gives_the_chord():
     box_min, box_max = np.array([-1., -2, -3]), np.array([2., 2, 1])
     origin, direction = rays(rng, 200, box_min, box_max)
     a, b = (box_min - origin) / direction, (box_max - origin) / direction
-    chord = np.maximum(np.maximum(a, b).min(1) - np.minimum(a, b).max(1), 0) * np.linalg.norm(direction, axis=1)
+    chord = np.maximum(np.maximum(a, b).min(1) - np.minimum(a, b).max(1), 0)
+    chord *= np.linalg.norm(direction, axis=1)
     result = integrate(np.full((5, 8, 3), 2.), box_min, box_max, origin, direction)
     np.testing.assert_allclose(result, 2 * chord, rtol=1e-5, atol=1e-5)
 
@@ -197,12 +196,12 @@ def test_axis_conventions():
 
 
 def test_panel_offset_moves_the_image_the_other_way():
-    geometry = scan(nVoxel=(9, 9, 9), dVoxel=(3., 3., 3.), dDetector=(3., 2.5), nDetector=(31, 31),
-                    offOrigin=(0., 0., 0.), offDetector=(0., 0.))
+    settings = dict(nVoxel=(9, 9, 9), dVoxel=(3., 3., 3.), dDetector=(3., 2.5), nDetector=(31, 31),
+                    offOrigin=(0., 0., 0.))
+    geometry = scan(**settings, offDetector=(0., 0.))
     volume = np.random.default_rng(0).random(geometry.nVoxel)
     centred = project(volume, geometry)
-    shifted = project(volume, scan(nVoxel=(9, 9, 9), dVoxel=(3., 3., 3.), dDetector=(3., 2.5), nDetector=(31, 31),
-                                   offOrigin=(0., 0., 0.), offDetector=(6., 5.)))
+    shifted = project(volume, scan(**settings, offDetector=(6., 5.)))
     # Two rows towards +z (smaller row numbers), two columns towards +u.
     np.testing.assert_allclose(shifted[:, 2:, :-2], centred[:, :-2, 2:], rtol=1e-4, atol=1e-4)
 

@@ -38,8 +38,7 @@ def _clip(origin, direction, low, high, t_min, t_max):
 
 
 def _first_planes(origin, direction, t):
-    """Integers per axis: the plane that a ray at t meets next, the step to the one after, the offset of its
-    cell."""
+    """The planes that a ray at t meets next, the steps to the ones after, the offsets of the cells."""
     start = dr.fma(direction, t, origin)
     up = direction > 0
     plane = mi.Vector3i(dr.select(up, dr.floor(start) + 1, dr.ceil(start) - 1))
@@ -94,8 +93,7 @@ def _segment_weights(weight, value, far, d, length, middle):
 
 
 def _cell_address(plane, step, size):
-    """Flat index of a cell's near corner and the offsets to the far corners per axis, clamped like
-    `_corners`."""
+    """Index of a cell's near corner and the offsets to the far ones per axis, clamped like `_corners`."""
     far = [dr.clip(plane[i], 0, n - 1) for i, n in enumerate(size)]
     near = [dr.clip(plane[i] - step[i], 0, n - 1) for i, n in enumerate(size)]
     stride = (size[1] * size[2], size[2], 1)
