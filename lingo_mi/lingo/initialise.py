@@ -1,0 +1,142 @@
+"""LINGO's initial cloud (paper, section III-A and III-B), from projections alone. NumPy and SciPy."""
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import InputError
+from ..geometry import Frames
+from .density import FACTORS, MODES, least_squares_factor, mean_pixel
+from .ipsd import neighbour_distance
+from .masks import masks
+from .scaling import occupancy, scale_factor, scaled_grid
+from .voxel_filter import valid_voxels, voxel_centres
+
+
+@dataclass(frozen=True)
+class InitialCloud:
+    """What a fit starts from, in the normalised frame.
+
+    points   float64 [N, 3]
+    density  float64 [N], value at the centre, in units of the volume's density
+    spacing  float64 [N], suggested standard deviation: rms distance to the three nearest neighbours
+    info     how it came about (numbers and strings only)
+    """
+
+    points: np.ndarray
+    density: np.ndarray
+    spacing: np.ndarray
+    info: dict = field(default_factory=dict, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters of the initialisation, each with its source.
+
+    n_points       points of the cloud (paper, implementation details: 50k)
+    high_fraction  share of the points that the high-density set gives (paper: 25 %)
+    low_factor     T_l = low_factor T_h (section III-A: 0.1)
+    resolution     V of the coarse grid for the occupancy (section III-B: 16)
+    V_S            upper bound of the voxel scaling (section III-B: 20)
+    density        'lsq', 'paper' or 'raw', see `density` (the paper is silent on the factor)
+    lsq_views      evenly spaced views that the factor of 'lsq' is solved on (own choice: a few determine one
+                   number)
+    misses         views that may miss a valid cell (paper: 0)
+    outside        'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`
+    """
+
+    n_points: int = 50_000
+    high_fraction: float = 0.25
+    low_factor: float = 0.1
+    resolution: int = 16
+    V_S: float = 20.
+    density: str = 'lsq'
+    lsq_views: int = 8
+    misses: int = 0
+    outside: str = 'invalid'
+
+    def __post_init__(self):
+        if self.n_points < 1 or self.resolution < 1 or self.lsq_views < 1:
+            raise InputError('n_points, resolution and lsq_views must be at least 1')
+        if not 0 <= self.high_fraction <= 1:
+            raise InputError(f'high_fraction must lie in [0, 1], not {self.high_fraction}')
+        if self.density not in MODES:
+            raise InputError(f'density {self.density!r} is unknown: use one of {", ".join(MODES)}')
+
+
+def draw(cells, count: int, rng):
+    """Draw `count` of the cells, without replacement while they last: (cells [count], is a repeat [count]).
+
+    When there are fewer cells than points, every cell is taken once, then again, as evenly as it goes.
+    """
+    rounds = [rng.permutation(cells) for _ in range(max(-(-count // len(cells)), 1))]
+    return np.concatenate(rounds)[:count], np.arange(count) >= len(cells)
+
+
+def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = Settings(), rng=None,
+               render=None) -> InitialCloud:
+    """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
+
+    frames       n views in the normalised frame (`Geometry.normalised_frames`)
+    projections  [n, v, u] normalised line integrals (`Scan.normalised`)
+    nVoxel       V_d, the volume's voxels (x, y, z); a single slice (fan beam) is fine
+    half         half the volume's sides in the normalised frame, [3] (`Geometry.half`)
+    rng          numpy Generator (default: seed 0)
+    render       for density 'lsq': render(points, density, spacing, views) -> projections [len(views), v, u]
+                 of that cloud of isotropic Gaussians, for the view indices `views`
+
+    Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid; points of the low set
+    sit at the cell centres, but for repeats (there may be fewer valid cells than points), which are jittered
+    too. There is no jitter along an axis of one cell. An empty high set leaves all the points to the low set.
+    A point's density is that of its cell.
+
+    Raises InputError where no cell is valid, or where 'lsq' has no `render`.
+    """
+    begun = time.perf_counter()
+    rng = np.random.default_rng(0) if rng is None else rng
+    projections = np.asarray(projections, np.float32)
+    if settings.density == 'lsq' and render is None:
+        raise InputError("density 'lsq' needs a render function: give one, or choose 'paper' or 'raw'")
+
+    found = masks(projections, settings.low_factor)
+    P = occupancy(frames, found, half, nVoxel, settings.resolution, settings.misses, settings.outside)
+    S = scale_factor(P, settings.V_S)
+    grid = scaled_grid(nVoxel, S)
+    low, high = valid_voxels(frames, found, grid, half, settings.misses, settings.outside)
+    if len(low) == 0:
+        raise InputError('no voxel lies in the low-density mask of every view: check the geometry and '
+                         "the volume's size, or, for a truncated scan, set outside='ignore' or misses > 0")
+
+    n_high = round(settings.n_points * settings.high_fraction) if len(high) else 0
+    n_low = settings.n_points - n_high
+    cells, repeat = draw(low, n_low, rng)
+    jittered, repeats = repeat, np.count_nonzero(repeat)
+    if n_high:
+        more, again = draw(high, n_high, rng)
+        repeats += np.count_nonzero(again)
+        cells, jittered = np.concatenate([more, cells]), np.concatenate([np.ones(n_high, bool), repeat])
+    centres = voxel_centres(grid, half, cells)
+    size = 2 * np.asarray(half, float) / grid
+    jitter = rng.uniform(-0.5, 0.5, centres.shape) * (np.array(grid) > 1)
+    points = np.where(jittered[:, None], centres + jitter * size, centres)
+
+    unique, inverse = np.unique(cells, return_inverse=True)
+    density = mean_pixel(frames, projections, voxel_centres(grid, half, unique))[inverse]
+    spacing = neighbour_distance(points, fallback=size.min())
+    if settings.density == 'lsq':
+        n = len(frames)
+        views = np.unique(np.arange(min(n, settings.lsq_views)) * n // min(n, settings.lsq_views))
+        factor = least_squares_factor(projections[views], render(points, density, spacing, views))
+    else:
+        factor = FACTORS[settings.density]
+    return InitialCloud(points, density * factor, spacing, {
+        'method': 'lingo', 'P': P, 'S': S, 'grid': grid,
+        'density': settings.density, 'density_factor': factor,
+        'cells_low': len(low), 'cells_high': len(high), 'points_low': n_low, 'points_high': n_high,
+        'repeats': repeats,
+        'T_high': float(found.t_high.mean()), 'seconds': time.perf_counter() - begun})

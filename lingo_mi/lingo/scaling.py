@@ -1,0 +1,30 @@
+"""Voxel scaling for spatial occupancy (paper, section III-B). Pure NumPy."""
+from __future__ import annotations
+
+import numpy as np
+
+from ..geometry import Frames
+from .masks import Masks
+from .voxel_filter import valid_voxels
+
+
+def occupancy(frames: Frames, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0,
+              outside: str = 'invalid') -> float:
+    """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
+
+    An axis with fewer than V voxels keeps them (a single slice stays one cell thick), and the count is
+    divided by the cells there are. The other arguments are those of `valid_voxels`.
+    """
+    coarse = np.minimum(resolution, nVoxel)
+    low, _ = valid_voxels(frames, masks, coarse, half, misses, outside)
+    return len(low) / float(np.prod(coarse))
+
+
+def scale_factor(P: float, V_S: float = 20.) -> float:
+    """S = max(P V_S, 1)."""
+    return max(P * V_S, 1.)
+
+
+def scaled_grid(nVoxel, S: float, smallest: int = 8) -> tuple[int, int, int]:
+    """V_ds = V_d / S, rounded to whole cells, at least `smallest` (or all, where there are fewer)."""
+    return tuple(max(int(n / S + 0.5), min(smallest, int(n))) for n in nVoxel)
