@@ -1,0 +1,302 @@
+"""What the fit minimises: L1 and SSIM of a projection, total variation of a cube of voxels.
+
+SSIM's window is separable, so all of it is four kernels: filter along columns; filter along rows and compare; and the
+two adjoint filters. In each, a lane makes TILE consecutive pixels of a line from TILE + 2 REACH taps, which it keeps in
+registers, and the four maps that SSIM filters travel as one packet a pixel. The packets between column and row filters
+are stored transposed, so that neighbouring lanes always read neighbouring packets.
+
+Line integrals are not small: E[x^2] - mu^2 at 10 would lose to rounding what SSIM compares with C2 = 9e-4. Therefore
+nothing is measured from zero:
+
+    a filter       takes its taps relative to the line's middle pixel, which lies in all of its windows; the variance of
+                   a window is the mean variance of its columns plus the variance of the columns' means
+    between them   means are kept relative to their *tile's origin*, the pixel in the middle of TILE x TILE of them
+    the adjoint    filters linear functions of the two images, e + g (y - y0) - h (x - x0), with the same origins; a
+                   function is carried over to the next tile by adding the step between the origins
+"""
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import InputError
+from ..metrics import C1, C2, WINDOW
+
+TILE = 8
+REACH = len(WINDOW) // 2
+TAPS = range(-REACH, TILE + REACH)
+
+
+def l1(image, truth):
+    """Mean absolute error of two arrays Float [N], in their own unit. Subgradient 0 where they agree."""
+    difference = image - truth
+    return dr.mean(difference * dr.detach(_sign(difference)))
+
+
+def ssim(image, truth, height: int, width: int):
+    """Mean SSIM of an image with its truth, both Float [height * width], row by row; full scale is 1.
+
+    Wang et al. (IEEE TIP 2004) in the form of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5,
+    zeros around the images, C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode;
+    the truth is a constant. InputError where the two do not have that many pixels.
+    """
+    return 1 - _photometric(image, truth, height, width, 0., 1.)
+
+
+def combined(image, truth, height: int, width: int, lambda_ssim: float = .25):
+    """L1 + lambda_ssim (1 - SSIM) in one operation, with the arguments of `ssim`.
+
+    Differentiable in the image, in reverse mode; InputError as for `ssim`.
+    """
+    return _photometric(image, truth, height, width, 1., lambda_ssim)
+
+
+def tv(volume, shape: tuple[int, int, int]):
+    """Mean absolute difference of neighbouring voxels along the three axes.
+
+    volume : Float [nz * ny * nx], x fastest
+    shape  : (nz, ny, nx); an axis of one voxel has no differences
+
+    Subgradient 0 where neighbours agree; 0 for a single voxel. Differentiable in reverse mode. InputError where the
+    volume does not have that many voxels.
+    """
+    _check_size('volume', volume, *shape)
+    return dr.custom(_TotalVariation, volume, tuple(shape))
+
+
+def _photometric(image, truth, height, width, weight_l1, weight_ssim):
+    _check_size('image', image, height, width)
+    _check_size('truth', truth, height, width)
+    return dr.custom(_Photometric, image, dr.detach(truth), height, width, weight_l1, weight_ssim,
+                     dr.grad_enabled(image))
+
+
+def _check_size(what, array, *shape):
+    if dr.width(array) != math.prod(shape):
+        raise InputError(f'the {what} has {dr.width(array)} values, not {" x ".join(map(str, shape))}')
+
+
+class _Photometric(dr.CustomOp):
+    """weight_l1 L1 + weight_ssim (1 - SSIM)."""
+
+    def eval(self, image, truth, height, width, weight_l1, weight_ssim, derivative):
+        dr.eval(image, truth)
+        scale = 1 / (height * width)
+        self.weights = dr.opaque(mi.Float, weight_l1 * scale), dr.opaque(mi.Float, weight_ssim * scale)
+        self.tiles = _Tiles(image, truth, height, width)
+        loss_l1, columns = self.tiles.columns()
+        dr.eval(loss_l1, columns)
+        loss_ssim, self.slopes = self.tiles.rows(columns, derivative)
+        dr.eval(loss_ssim, self.slopes)
+        return self.weights[0] * dr.sum(loss_l1) + self.weights[1] * dr.sum(loss_ssim)
+
+    def backward(self):
+        slopes = self.tiles.rows_adjoint(self.slopes)
+        dr.eval(slopes)
+        upstream = self.grad_out()
+        dr.make_opaque(upstream)
+        self.set_grad_in('image', self.tiles.columns_adjoint(slopes, *(w * upstream for w in self.weights)))
+
+    def name(self):
+        return 'photometric loss'
+
+
+class _Tiles:
+    """The four filters of a pair of images."""
+
+    def __init__(self, image, truth, height, width):
+        self.image, self.truth, self.height, self.width = image, truth, height, width
+        self.down, self.across = -(-height // TILE), -(-width // TILE)  # tiles
+        self.padded_height, self.padded_width = self.down * TILE, self.across * TILE
+
+    def columns(self):
+        """Filter along columns; returns sums of |x - y|, and per pixel (mean of x, of y, variance, covariance).
+
+        The variance is the sum of both images': SSIM needs no more.
+        """
+        lane = dr.arange(mi.Int32, self.down * self.padded_width)
+        tile, column = lane // self.padded_width, lane % self.padded_width
+        x, y = self._pixels(tile, column, TAPS)
+        x0, y0 = x[REACH + TILE // 2], y[REACH + TILE // 2]
+        loss, taps = mi.Float(0), []
+        for k, u, v in zip(TAPS, x, y):
+            if 0 <= k < TILE:
+                loss += dr.abs(u - v)
+            taps.append(_moments(u - x0, v - y0))
+        ox, oy = self._origin(tile, column // TILE)
+        target = dr.empty(mi.Float, 4 * self.padded_width * self.padded_height)
+        for k, m in enumerate(_blur(taps)):
+            mx, my, variance, covariance = _central(*m)
+            packet = mi.Vector4f(mx + (x0 - ox), my + (y0 - oy), variance, covariance)
+            dr.scatter(target, packet, column * self.padded_height + tile * TILE + k, mode=dr.ReduceMode.Permute)
+        return loss, target
+
+    def rows(self, columns, derivative):
+        """Filter along rows; returns sums of 1 - SSIM, and per pixel SSIM's derivative as the packet (e, g, h, 0)."""
+        tile, row, taps, origins = self._row(columns, self.padded_height)
+        middle = taps[REACH + TILE // 2]
+        x0, y0 = middle.x, middle.y
+        moments = []
+        for k, m in zip(TAPS, taps):
+            dx, dy = self._step(origins, k)
+            x, y, squares, product = _moments(m.x + (dx - x0), m.y + (dy - y0))
+            moments.append((x, y, squares + m.z, product + m.w))
+        ox, oy = origins[1]
+        loss = mi.Float(0)
+        target = dr.empty(mi.Float, 4 * self.padded_width * self.height if derivative else 0)
+        for k, m in enumerate(_blur(moments)):
+            mx, my, variance, covariance = _central(*m)
+            inside = tile * TILE + k < self.width
+            dissimilarity, slopes = _compare(mx + x0, my + y0, ox, oy, variance, covariance)
+            loss += dr.select(inside, dissimilarity, 0)
+            if derivative:
+                dr.scatter(target, dr.select(inside, slopes, 0), (tile * TILE + k) * self.height + row,
+                           mode=dr.ReduceMode.Permute)
+        return loss, target
+
+    def rows_adjoint(self, slopes):
+        """Filter the derivatives along rows."""
+        tile, row, taps, origins = self._row(slopes, self.height)
+        target = dr.empty(mi.Float, 4 * self.padded_width * self.height)
+        for k, s in enumerate(_blur([self._carry(origins, k, s) for k, s in zip(TAPS, taps)])):
+            dr.scatter(target, mi.Vector4f(*s, 0), row * self.padded_width + tile * TILE + k,
+                       mode=dr.ReduceMode.Permute)
+        return target
+
+    def columns_adjoint(self, slopes, factor_l1, factor_ssim):
+        """Filter the derivatives along columns and apply them; returns the gradient of the image."""
+        lane = dr.arange(mi.Int32, self.down * self.width)
+        tile, column = lane // self.width, lane % self.width
+        index = tile * (TILE * self.padded_width) + column
+        taps = [dr.gather(mi.Vector4f, slopes, index + k * self.padded_width, self._inside(tile, k, self.height))
+                for k in TAPS]
+        origins = [self._origin(tile + s, column // TILE, self._inside(tile, s * TILE, self.height))
+                   for s in (-1, 0, 1)]
+        ox, oy = origins[1]
+        x, y = self._pixels(tile, column, range(TILE))
+        target = dr.empty(mi.Float, self.height * self.width)
+        for k, (e, g, h) in enumerate(_blur([self._carry(origins, k, s) for k, s in zip(TAPS, taps)])):
+            slope = e + g * (y[k] - oy) - h * (x[k] - ox)
+            dr.scatter(target, factor_l1 * _sign(x[k] - y[k]) - factor_ssim * slope,
+                       (tile * TILE + k) * self.width + column, self._inside(tile, k, self.height),
+                       mode=dr.ReduceMode.Permute)
+        return target
+
+    def _pixels(self, tile, column, taps):
+        """Both images at taps of the column of a tile, zero outside."""
+        index = tile * (TILE * self.width) + column
+        active = [self._inside(tile, k, self.height) & (column < self.width) for k in taps]
+        return tuple([dr.gather(mi.Float, x, index + k * self.width, a) for k, a in zip(taps, active)]
+                     for x in (self.image, self.truth))
+
+    def _row(self, packed, stride):
+        """A tile's row, its taps in packets stored column by column, and the origins of it and its neighbours."""
+        lane = dr.arange(mi.Int32, self.across * self.height)
+        tile, row = lane // self.height, lane % self.height
+        inside = {s: self._inside(tile, s * TILE, self.padded_width) for s in (-1, 0, 1)}
+        index = tile * (TILE * stride) + row
+        taps = [dr.gather(mi.Vector4f, packed, index + k * stride, inside[k // TILE]) for k in TAPS]
+        return tile, row, taps, [self._origin(row // TILE, tile + s, inside[s]) for s in (-1, 0, 1)]
+
+    def _origin(self, down, across, active=True):
+        """Both images in the middle of a tile (or the last pixel before it, if the tile is cut off)."""
+        row = dr.minimum(down * TILE + TILE // 2, self.height - 1)
+        column = dr.minimum(across * TILE + TILE // 2, self.width - 1)
+        index = row * self.width + column
+        return dr.gather(mi.Float, self.image, index, active), dr.gather(mi.Float, self.truth, index, active)
+
+    @staticmethod
+    def _inside(tile, k, size):
+        """Whether tap k of a tile lies in the image, along an axis of `size` pixels."""
+        return tile > 0 if k < 0 else tile * TILE + k < size
+
+    @staticmethod
+    def _step(origins, k):
+        """The origin of tap k's tile relative to that of the tile itself."""
+        if 0 <= k < TILE:
+            return mi.Float(0), mi.Float(0)
+        there, here = origins[k // TILE + 1], origins[1]
+        return there[0] - here[0], there[1] - here[1]
+
+    def _carry(self, origins, k, s):
+        """The linear function of tap k with the tile's own origin."""
+        if 0 <= k < TILE:
+            return s.x, s.y, s.z
+        dx, dy = self._step(origins, k)
+        return dr.fma(s.z, dx, dr.fma(-s.y, dy, s.x)), s.y, s.z
+
+
+def _sign(x):
+    return dr.select(x > 0, mi.Float(1), dr.select(x < 0, mi.Float(-1), 0))
+
+
+def _moments(x, y):
+    return x, y, dr.fma(x, x, y * y), x * y
+
+
+def _central(mx, my, squares, product):
+    """Means, variance and covariance from means of (x, y, x^2 + y^2, x y)."""
+    return mx, my, squares - dr.fma(mx, mx, my * my), dr.fma(-mx, my, product)
+
+
+def _blur(taps):
+    """The TILE windows' means of TILE + 2 REACH consecutive tuples."""
+    weights = [mi.Float(float(w)) for w in WINDOW[REACH:]]
+    fma = dr.fma
+    maps = []
+    for values in zip(*taps):  # plain numbers trace in half the time of packets
+        means = []
+        for i in range(REACH, REACH + TILE):
+            mean = values[i] * weights[0]
+            for k in range(1, REACH + 1):
+                mean = fma(values[i - k] + values[i + k], weights[k], mean)
+            means.append(mean)
+        maps.append(means)
+    return list(zip(*maps))
+
+
+def _compare(mx, my, ox, oy, variance, covariance):
+    """1 - SSIM from means relative to an origin (ox, oy), and SSIM's derivative (e, g, h, 0) with that origin."""
+    x, y, dm = mx + ox, my + oy, (my - mx) + (oy - ox)
+    b1 = dr.fma(x, x, y * y) + C1
+    b2 = variance + C2
+    inverse = 1 / (b1 * b2)
+    i1, i2 = inverse * b2, inverse * b1
+    luminance = dr.fma(2 * x, y, C1) * i1
+    structure = dr.fma(2, covariance, C2) * i2
+    g = 2 * luminance * i2
+    h = g * structure
+    # The luminance's derivative, 2 (y - x luminance) / b1, is written without that cancellation.
+    e = 2 * structure * i1 * i1 * dm * dr.fma(y, x + y, C1) - g * my + h * mx
+    return dr.fma(-luminance, structure, 1), mi.Vector4f(e, g, h, 0)
+
+
+class _TotalVariation(dr.CustomOp):
+    def eval(self, volume, shape):
+        nz, ny, nx = shape
+        i = dr.arange(mi.Int32, nz * ny * nx)
+        places = i % nx, i // nx % ny, i // (nx * ny)
+        total, self.slope = mi.Float(0), mi.Float(0)
+        count = 0
+        for place, size, stride in zip(places, (nx, ny, nz), (1, nx, nx * ny)):
+            if size > 1:
+                count += (size - 1) * (nz * ny * nx // size)
+                ahead = dr.gather(mi.Float, volume, i + stride, place + 1 < size)
+                behind = dr.gather(mi.Float, volume, i - stride, place > 0)
+                after = dr.select(place + 1 < size, ahead - volume, 0)
+                before = dr.select(place > 0, volume - behind, 0)
+                total += dr.abs(after)
+                self.slope += _sign(before) - _sign(after)
+        self.scale = 1 / max(count, 1)
+        dr.eval(total, self.slope)
+        return dr.sum(total) * self.scale
+
+    def backward(self):
+        upstream = self.grad_out()
+        dr.make_opaque(upstream)
+        self.set_grad_in('volume', self.slope * (upstream * self.scale))
+
+    def name(self):
+        return 'total variation'
