@@ -23,7 +23,7 @@ def densify(state: State, settings: Settings, half, rng) -> State:
     rng    numpy Generator; places the halves of splits
     """
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
-    _, scale, _, _ = activate(state, settings.scale_min, settings.scale_max)
+    _, scale, _, _ = activate(state, settings)
     strong = mean >= settings.densify_threshold
     if len(state) + strong.sum() > settings.max_gaussians:
         strong[:] = False
@@ -43,7 +43,7 @@ def split(state: State, chosen, settings: Settings, rng) -> State:
     """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.scale_min, settings.scale_max
-    centre, scale, rotation, _ = activate(state, low, high)
+    centre, scale, rotation, _ = activate(state, settings)
     factor = .5 * SHRINK ** 3 if settings.split_keeps_mass else .5
     children = _fresh(_with_density(state, chosen, factor), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
@@ -55,7 +55,7 @@ def split(state: State, chosen, settings: Settings, rng) -> State:
 
 def prune(state: State, settings: Settings, half) -> State:
     """Remove Gaussians whose density is below the bound or whose centre left the volume; clear the statistic."""
-    centre, _, _, density = activate(state, settings.scale_min, settings.scale_max)
+    centre, _, _, density = activate(state, settings)
     keep = (density >= settings.prune_density) & (np.abs(centre) <= np.asarray(half)).all(1)
     kept = _take(state, keep)
     kept.gradient[:], kept.seen[:] = 0, 0

@@ -68,7 +68,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0., [], dict(initial.info)
-        state = DeviceState(start(points, initial.spacing, initial.density, settings.scale_min, settings.scale_max))
+        state = DeviceState(start(points, initial.spacing, initial.density / stepper.unit, settings))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()
 

@@ -19,8 +19,12 @@ class Settings:
     Start
     init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume)
     n_points           Gaussians to start with (paper: 50k)
-    init_density       'lsq', 'paper' or 'raw' for `lingo` (see `lingo_mi.lingo.density`); `r2` has its own
-    density_passes     sweeps of multiplicative density updates over all views before the first step (own)
+    high_fraction, low_factor, occupancy_voxels, V_S, misses, outside, init_density
+                       of `lingo`: see `lingo_mi.lingo.initialise.Settings`
+    fdk_threshold, fdk_rescale
+                       of `r2`: see `lingo_mi.fit.r2_init` (R2: 0.05 and 0.15)
+    normalise          whether densities are fitted in a unit that makes the largest line integral 1 (own): SSIM's
+                       constants and the bounds then mean the same for any object; R2 expects volumes in [0, 1]
 
     Forward model
     extent             cut-off in standard deviations (R2: 3)
@@ -53,8 +57,16 @@ class Settings:
     batch: int = 1
     init: str = 'r2'
     n_points: int = 50_000
+    high_fraction: float = .25
+    low_factor: float = .1
+    occupancy_voxels: int = 16
+    V_S: float = 20.
+    misses: int = 0
+    outside: str = 'invalid'
     init_density: str = 'lsq'
-    density_passes: int = 0
+    fdk_threshold: float = .05
+    fdk_rescale: float = .15
+    normalise: bool = False
     extent: float = 3.
     lambda_ssim: float = .25
     lambda_tv: float = .05
@@ -133,7 +145,7 @@ def _parse(name, value, like):
 R2 = Settings()
 LINGO = Settings(init='lingo', loss_scale='dynamic')
 FAST = Settings(
-    init='lingo', iterations=600, decay_steps=0, rate_centre=(4e-3, 4e-4), rate_density=(5e-2, 5e-3),
+    init='lingo', normalise=True, iterations=600, decay_steps=0, rate_centre=(4e-3, 4e-4), rate_density=(5e-2, 5e-3),
     rate_scale=(5e-2, 5e-3), rate_rotation=(2e-2, 2e-3))
 
 METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2}

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .settings import Settings
+
 PARAMETERS = {'centre': 3, 'scale': 3, 'rotation': 4, 'density': 1}
 
 
@@ -29,11 +31,12 @@ class State:
         return len(self.born)
 
 
-def start(points, spacing, density, scale_min: float, scale_max: float) -> State:
+def start(points, spacing, density, settings: Settings) -> State:
     """The state that begins a fit: isotropic Gaussians, unrotated, without moments.
 
-    points [N, 3], spacing [N] standard deviations, density [N] at the centres; normalised frame.
+    points [N, 3], spacing [N] standard deviations, density [N] at the centres, in the fit's unit; normalised frame.
     """
+    scale_min, scale_max = settings.scale_min, settings.scale_max
     n = len(points)
     scale = np.clip(spacing, scale_min + 1e-5, scale_max - 1e-5)[:, None].repeat(3, 1)
     values = dict(centre=np.asarray(points), scale=inverse_scale(scale, scale_min, scale_max),
@@ -44,11 +47,12 @@ def start(points, spacing, density, scale_min: float, scale_max: float) -> State
                  np.zeros(n, np.float32), np.zeros(n, bool))
 
 
-def activate(state: State, scale_min: float, scale_max: float):
+def activate(state: State, settings: Settings):
     """Centres, standard deviations, unit quaternions (x, y, z, w) and densities, float64 [N, ...].
 
     Scales by a sigmoid between the bounds, densities by softplus: both R2-Gaussian's.
     """
+    scale_min, scale_max = settings.scale_min, settings.scale_max
     v = {k: x.astype(float) for k, x in state.values.items()}
     rotation = v['rotation'] / np.linalg.norm(v['rotation'], axis=1, keepdims=True)
     scale = scale_min + (scale_max - scale_min) / (1 + np.exp(-v['scale']))

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Scan
 from ..xray.footprint import project
@@ -15,20 +16,20 @@ from ..xray.splat import splat
 from ..xray.voxelize import Grid, voxelize
 from . import losses
 from .device import DeviceState
+from .loss_scale import loss_scale
 from .settings import Settings
 
 
 class Target:
-    """A measured view on the device: its rays, pixels (normalised line integrals) and what SSIM needs of them."""
+    """A measured view on the device: its rays and pixels (normalised line integrals over the fit's unit of density)."""
 
-    def __init__(self, scan: Scan, index: int):
+    def __init__(self, scan: Scan, index: int, unit: float):
         height, width = scan.geometry.nDetector
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
         self.view = View.of(scan.geometry.normalised_frames(), index, height, width, panel=False)
-        self.pixels = mi.Float(scan.normalised[index].ravel())
-        self.ssim = losses.ssim_target(self.pixels, height, width)
-        dr.eval(self.pixels, self.ssim)
+        self.pixels = mi.Float(scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit))
+        dr.eval(self.pixels)
 
 
 class Stepper:
@@ -36,7 +37,8 @@ class Stepper:
 
     def __init__(self, scan: Scan, settings: Settings):
         self.settings, self.geometry = settings, scan.geometry
-        self.targets = [Target(scan, i) for i in range(len(scan))]
+        self.unit = density_unit(scan, settings)
+        self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
@@ -65,17 +67,25 @@ class Stepper:
         state.adam(gradients, {name: s.rate(name, iteration) for name in gradients}, iteration + 1, s.epsilon)
         return total
 
-    def render(self, state: DeviceState, view: View):
-        """Normalised line integrals of a view, Float [height * width]."""
-        f = project(*state.gaussians(self.settings), view, self.settings.extent)
-        return splat(f, view.height, view.width, self.settings.extent) * view.lengths()
+    def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
+        """Projections of the cloud in a scan's geometry, float32 [view, v, u], density times mm."""
+        frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
+        gaussians, extent = state.gaussians(self.settings), self.settings.extent
+        out = np.empty((len(geometry), height, width), np.float32)
+        for i in range(len(geometry)):
+            view = View.of(frames, i, height, width, panel=False)
+            image = splat(project(*gaussians, view, extent), height, width, extent) * view.lengths()
+            out[i] = image.numpy().reshape(height, width)
+            if progress:
+                progress(i + 1, len(geometry))
+        return out * np.float32(self.unit / geometry.scale)
 
-    def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray:
-        """The cloud's density at the voxel centres, float32 [x, y, z]."""
-        g = geometry or self.geometry
+    def volume(self, state: DeviceState) -> np.ndarray:
+        """The cloud's density at the voxel centres of the scan's grid, float32 [x, y, z]."""
+        g = self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        flat = voxelize(*state.gaussians(self.settings), grid, self.settings.extent)
-        return np.ascontiguousarray(flat.numpy().reshape(g.nVoxel[::-1]).transpose(2, 1, 0))
+        flat = voxelize(*state.gaussians(self.settings), grid, self.settings.extent).numpy() * np.float32(self.unit)
+        return np.ascontiguousarray(flat.reshape(g.nVoxel[::-1]).transpose(2, 1, 0))
 
     def _view(self, state, gaussians, target, batch):
         """Add one view's gradient to the parameters', and its part to the densification statistic."""
@@ -83,8 +93,8 @@ class Stepper:
         footprints = project(*gaussians, view, s.extent)
         leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
         image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
-        loss = losses.combined(image, target.pixels, target.ssim, s.lambda_ssim)
-        factor = losses.loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
+        loss = losses.combined(image, target.pixels, view.height, view.width, s.lambda_ssim)
+        factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
         dr.backward(loss * weight * (1 / batch))
         with dr.suspend_grad():
@@ -114,6 +124,14 @@ class Stepper:
         loss = s.lambda_tv * losses.tv(cube, shape[::-1])
         dr.backward(loss)
         return dr.detach(loss)
+
+
+def density_unit(scan: Scan, settings: Settings) -> float:
+    """The density that a fit counts as 1: see `Settings.normalise`. Raises InputError for an empty scan."""
+    largest = float(scan.projections.max()) * scan.geometry.scale
+    if largest <= 0:
+        raise InputError('the projections are zero everywhere: there is nothing to fit')
+    return largest if settings.normalise else 1.
 
 
 def _leaf(values):

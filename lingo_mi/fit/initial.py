@@ -1,0 +1,45 @@
+"""The initial cloud of a fit, by the method that its settings name."""
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from ..lingo import initialise as lingo
+from ..lingo.initialise import InitialCloud
+from ..scan import Scan
+from .device import DeviceState
+from .loop import bounded
+from .r2_init import r2_initialise
+from .settings import Settings
+from .state import start
+from .step import Stepper, density_unit
+
+
+def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
+    """Where a fit of `scan` starts: LINGO's cloud (paper, section III-A and B) or R2-Gaussian's.
+
+    `info['seconds']` is the whole time, an FDK reconstruction or renderings included. Raises InputError where the scan
+    gives no cloud.
+    """
+    begun = time.perf_counter()
+    rng = np.random.default_rng(seed)
+    g, unit = scan.geometry, density_unit(scan, settings)
+    if settings.init == 'r2':
+        from ..recon.fdk import fdk
+        volume = fdk(scan) / unit
+        cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, rescale=settings.fdk_rescale)
+        cloud = replace(cloud, density=cloud.density * unit)
+    else:
+        def render(points, density, spacing, views):
+            state = start(points, spacing, density / unit, settings)
+            return Stepper(scan.subset(views[:1]), settings).render(DeviceState(state), g.subset(views)) * g.scale
+        settings = bounded(settings, scan)
+        chosen = lingo.Settings(
+            n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
+            resolution=settings.occupancy_voxels, V_S=settings.V_S, density=settings.init_density,
+            misses=settings.misses, outside=settings.outside)
+        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render)
+    cloud.info['seconds'] = time.perf_counter() - begun
+    return cloud

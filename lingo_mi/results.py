@@ -1,0 +1,140 @@
+"""What a fit leaves behind: volume, cloud, scene, views, measurements, report."""
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from . import metrics
+from .files.images import write_exr
+from .files.ply import write_ply
+from .files.volumes import first_voxel, write_volume
+from .fit.device import DeviceState
+from .fit.loop import Fitted
+from .fit.state import activate
+from .lingo.ipsd import ipsd, reverse_distance
+from .report import ReportData, write_report
+from .scan import Dataset
+
+METRICS, CHECKPOINT = 'metrics.json', 'checkpoint.npz'
+
+
+def quick_measure(dataset: Dataset, most: int = 4):
+    """A function for `fit.loop.run` that gives 2D PSNR on a few held-out views and 3D PSNR where the truth is known."""
+    test = dataset.test
+    if test is not None and len(test) > most:
+        test = test.subset(np.arange(most) * len(test) // most)
+
+    def measure(stepper, state):
+        out = {}
+        if test is not None and len(test):
+            out['psnr_2d'] = metrics.psnr_2d(stepper.render(state, test.geometry), test.projections)
+        if dataset.volume is not None:
+            out['psnr_3d'] = metrics.psnr_3d(stepper.volume(state), dataset.volume)
+        return out
+    return measure
+
+
+def world_cloud(fitted: Fitted, geometry):
+    """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities [N]."""
+    centre, scale, rotation, density = activate(fitted.state, fitted.settings)
+    return (centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation,
+            density * fitted.stepper.unit)
+
+
+def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, seed: int,
+                  command: str) -> dict:
+    """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
+    `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
+    """
+    geometry, test = dataset.train.geometry, dataset.test
+    state = DeviceState(fitted.state)
+    volume = fitted.stepper.volume(state)
+    write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+    cloud = world_cloud(fitted, geometry)
+    write_ply(folder / 'gaussians.ply', *cloud)
+    write_scene(folder / 'result.xml', geometry, fitted.settings.extent)
+    rendered = None
+    if test is not None and len(test):
+        rendered = fitted.stepper.render(state, test.geometry)
+        views = folder / 'views'
+        views.mkdir(exist_ok=True)
+        for stale in views.glob('*.exr'):
+            stale.unlink()
+        for i, image in enumerate(rendered):
+            write_exr(views / f'{i:04d}.exr', image)
+    measured = measure(fitted, dataset, volume, rendered) | dict(
+        method=method, seed=seed, views=len(dataset.train), variant=mi.variant(), settings=asdict(fitted.settings),
+        initial=fitted.info, command=command,
+        angles=np.degrees(geometry.angles).round(6).tolist(), versions=versions())
+    report = ReportData(
+        title=title, metrics=measured, volume=volume, truth=dataset.volume, spacing=geometry.dVoxel,
+        centre=geometry.offOrigin, views=rendered, views_truth=test.projections if rendered is not None else None,
+        views_angles=np.degrees(test.geometry.angles) if rendered is not None else None, pixel=geometry.dDetector,
+        cloud_centres=cloud[0], cloud_density=cloud[3], command=command)
+    write_report(folder, report)
+    temporary = folder / (METRICS + '.partial')
+    temporary.write_text(json.dumps(measured, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
+    temporary.replace(folder / METRICS)
+    return measured
+
+
+def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
+    """The numbers of a finished fit; None where there is no truth to compare with."""
+    born = fitted.state.values['centre'][fitted.state.born]
+    test = dataset.test
+    truth = test.projections if rendered is not None else None
+
+    def of(function, result, reference):
+        return None if result is None or reference is None else function(result, reference)
+    return dict(
+        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth), psnr_2d=of(metrics.psnr_2d, rendered, truth),
+        ssim_2d=of(metrics.ssim_2d, rendered, truth), psnr_3d=of(metrics.psnr_3d, volume, dataset.volume),
+        ssim_3d=of(metrics.ssim_3d, volume, dataset.volume),
+        ipsd=_number(ipsd(fitted.initial, born)), ipsd_targets=len(born),
+        ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
+        gaussians=len(fitted.state), iterations=fitted.settings.iterations,
+        seconds_init=fitted.info['seconds'], seconds_fit=fitted.seconds,
+        ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations, history=fitted.history)
+
+
+def write_scene(path: Path, geometry, extent: float):
+    """A scene that renders the fitted cloud with the scan's own scanner; needs only `import lingo_mi`."""
+    from .plugins.ct_scanner import describe
+    lines = ['<scene version="3.0.0">', '    <integrator type="lingo_xray">',
+             f'        <float name="extent" value="{extent:g}"/>', '    </integrator>',
+             '    <shape type="ellipsoids" id="cloud">', '        <string name="filename" value="gaussians.ply"/>',
+             '    </shape>', '    <sensor type="ct_scanner" id="scanner">']
+    kinds = {str: 'string', float: 'float', int: 'integer'}
+    lines += [f'        <{kinds[type(v)]} name="{k}" value="{v!r}"/>'.replace('"\'', '"').replace('\'"', '"')
+              for k, v in describe(geometry).items() if k != 'type']
+    path.write_text('\n'.join([*lines, '    </sensor>', '</scene>']) + '\n', encoding='utf-8')
+
+
+def versions() -> dict:
+    """Versions of what computed a result."""
+    return dict(python=platform.python_version(),
+                **{name: version(name) for name in ('lingo_mi', 'mitsuba', 'drjit', 'numpy', 'scipy', 'scikit-image')},
+                date=time.strftime('%Y-%m-%d'))
+
+
+def _number(x: float):
+    """A number for JSON, which has no NaN."""
+    return x if np.isfinite(x) else None
+
+
+def summary(result: dict) -> str:
+    """The main numbers of a result, one line each."""
+    def show(name, form, unit):
+        return form.format(result[name]) + unit if result[name] is not None else 'n/a'
+    return '\n'.join([
+        f'held-out views  PSNR {show("psnr_2d", "{:.2f}", " dB")}, SSIM {show("ssim_2d", "{:.4f}", "")}',
+        f'volume          PSNR {show("psnr_3d", "{:.2f}", " dB")}, SSIM {show("ssim_3d", "{:.4f}", "")}',
+        f'cloud           {result["gaussians"]:,} Gaussians after {result["iterations"]} iterations of '
+        f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, {result["seconds_fit"]:.0f} s to fit'])

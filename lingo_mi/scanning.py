@@ -1,0 +1,195 @@
+"""From a scene to a scan: load it, find its scanner, render or read every view, sample the true volume."""
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from .errors import InputError
+from .geometry import Geometry, spread
+from .progress import Progress
+from .scan import Dataset, Scan
+from .xray import grid
+from .xray.frame import View
+from .xray.objects import Ellipsoids, GridInCube, find_objects
+
+
+@dataclass(frozen=True)
+class LoadedScene:
+    """A scene, its scanner and where they came from."""
+
+    scene: object
+    scanner: object
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+
+def load_scene(path, parameters: dict | None = None) -> LoadedScene:
+    """Load a Mitsuba scene with a `ct_scanner`.
+
+    parameters   values for the scene's own `<default>` names
+
+    Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f'{path}: there is no such scene')
+    unknown = set(parameters or {}) - defaults(path)
+    if unknown:
+        raise InputError(f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
+                         f'it has {", ".join(sorted(defaults(path))) or "none"}')
+    try:
+        scene = mi.load_file(str(path), **(parameters or {}))
+    except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
+        raise InputError(f'{path}: {plain(error)}') from None
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f'{path}: this is a {type(scene).__name__}, not a scene')
+    scanner = next((s for s in scene.sensors() if hasattr(s, 'geometry')), None)
+    if scanner is None:
+        raise InputError(f'{path}: the scene has no scanner; add <sensor type="ct_scanner">')
+    return LoadedScene(scene, scanner, path)
+
+
+def defaults(path) -> set[str]:
+    """Names of a scene file's `<default>` parameters. Raises InputError where the file is no XML."""
+    try:
+        return {node.get('name', '') for node in ElementTree.parse(path).iter('default')}
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: this is not a scene in XML ({error})') from None
+
+
+def plain(error: Exception) -> str:
+    """The one line of an error that a user needs: ours if a plugin raised it, else the gist of Mitsuba's."""
+    text = str(error)
+    ours = re.findall(r'InputError: (.*)', text)
+    if ours:
+        return ours[-1].strip()
+    lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]
+    return ' '.join(lines)[:400] or type(error).__name__
+
+
+def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
+    """The scan of a scene: measured projections if the scanner has them, else every view rendered, with a progress bar.
+
+    views    how many to fit, evenly spaced among the scanner's (0: all of them)
+    volume   `files.volumes.Volume` to scan instead of the scene's objects
+
+    The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given where it
+    is known on the scanner's grid.
+    """
+    scanner = loaded.scanner
+    if volume is None and scanner.dataset is not None:
+        return choose_views(scanner.dataset, views)
+    geometry, test = scanner.geometry, scanner.test_geometry
+    if views:  # before the work, not after
+        spread(len(geometry), views)
+    if volume is not None:
+        geometry = geometry.with_volume(volume.data.shape, volume.spacing)
+        test = test and test.with_volume(volume.data.shape, volume.spacing)
+        objects = [_Volume(volume.data, geometry)]
+    else:
+        try:
+            objects = find_objects(loaded.scene)
+        except InputError as error:
+            raise InputError(f'{loaded.path}: {error}') from None
+    _warn_if_truncated(geometry)
+    if views and test is not None:  # unused views are needed only where nothing else is held out
+        geometry = geometry.subset(spread(len(geometry), views))
+    every = geometry if test is None else replace(geometry, angles=np.concatenate([geometry.angles, test.angles]))
+    everything = Scan(every, _render(objects, every))
+    train = everything.subset(slice(0, len(geometry)))
+    held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
+    return choose_views(Dataset(train, held_out, _truth(objects, geometry)), 0 if test is not None else views)
+
+
+def choose_views(dataset: Dataset, views: int) -> Dataset:
+    """A data set with `views` evenly spaced views to fit (0: all); those left over are held out if none were before."""
+    train, test, volume = dataset.train, dataset.test, dataset.volume
+    if not views or views == len(train):
+        return dataset
+    chosen = spread(len(train), views)
+    rest = np.setdiff1d(np.arange(len(train)), chosen)
+    return Dataset(train.subset(chosen), test if test is not None else train.subset(rest), volume)
+
+
+class _Volume:
+    """A volume on the scan's own grid, to be scanned."""
+
+    def __init__(self, data, geometry):
+        self.data, self.box = data, geometry
+
+    def project(self, geometry, progress):
+        return grid.project(self.data, geometry, progress)
+
+
+def _render(objects, geometry) -> np.ndarray:
+    """Line integrals of all objects in all views, float32 [view, v, u]."""
+    total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
+    with Progress('Scan', len(geometry) * len(objects)) as bar:
+        for k, thing in enumerate(objects):
+            def report(done, _):
+                bar.update(k * len(geometry) + done)
+            same_box = isinstance(thing, GridInCube) and _on_grid(thing, geometry)
+            if isinstance(thing, _Volume):
+                total += thing.project(geometry, report)
+            elif same_box:  # skips empty margins, which rendering through the scene may not
+                total += grid.project(_values(thing), geometry, report)
+            else:
+                frames = geometry.frames()
+                for i in range(len(geometry)):
+                    view = View.of(frames, i, *geometry.nDetector)
+                    total[i] += thing.line_integrals(view, 8., True).numpy().reshape(geometry.nDetector)
+                    report(i + 1, None)
+    return total
+
+
+def _values(thing: GridInCube) -> np.ndarray:
+    """Densities of a grid, float32 [x, y, z]."""
+    return thing.data.numpy().reshape(thing.size[::-1]).transpose(2, 1, 0) * np.float32(thing.scale)
+
+
+def _on_grid(thing: GridInCube, geometry: Geometry) -> bool:
+    """Whether a grid is the scanner's own."""
+    centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    return (tuple(thing.size) == geometry.nVoxel and np.allclose(thing.low, centre - half, atol=1e-4 * half.max())
+            and np.allclose(thing.high, centre + half, atol=1e-4 * half.max()))
+
+
+def _truth(objects, geometry) -> np.ndarray | None:
+    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it."""
+    total = np.zeros(geometry.nVoxel, np.float32)
+    for thing in objects:
+        if isinstance(thing, _Volume):
+            total += thing.data
+        elif isinstance(thing, GridInCube) and _on_grid(thing, geometry):
+            total += _values(thing)
+        elif isinstance(thing, Ellipsoids):
+            from .xray.frame import vector64
+            from .xray.voxelize import Grid, voxelize
+            corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+            cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
+            flat = voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, 6.).numpy()
+            total += flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0)
+        else:
+            return None
+    return total
+
+
+def _warn_if_truncated(geometry: Geometry):
+    """Say so where the volume's midplane is wider than what the panel sees of it."""
+    if geometry.mode == 'parallel':
+        field = geometry.sDetector[1]
+    else:
+        field = geometry.sDetector[1] * geometry.DSO / geometry.DSD
+    widest = max(geometry.sVoxel[:2])
+    if widest > field * 1.0001:
+        import warnings
+        warnings.warn(f'the volume is {widest:g} mm wide, but the panel sees only {field:g} mm of it: projections may be '
+                      'truncated', stacklevel=2)
