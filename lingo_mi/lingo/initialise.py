@@ -138,5 +138,5 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
         'method': 'lingo', 'P': P, 'S': S, 'grid': grid,
         'density': settings.density, 'density_factor': factor,
         'cells_low': len(low), 'cells_high': len(high), 'points_low': n_low, 'points_high': n_high,
-        'repeats': repeats,
+        'repeats': int(repeats),
         'T_high': float(found.t_high.mean()), 'seconds': time.perf_counter() - begun})
