@@ -1,0 +1,36 @@
+"""What all tests share: the variant, slow tests, and the folder of test volumes."""
+import os
+from pathlib import Path
+
+import pytest
+
+import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
+
+
+def pytest_addoption(parser):
+    parser.addoption('--slow', action='store_true', help='also run the full-size forms of tests')
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption('--slow'):
+        return
+    skip = pytest.mark.skip(reason='full size: run with --slow')
+    for item in items:
+        if 'slow' in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope='session', autouse=True)
+def variant() -> str:
+    """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
+    from lingo_mi.runtime import use_variant
+    return use_variant(os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono'))
+
+
+@pytest.fixture(scope='session')
+def data() -> Path:
+    """The folder of test volumes that LINGO_MI_DATA names; skips where it names none."""
+    folder = os.environ.get('LINGO_MI_DATA')
+    if not folder or not Path(folder).is_dir():
+        pytest.skip('LINGO_MI_DATA names no folder of test volumes')
+    return Path(folder)
