@@ -3,9 +3,10 @@
 `import lingo_mi` and `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba. The geometry, image,
 metric, file and phantom modules load without Mitsuba.
 """
-from .runtime import find_libllvm, watch_variants
+from .runtime import find_libllvm, mend_llvm, watch_variants
 
 find_libllvm()  # before anything loads Dr.Jit
+mend_llvm()     # or after it
 watch_variants()
 
 __version__ = '0.1.0'

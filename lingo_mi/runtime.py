@@ -1,11 +1,15 @@
-"""Backend choice: find libLLVM before Dr.Jit loads, choose a variant, register the plugins."""
+"""Backend choice: find libLLVM before Dr.Jit loads, choose a variant, register the plugins; find a scene's data."""
 from __future__ import annotations
 
+import ctypes
 import glob
 import os
+import re
 import sys
 import warnings
 from pathlib import Path
+
+from .errors import InputError
 
 LLVM_HELP = ('Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '
              'elsewhere install LLVM and set DRJIT_LIBLLVM_PATH to its libLLVM shared library.')
@@ -27,6 +31,42 @@ def find_libllvm() -> str | None:
     return None
 
 
+def mend_llvm():
+    """Where Dr.Jit was imported before us and took an LLVM that cannot work, restart it on the bundled one.
+
+    Dr.Jit loads LLVM as soon as it is imported, so that `import mitsuba` before `import lingo_mi` meets a system LLVM first.
+    Restarting would lose the user's arrays: with any alive, a warning says what to do instead. (Mitsuba's own constants, the
+    tables of colour matching functions, survive it.)
+    """
+    if 'drjit' not in sys.modules:
+        return
+    import drjit as dr
+
+    path = os.environ.get('DRJIT_LIBLLVM_PATH')
+    if dr.detail.llvm_version()[0] >= 17 or not path:
+        return
+    library = ctypes.CDLL(str(next(Path(dr.__file__).parent.glob('libdrjit-core.*'))))
+    known = all(hasattr(library, name) for name in (_SHUTDOWN, _INIT, _WHOS))
+    alive = True
+    if known:
+        whos = library[_WHOS]
+        whos.restype = ctypes.c_char_p
+        rows = re.findall(rb'^ +\d+ +LLVM +\w+ .*? (\d+)(?: +\d+ K?i?B)? *$', whos(), re.MULTILINE)
+        alive = any(int(size) not in (1, _COLOUR_SAMPLES) for size in rows)
+    if alive:
+        warnings.warn(f'Dr.Jit runs on LLVM {dr.detail.llvm_version()[0]}, which cannot compile its kernels: '
+                      'import lingo_mi before mi.set_variant, or set DRJIT_LIBLLVM_PATH', stacklevel=3)
+        return
+    library[_SHUTDOWN](0)
+    library[_INIT](1 << 1 | 1 << 2)  # CUDA and LLVM
+
+
+_COLOUR_SAMPLES = 95  # entries of Mitsuba's tables of colour matching functions
+
+# jit_shutdown(int), jit_init(uint32_t) and jit_var_whos() of drjit-core, which Python does not bind
+_SHUTDOWN, _INIT, _WHOS = '_Z12jit_shutdowni', '_Z8jit_initj', '_Z12jit_var_whosv'
+
+
 def use_variant(name: str | None = None) -> str:
     """Activate a Mitsuba variant and return its name: `name`, else cuda_ad_mono, else llvm_ad_mono.
 
@@ -34,11 +74,14 @@ def use_variant(name: str | None = None) -> str:
     """
     import mitsuba as mi
 
-    from .errors import InputError
-
-    if name is not None and name not in mi.variants():
-        raise InputError(f'--variant {name}: not one of {", ".join(mi.variants())}')
+    usable = [v for v in mi.variants() if v.endswith(('_ad_mono', '_ad_rgb'))]
+    if name is not None and name not in usable:
+        raise InputError(f'--variant {name}: not one of {", ".join(usable)}')
+    mi.set_log_level(mi.LogLevel.Error)  # its warnings are about films and files that a scan does not depend on
+    library = os.environ.get('DRJIT_LIBLLVM_PATH', '')
     for variant in [name] if name else ['cuda_ad_mono', 'llvm_ad_mono']:
+        if variant.startswith('llvm') and os.sep in library and not os.path.exists(library):
+            raise InputError(f'DRJIT_LIBLLVM_PATH = {library}: there is no such file. {LLVM_HELP}')
         try:
             mi.set_variant(variant)
             import drjit as dr
@@ -47,6 +90,25 @@ def use_variant(name: str | None = None) -> str:
         except Exception as error:  # Dr.Jit raises plain RuntimeErrors for a missing driver or library
             reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
+
+
+def data_file(name: str, parameter: str) -> str:
+    """The path of a file that a scene names: beside the scene or here, else in the folder that LINGO_MI_DATA names.
+
+    parameter   the scene's `<default>` by which a user can name another file, for the message
+
+    Raises InputError, in one line, where there is no such file.
+    """
+    import mitsuba as mi
+    found = Path(str(mi.file_resolver().resolve(name)))
+    folder = os.environ.get('LINGO_MI_DATA')
+    if not found.exists() and folder:
+        found = Path(folder) / name
+    if not found.exists():
+        where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
+        raise InputError(f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder that '
+                         f'holds it, or name your file: -D {parameter}=FILE')
+    return str(found)
 
 
 def watch_variants():
