@@ -1,6 +1,8 @@
 """From a scene to a scan: load it, find its scanner, render or read every view, sample the true volume."""
 from __future__ import annotations
 
+import math
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
@@ -15,7 +17,7 @@ from .progress import Progress
 from .scan import Dataset, Scan
 from .xray import grid
 from .xray.frame import View
-from .xray.objects import Ellipsoids, GridInCube, find_objects
+from .xray.objects import Ellipsoids, GridInCube, HomogeneousMesh, find_objects
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,6 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f'{path}: there is no such scene')
     unknown = set(parameters or {}) - defaults(path)
     if unknown:
         raise InputError(f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
@@ -54,11 +54,30 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     scanner = next((s for s in scene.sensors() if hasattr(s, 'geometry')), None)
     if scanner is None:
         raise InputError(f'{path}: the scene has no scanner; add <sensor type="ct_scanner">')
+    check_memory(scanner.geometry, scanner.test_geometry)
     return LoadedScene(scene, scanner, path)
 
 
+def check_memory(*geometries: Geometry | None):
+    """Refuse, before anything is allocated, a scan that this machine cannot hold.
+
+    Counts the least there is: the voxels as read, fitted and compared, and the projections as measured and rendered.
+    """
+    known = [g for g in geometries if g is not None]
+    voxels = math.prod(known[0].nVoxel)
+    pixels = sum(len(g) * math.prod(g.nDetector) for g in known)
+    needed = 4 * (3 * voxels + 2 * pixels)
+    room = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') if hasattr(os, 'sysconf') else math.inf
+    if needed > room:
+        raise InputError(f'{" x ".join(map(str, known[0].nVoxel))} voxels and {sum(map(len, known))} views of '
+                         f'{" x ".join(map(str, known[0].nDetector))} pixels need at least {needed / 2 ** 30:,.0f} GiB of '
+                         f'memory, but this machine has {room / 2 ** 30:,.0f} GiB: lower nVoxel, nDetector or the views')
+
+
 def defaults(path) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError where the file is no XML."""
+    """Names of a scene file's `<default>` parameters. Raises InputError where the file is missing or no XML."""
+    if not Path(path).is_file():
+        raise InputError(f'{path}: there is no such scene')
     try:
         return {node.get('name', '') for node in ElementTree.parse(path).iter('default')}
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
@@ -71,6 +90,7 @@ def plain(error: Exception) -> str:
     ours = re.findall(r'InputError: (.*)', text)
     if ours:
         return ours[-1].strip()
+    text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]
     return ' '.join(lines)[:400] or type(error).__name__
 
@@ -92,6 +112,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
         spread(len(geometry), views)
     if volume is not None:
         geometry = geometry.with_volume(volume.data.shape, volume.spacing)
+        check_memory(geometry, test)
         test = test and test.with_volume(volume.data.shape, volume.spacing)
         objects = [_Volume(volume.data, geometry)]
     else:
@@ -177,6 +198,13 @@ def _truth(objects, geometry) -> np.ndarray | None:
             cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
             flat = voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, 6.).numpy()
             total += flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0)
+        elif isinstance(thing, HomogeneousMesh):
+            from .phantoms.mesh import voxelise
+            params = mi.traverse(thing.shape)
+            vertices, faces = (np.array(params[k]).reshape(-1, 3) for k in ('vertex_positions', 'faces'))
+            corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+            inside = voxelise(vertices[faces].astype(float), corner, geometry.dVoxel, geometry.nVoxel)
+            total += inside * np.float32(np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0])
         else:
             return None
     return total

@@ -1,4 +1,6 @@
 """The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -6,6 +8,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry, circular
+from lingo_mi.runtime import data_file
 from lingo_mi.xray.frame import View
 
 
@@ -47,8 +50,8 @@ class CTScanner(mi.Sensor):
        - Views held out of the fit, at angles drawn uniformly from the same range with a fixed seed. (Default: 0)
      * - projections
        - |string|
-       - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. An empty name is
-         none.
+       - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. It is looked for
+         beside the scene, then in the folder that LINGO_MI_DATA names. An empty name is none.
      * - view
        - |int|
        - The view that this sensor renders. (Default: 0)
@@ -58,20 +61,20 @@ class CTScanner(mi.Sensor):
     """
 
     def __init__(self, props):
-        projections = props.get('projections', '')
         self.dataset = None
         try:
+            projections = _one(props, 'projections', '')
             if projections:
-                self.dataset = read_scan(str(mi.file_resolver().resolve(projections)))
+                self.dataset = read_scan(data_file(projections, 'projections'))
                 self.geometry = self.dataset.train.geometry
                 self.test_geometry = self.dataset.test.geometry if self.dataset.test else None
             else:
                 self.geometry, self.test_geometry = _read(props)
+            self.index = _one(props, 'view', 0)
+            if not 0 <= self.index < len(self.geometry):
+                raise InputError(f'view {self.index} of a scan of {len(self.geometry)} views')
         except InputError as error:
             raise InputError(f'ct_scanner {props.id()!r}: {error}') from None
-        self.index = props.get('view', 0)
-        if not 0 <= self.index < len(self.geometry):
-            raise InputError(f'ct_scanner {props.id()!r}: view {self.index} of a scan of {len(self.geometry)} views')
         for name in _NAMES:  # a file of projections overrides the numbers in the scene
             if name in props:
                 props[name]
@@ -111,6 +114,7 @@ class CTScanner(mi.Sensor):
 
 create = CTScanner
 
+MOST_VIEWS = 100_000
 _NAMES = ('mode', 'DSO', 'DSD', 'nDetector', 'dDetector', 'offDetector', 'nVoxel', 'dVoxel', 'offOrigin', 'views',
           'totalAngle', 'startAngle', 'angles', 'test_views')
 
@@ -131,6 +135,15 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
                 dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()), view=index)
 
 
+def _one(props, name, default):
+    """A property of the kind of its default: a string, a whole number or a finite number."""
+    value = props.get(name, default)
+    kind, wanted = {str: (str, 'text'), int: (int, 'a whole number'), float: ((int, float), 'a number')}[type(default)]
+    if not isinstance(value, kind) or isinstance(value, bool) or (wanted == 'a number' and not np.isfinite(value)):
+        raise InputError(f'{name} must be {wanted}, not {value!r}')
+    return value
+
+
 def _numbers(props, name, default=None):
     value = props.get(name, default)
     if value is None:
@@ -141,25 +154,33 @@ def _numbers(props, name, default=None):
         raise InputError(f'{name} = {value!r} is not a list of numbers') from None
 
 
+def _distance(props, name, default):
+    values = _numbers(props, name, default)
+    if len(values) != 1:
+        raise InputError(f'{name} must be one number, not {values}')
+    return values[0]
+
+
 def _read(props):
     """The scan's and the held-out views' geometry from a plugin's properties."""
-    total, start = props.get('totalAngle', 360.), props.get('startAngle', 0.)
-    angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(props.get('views', 50), total, start)
+    total, start = _one(props, 'totalAngle', 360.), _one(props, 'startAngle', 0.)
+    views, held_out = _one(props, 'views', 50), _one(props, 'test_views', 0)
+    if held_out < 0:
+        raise InputError(f'test_views must not be negative, but is {held_out}')
+    if max(views, held_out) > MOST_VIEWS:
+        raise InputError(f'a scan has at most {MOST_VIEWS} views, not {max(views, held_out)}')
+    angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(views, total, start)
     counts = {}
     for name in ('nDetector', 'nVoxel'):
         counts[name] = _numbers(props, name)
-        if any(n != int(n) for n in counts[name]):
+        if any(n % 1 != 0 for n in counts[name]):  # also of NaN and infinity
             raise InputError(f'{name} must be whole numbers, not {counts[name]}')
-    mode = props.get('mode', 'cone')
+    mode = _one(props, 'mode', 'cone')
     far = 1. if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
-    geometry = Geometry(mode=mode, DSO=_numbers(props, 'DSO', far)[0], DSD=_numbers(props, 'DSD', far)[0], angles=angles,
+    geometry = Geometry(mode=mode, DSO=_distance(props, 'DSO', far), DSD=_distance(props, 'DSD', far), angles=angles,
                         dDetector=_numbers(props, 'dDetector'), dVoxel=_numbers(props, 'dVoxel'),
                         offDetector=_numbers(props, 'offDetector', 0.), offOrigin=_numbers(props, 'offOrigin', 0.), **counts)
-    held_out = props.get('test_views', 0)
-    if held_out < 0:
-        raise InputError(f'test_views must not be negative, but is {held_out}')
     if not held_out:
         return geometry, None
     drawn = np.sort(np.random.default_rng(0).uniform(0, total, held_out)) + start
-    from dataclasses import replace
     return geometry, replace(geometry, angles=np.radians(drawn))

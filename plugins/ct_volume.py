@@ -5,6 +5,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.phantoms import make
+from lingo_mi.runtime import data_file
 
 
 def create(props):
@@ -18,7 +19,8 @@ def create(props):
 
      * - filename
        - |string|
-       - A CT volume: NIfTI, NRRD, MHA/MHD, NPY/NPZ, a TIFF stack or a DICOM folder (see `lingo_mi.files.volumes`).
+       - A CT volume: NIfTI, NRRD, MHA/MHD, NPY/NPZ, a TIFF stack or a DICOM folder (see `lingo_mi.files.volumes`). It is
+         looked for beside the scene, then in the folder that the environment variable LINGO_MI_DATA names.
      * - phantom
        - |string|
        - Instead of a file: `foot`, `chest`, `shepp_logan`, `gaussians` or `mesh`.
@@ -42,13 +44,16 @@ def create(props):
     filename, phantom = props.get('filename', ''), props.get('phantom', '')
     size, seed = props.get('size', 256), props.get('seed', 0)
     mu_water = props.get('mu_water', 0.)
+    for key, value, kinds in (('filename', filename, str), ('phantom', phantom, str), ('mu_water', mu_water, (int, float))):
+        if not isinstance(value, kinds):
+            raise InputError(f'ct_volume: {key} = {value!r} is of the wrong type')
     to_world = props.get('to_world', mi.ScalarTransform4f())
     if bool(filename) == bool(phantom):
         raise InputError('ct_volume needs either a filename or a phantom')
     if phantom:
         data = make(phantom, size, seed).data
     else:
-        data = read_volume(str(mi.file_resolver().resolve(filename)), mu_water=mu_water or None).data
+        data = read_volume(data_file(filename, 'volume'), mu_water=mu_water or None).data
     grid = np.ascontiguousarray(data.transpose(2, 1, 0))[..., None]
     volume = dict(type='gridvolume', grid=mi.VolumeGrid(grid), to_world=to_world, raw=True)
     return mi.load_dict(dict(type='heterogeneous', sigma_t=volume, albedo=0., id=props.id()))

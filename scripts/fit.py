@@ -15,14 +15,14 @@ import shlex
 import sys
 from pathlib import Path
 
-from lingo_mi.cli import definitions, guard, writable_folder
+from lingo_mi.cli import Parser, between_steps, definitions, guard, writable_folder
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.runtime import use_variant
 
 
 def arguments():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scene', help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml')
     p.add_argument('--method', choices=METHODS, default='fast',
                    help='recipe: fast (default), or the published lingo and r2')
@@ -56,29 +56,36 @@ def main():
     from lingo_mi.fit.loop import run
     from lingo_mi.progress import Progress
     from lingo_mi.results import CHECKPOINT, METRICS, quick_measure, summary, write_results
-    from lingo_mi.scanning import choose_views, defaults, load_scene, take_scan
+    from lingo_mi.scanning import check_memory, choose_views, defaults, load_scene, take_scan
 
     if args.views < 0:
         raise InputError(f'--views must be at least 1, not {args.views}')
     if args.projections and args.volume:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
     defined = definitions(args.define)
-    own = defaults(args.scene) if Path(args.scene).is_file() else set()
+    own = defaults(args.scene)  # a name of the scene goes before a setting's
     given = {k: v for k, v in defined.items() if k not in own}
     settings = METHODS[args.method].changed(
         **given, **{k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None})
-    folder = args.out or Path('out') / Path(args.scene).stem
+    folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
-    folder = writable_folder(folder, args.force, args.resume, METRICS)
     if args.projections:
         scan = choose_views(read_scan(args.projections), args.views)
+        check_memory(scan.train.geometry)
     else:
         volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
         scan = take_scan(scene, args.views, volume)
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
-    with Progress('Fit', settings.iterations) as bar:
-        fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), bar.update, folder / CHECKPOINT, args.resume)
+    with Progress('Fit', settings.iterations) as bar, between_steps() as check:
+        def progress(iteration, **fields):
+            bar.update(iteration, **fields)
+            check()
+        try:
+            fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT, args.resume)
+        except KeyboardInterrupt:
+            again = [a for a in sys.argv if a not in ('--resume', '--force')] + ['--resume']
+            raise KeyboardInterrupt(f'go on with  python {shlex.join(again)}') from None
     result = write_results(folder, fit, scan, title=args.volume or args.projections or scene.name, method=args.method,
                            seed=args.seed, command='python ' + shlex.join(sys.argv))
     print(summary(result))

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Make a test object and, if asked, a noise-free scan of it."""
 import argparse
-import sys
 from pathlib import Path
 
 from lingo_mi import phantoms
+from lingo_mi.cli import Parser, guard
 from lingo_mi.errors import InputError
 
 EPILOG = """\
@@ -16,6 +16,10 @@ examples:
       the default object on 256^3 voxels of 1 mm
   phantom.py foot --size 128 --out foot.nii.gz --projections foot.pickle --kind naf
       and its scan in the format of NAF, SAX-NeRF and X3D
+  phantom.py mesh --out flange.ply
+      the flange as a mesh, and bolts for its holes (flange_bolts.ply)
+  phantom.py gaussians --out cloud.ply
+      the Gaussians themselves, for Mitsuba's `ellipsoids`
   phantom.py chest --projections chest_scan --kind r2 --views 25
       a scan alone, as a folder for R2-Gaussian
 
@@ -33,11 +37,6 @@ SUMMARY = {
 }
 
 
-class Parser(argparse.ArgumentParser):
-    def error(self, message):
-        self.exit(2, f'error: {message} (see --help)\n')
-
-
 def arguments():
     listing = '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
     parser = Parser(description=__doc__, epilog=EPILOG.format(list=listing),
@@ -48,7 +47,8 @@ def arguments():
                         help='voxels a side, 8 to 512 (default 256)')
     parser.add_argument('--seed', type=int, default=0, metavar='S',
                         help='texture, vessels, random Gaussians and held-out angles (default 0)')
-    parser.add_argument('--out', type=Path, metavar='F.nii.gz', help='where to write the volume')
+    parser.add_argument('--out', type=Path, metavar='F.nii.gz',
+                        help='where to write the volume; for mesh and gaussians also F.ply')
     parser.add_argument('--projections', type=Path, metavar='PATH',
                         help='where to write a scan: a .pickle file or a new folder')
     parser.add_argument('--kind', choices=('naf', 'r2', 'exr'), default='naf',
@@ -80,7 +80,24 @@ def check(args):
         if not path.absolute().parent.is_dir():
             raise InputError(f'{path}: the folder {path.parent} does not exist; make it first')
     if args.out is not None and not args.out.name.endswith(('.nii', '.nii.gz')):
-        raise InputError(f'{args.out}: volumes are written as NIfTI; give a name that ends in .nii.gz')
+        if args.out.suffix != '.ply':
+            raise InputError(f'{args.out}: volumes are written as NIfTI; give a name that ends in .nii.gz')
+        if args.name not in ('gaussians', 'mesh'):
+            raise InputError(f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in .nii.gz')
+
+
+def write_ply(path, phantom):
+    """The phantom's own form: Gaussians, or the flange and its bolts."""
+    if phantom.name == 'gaussians':
+        from lingo_mi.files.ply import write_ply
+        cloud = phantom.analytic
+        write_ply(path, cloud.centres, cloud.scales, cloud.quaternions, cloud.density)
+        print(f'{path}: {len(cloud)} Gaussians')
+        return
+    from lingo_mi.phantoms.mesh import bolts
+    for name, mesh in ((path, phantom.analytic.mesh), (path.with_stem(path.stem + '_bolts'), bolts())):
+        mesh.export(name)
+        print(f'{name}: {len(mesh.faces)} triangles')
 
 
 def run():
@@ -90,7 +107,9 @@ def run():
         return
     check(args)
     phantom = phantoms.make(args.name, args.size, args.seed)
-    if args.out:
+    if args.out and args.out.suffix == '.ply':
+        write_ply(args.out, phantom)
+    elif args.out:
         from lingo_mi.files.volumes import write_volume
         write_volume(args.out, phantom.data, phantom.spacing, phantom.origin, 'normalised')
         print(f'{args.out}: {args.name}, {args.size}^3 voxels of {phantom.spacing[0]:g} mm')
@@ -108,11 +127,4 @@ def run():
 
 
 if __name__ == '__main__':
-    try:
-        run()
-    except InputError as error:
-        print(f'error: {error}', file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print('error: interrupted', file=sys.stderr)
-        sys.exit(130)
+    guard(run)

@@ -18,8 +18,6 @@ from .settings import Settings
 from .state import State, start
 from .step import Stepper
 
-CHECKPOINT_SECONDS = 30.
-
 
 @dataclass
 class Fitted:
@@ -51,8 +49,9 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     initial    where to start; may be None with `resume`
     seed       of the views' order, the total variation's cubes and splits
     measure    called as measure(stepper, state) at a few iterations; returns numbers for the history
-    progress   called as progress(iterations done, loss=, gaussians=, **last measurement)
-    path       checkpoint file, written every 30 seconds, at Ctrl-C and at the end
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where everything
+               is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
+    path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
     resume     go on from `path`: the same steps as without the interruption
     """
     settings = bounded(settings, scan)
@@ -60,7 +59,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     rng = np.random.default_rng(seed)
     if resume:
         host, extra, arrays = checkpoint.load(path)
-        _same_fit(extra, settings, scan, path)
+        _same_fit(extra, settings, scan, seed, path)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
@@ -74,42 +73,45 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
 
     def store():
         if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
             checkpoint.save(path, state.host(), dict(
-                rng=rng.bit_generator.state, iteration=iteration, seconds=seconds + time.perf_counter() - clock,
+                seed=seed, rng=rng.bit_generator.state, iteration=iteration, seconds=seconds + time.perf_counter() - clock,
                 history=history, info=info, settings=asdict(settings), views=len(scan)),
                 dict(initial=points, order=np.array(order, int)))
-    try:
-        while iteration < settings.iterations:
-            while len(order) < settings.batch:  # every view once before any a second time
-                order += rng.permutation(len(scan)).tolist()
-            views, rest = order[:settings.batch], order[settings.batch:]
-            loss = stepper.step(state, views, iteration, rng)
-            order, iteration = rest, iteration + 1
-            if (settings.densify_from < iteration < settings.densify_until
-                    and iteration % settings.densify_every == 0):
-                state = DeviceState(densify(state.host(), settings, stepper.half, rng))
-                if len(state) == 0:
-                    raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
-            if iteration in marks:
-                dr.sync_thread()
-                value = float(loss[0])
-                if not np.isfinite(value):
-                    raise InputError(f'the loss is not finite at iteration {iteration}: lower the rates, or check the '
-                                     'projections')
-                seconds += time.perf_counter() - clock
-                entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
-                history.append(entry | (measure(stepper, state) if measure else {}))
-                clock = time.perf_counter()  # measuring is not fitting
-            if progress is not None:
-                last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
+
+    while iteration < settings.iterations:
+        while len(order) < settings.batch:  # every view once before any a second time
+            order += rng.permutation(len(scan)).tolist()
+        views, rest = order[:settings.batch], order[settings.batch:]
+        loss = stepper.step(state, views, iteration, rng)
+        order, iteration = rest, iteration + 1
+        if (settings.densify_from < iteration < settings.densify_until
+                and iteration % settings.densify_every == 0):
+            state = DeviceState(densify(state.host(), settings, stepper.half, rng))
+            if len(state) == 0:
+                raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+        if iteration in marks:
+            dr.sync_thread()
+            value = float(loss[0])
+            if not np.isfinite(value):
+                raise InputError(f'the loss is not finite at iteration {iteration}: lower the rates, or check the '
+                                 'projections')
+            seconds += time.perf_counter() - clock
+            entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
+            history.append(entry | (measure(stepper, state) if measure else {}))
+            clock = time.perf_counter()  # measuring is not fitting
+        if progress is not None:
+            last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
+            try:
                 progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
-            if time.perf_counter() - saved > CHECKPOINT_SECONDS:
+            except KeyboardInterrupt:
                 store()
-                saved = time.perf_counter()
-        dr.sync_thread()
-    finally:
-        # Also on Ctrl-C, between two steps or within one: a step replaces the state's arrays only at its end.
-        store()
+                raise
+        if time.perf_counter() - saved > settings.checkpoint_seconds:
+            store()
+            saved = time.perf_counter()
+    dr.sync_thread()
+    store()
     seconds += time.perf_counter() - clock
     return Fitted(state.host(), stepper, settings, points, history, seconds, info)
 
@@ -135,11 +137,13 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     return replace(settings, scale_max=min(settings.scale_max, largest))
 
 
-def _same_fit(extra, settings, scan, path):
+def _same_fit(extra, settings, scan, seed, path):
     """Raise InputError where a checkpoint belongs to another fit."""
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
-    changed = [k for k in now if before.get(k) != now[k]]
+    changed = [k for k in now if before.get(k) != now[k] and k != 'checkpoint_seconds']
+    if extra['seed'] != seed:
+        changed.append('seed')
     if extra['views'] != len(scan):
         changed.append('views')
     if changed:

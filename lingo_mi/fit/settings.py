@@ -1,6 +1,7 @@
 """The settings of a fit and the three recipes: every number named, with its source."""
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 
 from ..errors import InputError
@@ -15,6 +16,7 @@ class Settings:
     iterations         Adam steps
     decay_steps        iterations over which the rates fall from first to last; 0 stands for `iterations`
     batch              views a step
+    checkpoint_seconds how often a checkpoint is written
 
     Start
     init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume)
@@ -55,6 +57,7 @@ class Settings:
     iterations: int = 30_000
     decay_steps: int = 30_000
     batch: int = 1
+    checkpoint_seconds: float = 30.
     init: str = 'r2'
     n_points: int = 50_000
     high_fraction: float = .25
@@ -92,8 +95,13 @@ class Settings:
         def require(good, message):
             if not good:
                 raise InputError(message)
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(isinstance(value, str) or all(math.isfinite(x) for x in (value if isinstance(value, tuple) else [value])),
+                    f'{f.name} must be finite, not {value}')
         require(self.iterations >= 1, f'iterations must be at least 1, not {self.iterations}')
         require(self.batch >= 1, f'batch must be at least 1, not {self.batch}')
+        require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),

@@ -6,6 +6,7 @@ symmetry. The flange is tilted against all axes. Density is 1 inside, 0 outside.
 Mitsuba's `ply` and `obj` shapes:
 
     flange().export('flange.ply')
+    bolts().export('bolts.ply')       # eight that fit its holes; not part of the phantom
 """
 from __future__ import annotations
 
@@ -22,6 +23,8 @@ SIDE = 256.                                         # mm
 BORE, NECK, ROOT, RIM = 32., 40., 54., 96.          # radii, mm
 BOTTOM, PLATE, TOP = -38., -14., 44.                # heights of the faces, mm
 BOLTS, BOLT_CIRCLE, BOLT, DOWEL = 9, 76., 10., 3.5  # count, radius of their circle, radii of the holes
+SHANK, HEAD, LENGTH = 9.5, 15., 10.                 # a bolt's radii and the height of its head
+GAP = .25                                           # between head and plate: parts that touch would share a face
 _ARC = 12                                           # mesh steps along a bolt's sector
 _FAN = 36                                           # vertices around a hole
 
@@ -71,10 +74,37 @@ def flange() -> trimesh.Trimesh:
     neck = [(ROOT, PLATE), (NECK, TOP), (BORE, TOP), (BORE, BOTTOM), (ROOT, BOTTOM)]
     for line in (rim, neck):
         triangles += [_strip(ring(*p), ring(*q)) for p, q in zip(line[:-1], line[1:])]
-    points = np.concatenate(triangles).reshape(-1, 3) @ rotation(25, 32, 14)
+    return _tilted(np.concatenate(triangles))
+
+
+def bolts() -> trimesh.Trimesh:
+    """Hexagon bolts through the eight bolt holes in the world frame, mm: one mesh of closed parts, outward normals."""
+    bottom, top = BOTTOM - 4, PLATE + GAP
+    # Radius, height and whether the ring is a hexagon, from the axis at the lower end to the axis at the upper one.
+    profile = [(0., bottom, False), (SHANK, bottom, False), (SHANK, top, False), (HEAD, top, True),
+               (HEAD, top + LENGTH, True), (0., top + LENGTH, True)]
+    angle = 2 * np.pi * np.arange(_FAN) / _FAN
+    hexagon = np.cos(np.pi / 6) / np.cos(angle % (np.pi / 3) - np.pi / 6)
+    triangles = []
+    for i in range(1, BOLTS):  # the place of bolt 0 is the dowel's
+        turn = 2 * np.pi * i / BOLTS
+        axis = BOLT_CIRCLE * np.array([np.cos(turn), np.sin(turn), 0])
+
+        def ring(radius, z, hexagonal):
+            r = radius * (hexagon if hexagonal else np.ones(_FAN))
+            return axis + np.stack([r * np.cos(angle), r * np.sin(angle), np.full(_FAN, z)], 1)
+        triangles += [_strip(ring(*p), ring(*q)) for p, q in zip(profile[:-1], profile[1:])]
+    return _tilted(np.concatenate(triangles))
+
+
+def _tilted(triangles):
+    """A closed mesh of triangles [n, 3, 3], tilted against all axes; those without area are dropped."""
+    points = triangles.reshape(-1, 3) @ rotation(25, 32, 14)
     # Vertices of neighbours agree to rounding; merge them to make the mesh closed.
     points, index = np.unique(np.round(points, 6), axis=0, return_inverse=True)
-    return trimesh.Trimesh(points, index.reshape(-1, 3), process=False)
+    faces = index.reshape(-1, 3)
+    distinct = (faces != np.roll(faces, 1, 1)).all(1)
+    return trimesh.Trimesh(points, faces[distinct], process=False)
 
 
 @dataclass(frozen=True)
@@ -129,34 +159,44 @@ def _draw(image, corners, faces, rays):
             part[inside] += np.sign(along) * t
 
 
-def build(size: int, seed: int):
-    """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed plays no
-    part.
+def voxelise(triangles, low, step, shape) -> np.ndarray:
+    """The share of every voxel that lies inside closed meshes of triangles [n, 3, 3]: float32 [x, y, z].
 
-    Columns along z are cut by the mesh; between two crossings a voxel is covered by the length it shares with
-    the column.
+    low [3], step [3]   corner of the grid and voxel size, the unit of the triangles
+
+    Columns along z are cut by the mesh, 4 x 4 a voxel; between two crossings a voxel is covered by the length it shares
+    with the column. Which way round the mesh is as a whole plays no part.
     """
-    analytic = Mesh(flange())
-    h, fine = SIDE / size, 4
-    triangles = analytic.mesh.triangles
-    edges = (np.arange(size + 1) - size / 2) * h
-    covered = np.zeros((size, size, size + 1))
-    corners = (triangles[:, :, :2] + SIDE / 2) / (h / fine)
-    n = size * fine
-    low = np.maximum(np.ceil(corners.min(1) - .5), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(1) - .5), n - 1).astype(int) + 1
-    for face, c, (x0, y0), (x1, y1) in zip(triangles, corners, low, high):
+    low, step, fine = np.asarray(low, float), np.asarray(step, float), 4
+    nx, ny, nz = shape
+    edges = low[2] + np.arange(nz + 1) * step[2]
+    start = min(low[2], triangles[..., 2].min()) - 1
+    covered = np.zeros((nx, ny, nz + 1))
+    cell = step[:2] / fine
+    corners = (triangles[:, :, :2] - low[:2]) / cell
+    first = np.maximum(np.ceil(corners.min(1) - .5), 0).astype(int)
+    last = np.minimum(np.floor(corners.max(1) - .5), (nx * fine - 1, ny * fine - 1)).astype(int) + 1
+    for face, c, (x0, y0), (x1, y1) in zip(triangles, corners, first, last):
         if x0 >= x1 or y0 >= y1:
             continue
         image = np.zeros((y1 - y0, x1 - x0))
         _draw(image, (c - (x0, y0))[None], face[None], lambda x, y, x0=x0, y0=y0: (
-            np.stack([(x + x0) * h / fine - SIDE / 2, (y + y0) * h / fine - SIDE / 2, 0 * x - SIDE], -1),
+            np.stack([(x + x0) * cell[0] + low[0], (y + y0) * cell[1] + low[1], 0 * x + start], -1),
             np.broadcast_to([0., 0., 1.], (len(x), 3))))
         j, i = np.nonzero(image)
-        sign, z = np.sign(image[j, i]), np.abs(image[j, i]) - SIDE
+        sign, z = np.sign(image[j, i]), np.abs(image[j, i]) + start
         # The length of the column below each voxel edge that lies below the crossing.
-        below = np.minimum(edges, z[:, None]) - edges[0]
+        below = np.maximum(np.minimum(edges, z[:, None]) - edges[0], 0)
         np.add.at(covered, ((i + x0) // fine, (j + y0) // fine), sign[:, None] * below)
-    data = np.diff(covered, axis=2) / (h * fine * fine)
+    data = np.diff(covered, axis=2) / (step[2] * fine * fine)
+    data *= np.sign(data.sum())
     data[np.abs(data) < 1e-9] = 0
-    return np.clip(data, 0, 1).astype(np.float32), SIDE, analytic
+    return np.clip(data, 0, 1).astype(np.float32)
+
+
+def build(size: int, seed: int):
+    """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed plays no
+    part."""
+    analytic = Mesh(flange())
+    step = SIDE / size
+    return voxelise(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size,) * 3), SIDE, analytic
