@@ -72,7 +72,8 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
     measured = measure(fitted, dataset, volume, rendered) | dict(
         method=method, seed=seed, views=len(dataset.train), variant=mi.variant(), settings=asdict(fitted.settings),
         initial=fitted.info, command=command,
-        angles=np.degrees(geometry.angles).round(6).tolist(), versions=versions())
+        angles=_degrees(geometry), test_angles=_degrees(test.geometry) if rendered is not None else [],
+        versions=versions())
     report = ReportData(
         title=title, metrics=measured, volume=volume, truth=dataset.volume, spacing=geometry.dVoxel,
         centre=geometry.offOrigin, views=rendered, views_truth=test.projections if rendered is not None else None,
@@ -122,6 +123,10 @@ def versions() -> dict:
     return dict(python=platform.python_version(),
                 **{name: version(name) for name in ('lingo_mi', 'mitsuba', 'drjit', 'numpy', 'scipy', 'scikit-image')},
                 date=time.strftime('%Y-%m-%d'))
+
+
+def _degrees(geometry) -> list[float]:
+    return np.degrees(geometry.angles).tolist()
 
 
 def _number(x: float):

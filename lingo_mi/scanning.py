@@ -127,7 +127,8 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
     everything = Scan(every, _render(objects, every))
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
-    return choose_views(Dataset(train, held_out, _truth(objects, geometry)), 0 if test is not None else views)
+    meshes = [s for s in loaded.scene.shapes() if s.is_mesh() and s.interior_medium() is not None]
+    return choose_views(Dataset(train, held_out, _truth(objects, meshes, geometry)), 0 if test is not None else views)
 
 
 def choose_views(dataset: Dataset, views: int) -> Dataset:
@@ -183,9 +184,13 @@ def _on_grid(thing: GridInCube, geometry: Geometry) -> bool:
             and np.allclose(thing.high, centre + half, atol=1e-4 * half.max()))
 
 
-def _truth(objects, geometry) -> np.ndarray | None:
-    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it."""
+def _truth(objects, meshes, geometry) -> np.ndarray | None:
+    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it.
+
+    meshes   the shapes of the objects that are homogeneous meshes, in their order
+    """
     total = np.zeros(geometry.nVoxel, np.float32)
+    homogeneous = iter(m for m in meshes if str(m.interior_medium()).startswith('HomogeneousMedium'))
     for thing in objects:
         if isinstance(thing, _Volume):
             total += thing.data
@@ -200,7 +205,7 @@ def _truth(objects, geometry) -> np.ndarray | None:
             total += flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0)
         elif isinstance(thing, HomogeneousMesh):
             from .phantoms.mesh import voxelise
-            params = mi.traverse(thing.shape)
+            params = mi.traverse(next(homogeneous))
             vertices, faces = (np.array(params[k]).reshape(-1, 3) for k in ('vertex_positions', 'faces'))
             corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
             inside = voxelise(vertices[faces].astype(float), corner, geometry.dVoxel, geometry.nVoxel)
