@@ -103,6 +103,7 @@ class Stepper:
             state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
             state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
         _pass_on(leaf, footprints.values)
+        _evaluate(gaussians)
         return dr.detach(loss) * (1 / batch)
 
     def _total_variation(self, gaussians, rng):
@@ -123,6 +124,7 @@ class Stepper:
         cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), s.extent)
         loss = s.lambda_tv * losses.tv(cube, shape[::-1])
         dr.backward(loss)
+        _evaluate(gaussians)
         return dr.detach(loss)
 
 
@@ -148,3 +150,8 @@ def _pass_on(leaf, values):
             dr.set_grad(value, dr.grad(copy))
             dr.enqueue(dr.ADMode.Backward, value)
     dr.traverse(dr.ADMode.Backward)
+
+
+def _evaluate(values):
+    """Evaluate all derivatives in one kernel; one by one, each would repeat the work that they share."""
+    dr.eval([dr.grad(value) for value in values])
