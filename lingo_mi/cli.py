@@ -5,6 +5,7 @@ import argparse
 import os
 import signal
 import sys
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,9 +20,11 @@ class Parser(argparse.ArgumentParser):
 
 
 def guard(main) -> None:
-    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C."""
+    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C. Warnings are one line each."""
     try:
-        sys.exit(main() or 0)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
+            sys.exit(main() or 0)
     except InputError as error:
         print(f'error: {error}', file=sys.stderr)
         sys.exit(2)

@@ -63,6 +63,8 @@ class CTScanner(mi.Sensor):
     def __init__(self, props):
         self.dataset = None
         try:
+            if any(isinstance(thing, mi.Film) for _, thing in props.objects()):
+                raise InputError('the scanner makes its own film, of nDetector pixels; leave yours out')
             projections = _one(props, 'projections', '')
             if projections:
                 self.dataset = read_scan(data_file(projections, 'projections'))

@@ -60,13 +60,17 @@ def main():
 
     if args.views < 0:
         raise InputError(f'--views must be at least 1, not {args.views}')
+    if args.seed < 0:
+        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
+        raise InputError('--shape, --dtype and --mu-water go with --volume')
     if args.projections and args.volume:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
     defined = definitions(args.define)
     own = defaults(args.scene)  # a name of the scene goes before a setting's
     given = {k: v for k, v in defined.items() if k not in own}
-    settings = METHODS[args.method].changed(
-        **given, **{k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None})
+    given |= {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
+    settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})

@@ -15,7 +15,7 @@ from . import checkpoint
 from .densify import densify
 from .device import DeviceState
 from .settings import Settings
-from .state import State, start
+from .state import PARAMETERS, State, start
 from .step import Stepper
 
 
@@ -59,7 +59,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     rng = np.random.default_rng(seed)
     if resume:
         host, extra, arrays = checkpoint.load(path)
-        _same_fit(extra, settings, scan, seed, path)
+        _same_fit(host, extra, settings, scan, seed, path)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
@@ -137,8 +137,14 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     return replace(settings, scale_max=min(settings.scale_max, largest))
 
 
-def _same_fit(extra, settings, scan, seed, path):
-    """Raise InputError where a checkpoint belongs to another fit."""
+def _same_fit(host, extra, settings, scan, seed, path):
+    """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
+    columns = [(host.values[k], host.first[k], host.second[k], size) for k, size in PARAMETERS.items()]
+    if not ({'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys()
+            and len(host.gradient) == len(host.seen) == len(host)
+            and all(x.shape == (len(host), size) and np.isfinite(x).all() for *arrays, size in columns for x in arrays)):
+        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again without '
+                         '--resume')
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     changed = [k for k in now if before.get(k) != now[k] and k != 'checkpoint_seconds']
