@@ -1,0 +1,85 @@
+#!/usr/bin/env python3
+"""Compare recipes: quality against time, for every scene and method, as curves and a table.
+
+    python scripts/recipes.py scenes/x3d_foot.xml scenes/chest.xml scenes/x3d_engine.xml
+    python scripts/recipes.py scenes/x3d_foot.xml --methods fast r2 --views 25 --iterations 5000
+
+Runs scripts/fit.py for each combination that has no result yet in --out (an interrupted one goes on where it stopped), then
+draws all histories and prints a Markdown table. --iterations is for lingo and r2; fast keeps its own number.
+"""
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from lingo_mi.cli import guard
+from lingo_mi.errors import InputError
+from lingo_mi.fit.settings import METHODS
+
+COLOURS = dict(fast='tab:green', lingo='tab:blue', r2='tab:red')
+COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'), ('ssim_2d', 'SSIM', '{:.4f}'),
+           ('psnr_3d', 'volume, dB', '{:.2f}'), ('ssim_3d', 'SSIM 3D', '{:.4f}'), ('ipsd', 'IPSD', '{:.4f}'),
+           ('ipsd_targets', 'born', '{:,}'), ('gaussians', 'Gaussians', '{:,}'), ('iterations', 'iterations', '{}'),
+           ('seconds_init', 'init, s', '{:.1f}'), ('seconds_fit', 'fit, s', '{:.0f}'))
+
+
+def arguments():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('scenes', nargs='+', type=Path)
+    p.add_argument('--methods', nargs='+', choices=METHODS, default=list(METHODS))
+    p.add_argument('--views', type=int, default=25)
+    p.add_argument('--iterations', type=int, default=5000)
+    p.add_argument('--out', type=Path, default=Path('out/recipes'), help='folder of the results')
+    p.add_argument('--figure', type=Path, help='picture of the curves (default: recipes.png in --out)')
+    return p.parse_args()
+
+
+def result(scene, method, args) -> dict:
+    """The metrics of one fit, run now unless they are there."""
+    folder = args.out / f'{scene.stem}_{args.views}_{method}'
+    if not (folder / 'metrics.json').exists():
+        command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', method,
+                   '--views', str(args.views), '--out', str(folder)]
+        command += [] if method == 'fast' else ['--iterations', str(args.iterations)]
+        command += ['--resume'] if (folder / 'checkpoint.npz').exists() else []
+        print(' '.join(command), file=sys.stderr)
+        if code := subprocess.run(command).returncode:
+            raise InputError(f'{scene}: fit.py --method {method} failed with exit code {code}')
+    return json.loads((folder / 'metrics.json').read_text())
+
+
+def draw(results, figure):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(scene for scene, _ in results))
+    fig = Figure(figsize=(5 * len(scenes), 7), layout='constrained')
+    FigureCanvasAgg(fig)
+    axes = fig.subplots(2, len(scenes), squeeze=False)
+    for (scene, method), metrics in results.items():
+        for row, key in enumerate(('psnr_2d', 'psnr_3d')):
+            axis = axes[row, scenes.index(scene)]
+            points = [(e['seconds'], e[key]) for e in metrics['history'] if e.get(key) is not None]
+            axis.semilogx(*zip(*points), '.-', color=COLOURS[method], label=f'{method}, {metrics["iterations"]} iterations')
+            axis.set(title=scene if row == 0 else None, xlabel='time in steps [s]',
+                     ylabel=f'PSNR, {"held-out views" if row == 0 else "volume"} [dB]')
+            axis.grid(alpha=.3, which='both')
+            axis.legend()
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(figure, dpi=90)
+
+
+def main():
+    args = arguments()
+    results = {(scene.stem, method): result(scene, method, args) for scene in args.scenes for method in args.methods}
+    print('| scene | method | ' + ' | '.join(title for _, title, _ in COLUMNS) + ' |')
+    print('|---|---|' + '---:|' * len(COLUMNS))
+    for (scene, method), metrics in results.items():
+        cells = (form.format(metrics[key]) if metrics[key] is not None else '–' for key, _, form in COLUMNS)
+        print(f'| {scene} | {method} | ' + ' | '.join(cells) + ' |')
+    draw(results, args.figure or args.out / 'recipes.png')
+
+
+if __name__ == '__main__':
+    guard(main)
