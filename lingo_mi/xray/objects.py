@@ -1,6 +1,8 @@
 """What attenuates in a Mitsuba scene: clouds of Gaussians, grids in cubes, closed meshes."""
 from __future__ import annotations
 
+import re
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,8 +10,9 @@ import numpy as np
 from ..errors import InputError
 from . import cloud, grid
 
-# Shapes hold no Python attributes of ours, so what was learnt of a shape (a mesh's edges) is kept here, for its lifetime.
+# Shapes hold no Python attributes of ours, so what was learnt of a shape (a mesh's edges) is kept here, the latest ones.
 _MESHES: dict = {}
+MOST_MESHES = 64
 
 
 def find_objects(scene) -> list:
@@ -80,7 +83,8 @@ class GridInCube:
             raise InputError(f'{where} must have a gridvolume with one channel as sigma_t')
         volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and 'GridVolume' in str(node))
         box, cube = volume.bbox(), shape.bbox()
-        if not (str(shape).startswith('Cube') and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
+        if not (str(shape).startswith('Cube') and _upright(shape, volume)
+                and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
                 and np.allclose(box.max, cube.max, atol=1e-4 * np.abs(cube.max - cube.min))):
             raise InputError(f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, and '
                              'the gridvolume, [0, 1]^3 in its own, transforms onto the same box')
@@ -98,6 +102,19 @@ class GridInCube:
         return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
 
 
+def _upright(cube, volume) -> bool:
+    """Whether neither a cube nor a gridvolume is turned, and the volume not mirrored: boxes alone do not tell."""
+    corners = np.array(mi.traverse(cube)['vertex_positions']).reshape(-1, 3)
+    low, high = corners.min(0), corners.max(0)
+    off_corner = np.minimum(corners - low, high - corners)
+    # A volume's transform is no parameter; its description begins with the matrix.
+    numbers = re.findall(r'matrix=\[(.*?)\]\]', str(volume), re.DOTALL)[0].replace('[', ' ').replace(']', ' ')
+    matrix = np.array([float(x) for x in numbers.replace(',', ' ').split()]).reshape(4, 4)[:3, :3]
+    scale = np.diag(matrix)
+    return bool(np.all(off_corner <= 1e-4 * (high - low)) and np.all(scale > 0)
+                and np.all(np.abs(matrix - np.diag(scale)) <= 1e-4 * scale[:, None]))
+
+
 class HomogeneousMesh:
     """A closed mesh with a homogeneous medium inside."""
 
@@ -108,11 +125,15 @@ class HomogeneousMesh:
         params = mi.traverse(medium)
         self.sigma = next(v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value'))
         self.scale = params['scale'] if 'scale' in params else 1.
-        key = (id(shape), shape.vertex_count())
+        geometry = mi.traverse(shape)
+        # While an array is kept alive no other one has its index, so a moved mesh is not taken for the one that it was.
+        arrays = geometry['vertex_positions'], geometry['faces']
+        key = (id(shape), *(x.index for x in arrays))
         if key not in _MESHES:
-            _MESHES.clear()
-            _MESHES[key] = (shape, from_mitsuba(shape))
-        self.paths = _MESHES[key][1]
+            while len(_MESHES) >= MOST_MESHES:
+                _MESHES.pop(next(iter(_MESHES)))
+            _MESHES[key] = (shape, arrays, from_mitsuba(shape))
+        self.paths = _MESHES[key][-1]
 
     def line_integrals(self, view, extent, primal):
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
