@@ -34,9 +34,9 @@ def quick_measure(dataset: Dataset, most: int = 4):
     def measure(stepper, state):
         out = {}
         if test is not None and len(test):
-            out['psnr_2d'] = metrics.psnr_2d(stepper.render(state, test.geometry), test.projections)
+            out['psnr_2d'] = _number(metrics.psnr_2d(stepper.render(state, test.geometry), test.projections))
         if dataset.volume is not None:
-            out['psnr_3d'] = metrics.psnr_3d(stepper.volume(state), dataset.volume)
+            out['psnr_3d'] = _number(metrics.psnr_3d(stepper.volume(state), dataset.volume))
         return out
     return measure
 
@@ -93,7 +93,7 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
     truth = test.projections if rendered is not None else None
 
     def of(function, result, reference):
-        return None if result is None or reference is None else function(result, reference)
+        return None if result is None or reference is None else _number(function(result, reference))
     return dict(
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth), psnr_2d=of(metrics.psnr_2d, rendered, truth),
         ssim_2d=of(metrics.ssim_2d, rendered, truth), psnr_3d=of(metrics.psnr_3d, volume, dataset.volume),
@@ -130,7 +130,7 @@ def _degrees(geometry) -> list[float]:
 
 
 def _number(x: float):
-    """A number for JSON, which has no NaN."""
+    """A number for JSON, which has neither NaN nor infinity, or None."""
     return x if np.isfinite(x) else None
 
 
