@@ -4,7 +4,7 @@ The function is L = sum(weights * image) with fixed random weights, normal about
 differentiation are compared with
 
     ellipsoids   central differences of the closed form in float64 NumPy, since those of a float32 image are mostly
-                 rounding; the cut-off is put where it costs nothing (8 standard deviations), for the closed form has none
+                 rounding; the cut-off is put at 8 standard deviations, because the closed form has none
     grids        the image of one voxel of density 1 in an empty grid, less that of the empty grid: integrals are linear
                  in a grid, so that this large step has no error but rounding
 
@@ -55,9 +55,9 @@ def load(path):
 def check(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
     """Compare derivatives of a scene's image in its first sensor.
 
-    step    of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the number itself
-            for densities)
-    count   Gaussians of every cloud and voxels of every grid to check, drawn with `seed` among those that the image shows
+    step    of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the
+            number itself for densities)
+    count   Gaussians of every cloud and voxels of every grid to check, drawn with `seed` among those in view
 
     Raises InputError where the integrator is not `lingo_xray`, or the scene has neither ellipsoids nor grids in view.
     """
@@ -76,7 +76,8 @@ def check(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]
     weights = rng.normal(size=image.shape).astype(np.float32)
 
     params = mi.traverse(scene)
-    clouds = [k[:-len('.density')] for k in params.keys() if k.endswith('.density') and k[:-len('density')] + 'data' in params]
+    clouds = [k.removesuffix('.density') for k in params.keys() if k.endswith('.density')]
+    clouds = [name for name in clouds if f'{name}.data' in params]
     grids = [k for k in params.keys() if k.endswith('sigma_t.data')]
     keys = [f'{name}.{part}' for name in clouds for part in ('data', 'density')] + grids
     if not keys:
@@ -156,7 +157,8 @@ def _cloud(name, params, gradients, rays, slope, step, count, rng):
 
 
 def _grid(key, params, gradient, render, slope, count, rng):
-    tensor, flat = mi.TensorXf(params[key]), gradient.ravel()  # a copy: setting a parameter overwrites the object in place
+    tensor = mi.TensorXf(params[key])  # a copy: setting a parameter overwrites the object in place
+    flat = gradient.ravel()
     drawn = _draw(flat, count, rng)
 
     def image(values):

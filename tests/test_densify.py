@@ -72,8 +72,8 @@ def test_mass_of_a_split(keeps):
     expected = mass(state)[chosen] * (1 if keeps else SHRINK ** -3)
     assert abs(children.sum() / expected.sum() - 1) < 1e-6
     np.testing.assert_allclose(children.sum(1), expected, rtol=5e-6)
-    np.testing.assert_allclose(activate(after, SETTINGS)[1][10:], activate(state, SETTINGS)[1][chosen].repeat(2, 0) / SHRINK,
-                               rtol=5e-6)
+    parents = activate(state, SETTINGS)[1][chosen].repeat(2, 0)
+    np.testing.assert_allclose(activate(after, SETTINGS)[1][10:], parents / SHRINK, rtol=5e-6)
 
 
 def test_children_are_drawn_from_their_parent():
@@ -141,8 +141,8 @@ def test_densify_clones_the_small_and_splits_the_large():
     assert after.born.sum() - state.born[[0, 2, 3, 4]].sum() == 3  # one copy, two halves
     assert not after.gradient.any() and not after.seen.any()
     density = activate(state, SETTINGS)[3]
-    np.testing.assert_allclose(np.sort(activate(after, SETTINGS)[3]), np.sort([*[density[0] / 2] * 2, *[density[1] / 2] * 2,
-                                                                               *density[2:]]), rtol=2e-6)
+    expected = [*[density[0] / 2] * 2, *[density[1] / 2] * 2, *density[2:]]
+    np.testing.assert_allclose(np.sort(activate(after, SETTINGS)[3]), np.sort(expected), rtol=2e-6)
 
 
 def test_the_mean_gradient_decides():

@@ -1,4 +1,4 @@
-"""The gradient check: it passes where derivatives are right, fails where they are not, and refuses what it cannot check."""
+"""The gradient check: it passes where derivatives are right, fails where they are not, refuses what it cannot check."""
 import os
 import subprocess
 import sys
@@ -30,7 +30,8 @@ XML = """<scene version="3.0.0">
 </scene>"""
 SENSORS = {
     'scanner': """<sensor type="ct_scanner"> <float name="DSO" value="5"/> <float name="DSD" value="7"/>
-        <string name="nDetector" value="17, 22"/> <string name="dDetector" value=".2"/> <string name="nVoxel" value="8"/>
+        <string name="nDetector" value="17, 22"/> <string name="dDetector" value=".2"/>
+        <string name="nVoxel" value="8"/>
         <string name="dVoxel" value=".25"/> <string name="angles" value="20"/></sensor>""",
     'camera': """<sensor type="perspective"> <float name="fov" value="35"/>
         <transform name="to_world"><lookat origin="3, 1, 1" target="0, 0, 0" up="0, 0, 1"/></transform>
@@ -51,8 +52,8 @@ def scene_file(folder, sensor='scanner', output='line_integral'):
 
 
 def script(*arguments):
-    return subprocess.run([sys.executable, SCRIPT, *map(str, arguments)], capture_output=True, text=True, env=os.environ,
-                          timeout=300)
+    return subprocess.run([sys.executable, SCRIPT, *map(str, arguments)], capture_output=True, text=True,
+                          env=os.environ, timeout=300)
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
@@ -66,7 +67,8 @@ def test_right_derivatives_pass(tmp_path, sensor, output):
     assert max(row.error for row in rows) < 1e-5
     assert all(row.ad != 0 for row in rows)
     lines = table(rows).splitlines()
-    assert len(lines) == len(rows) + 1 and 'cloud.centre[' in lines[1] and 'box.interior_medium.sigma_t.data[' in lines[-1]
+    assert len(lines) == len(rows) + 1
+    assert 'cloud.centre[' in lines[1] and 'box.interior_medium.sigma_t.data[' in lines[-1]
     np.testing.assert_array_equal(np.array(mi.render(scene)), before)  # the scene is given back as it was
 
 

@@ -82,8 +82,8 @@ def pose(sensor, view=0):
 def scanner_geometry(sensor=SCANNER):
     def numbers(name):
         return [float(x) for x in sensor[name].split(',')]
-    return Geometry(DSO=sensor['DSO'], DSD=sensor['DSD'], nDetector=numbers('nDetector'), dDetector=numbers('dDetector'),
-                    offDetector=numbers('offDetector'), nVoxel=8, dVoxel=.25, angles=np.radians(numbers('angles')))
+    return Geometry(DSO=sensor['DSO'], DSD=sensor['DSD'], angles=np.radians(numbers('angles')), nVoxel=8, dVoxel=.25,
+                    **{name: numbers(name) for name in ('nDetector', 'dDetector', 'offDetector')})
 
 
 def everything():
@@ -257,7 +257,8 @@ def test_forward_mode():
         params = mi.traverse(scene)
         data = np.concatenate([by['centre'], by['scale'], by['rotation']], 1).ravel()
         change = np.float32(by_grid.transpose(2, 1, 0)[..., None])
-        for key, direction in (('cloud.data', mi.Float(data.tolist())), ('cloud.density', mi.Float(by['density'].tolist())),
+        for key, direction in (('cloud.data', mi.Float(data.tolist())),
+                               ('cloud.density', mi.Float(by['density'].tolist())),
                                ('grid.interior_medium.sigma_t.data', mi.TensorXf(change))):
             dr.enable_grad(params[key])
             dr.set_grad(params[key], direction)
@@ -404,7 +405,9 @@ XML = """<scene version="3.0.0">
             <scale x=".2" y=".3" z=".25"/><rotate x="1" y="2" z="3" angle="40"/><translate x="-.3" y="-.2" z=".1"/>
         </transform>
         <bsdf type="null"/>
-        <medium name="interior" type="homogeneous"><float name="sigma_t" value="1.3"/><float name="albedo" value="0"/></medium>
+        <medium name="interior" type="homogeneous">
+            <float name="sigma_t" value="1.3"/> <float name="albedo" value="0"/>
+        </medium>
     </shape>
 </scene>"""
 
@@ -424,13 +427,15 @@ def test_scene_file(scene_file):
     assert relative(render(mi.load_file(str(scene_file))), expected) < 2e-6
 
 
-@pytest.mark.parametrize('order', ['import lingo_mi, mitsuba as mi; mi.set_variant("{}")',
-                                   'import mitsuba as mi; mi.set_variant("{}"); import lingo_mi',
-                                   'import mitsuba as mi; mi.set_variant("scalar_rgb"); import lingo_mi; mi.set_variant("{}")'])
+@pytest.mark.parametrize('order', [
+    'import lingo_mi, mitsuba as mi; mi.set_variant("{}")',
+    'import mitsuba as mi; mi.set_variant("{}"); import lingo_mi',
+    'import mitsuba as mi; mi.set_variant("scalar_rgb"); import lingo_mi; mi.set_variant("{}")'])
 @pytest.mark.parametrize('kind', ['mono', 'rgb'])
 def test_either_import_order(order, kind, scene_file, variant):
     name = variant.rsplit('_', 1)[0] + '_' + kind
-    code = order.format(name) + f'; import numpy; print(numpy.array(mi.render(mi.load_file({str(scene_file)!r}))).sum())'
+    code = (f'{order.format(name)}\n' 'import numpy\n'
+            f'print(numpy.array(mi.render(mi.load_file({str(scene_file)!r}))).sum())')
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, env=os.environ, timeout=120)
     assert done.returncode == 0, done.stderr
     assert abs(float(done.stdout) / render(mi.load_file(str(scene_file))).sum() - 1) < 1e-6
@@ -510,7 +515,8 @@ def test_empty_scene():
 
 
 @pytest.mark.parametrize('change, match', [
-    (dict(view=3), 'view 3'), (dict(nDetector='23.5, 30'), 'whole numbers'), (dict(dDetector='a'), 'not a list of numbers'),
+    (dict(view=3), 'view 3'), (dict(nDetector='23.5, 30'), 'whole numbers'),
+    (dict(dDetector='a'), 'not a list of numbers'),
     (dict(DSD=2.), 'DSD >= DSO'), (dict(mode='fan'), 'mode must be'), (dict(angles='nan'), 'not a finite number'),
     (dict(angles=''), 'no views')])
 def test_impossible_scanners(change, match):

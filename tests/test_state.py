@@ -139,8 +139,8 @@ def test_adam_against_numpy():
     types = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
     for step in range(1, 6):
         gradients = {k: np.float32(rng.normal(size=v.shape) * 10. ** rng.integers(-4, 2)) for k, v in expected.items()}
-        device.adam({k: types[k](np.ascontiguousarray(g.T if g.shape[1] > 1 else g[:, 0])) for k, g in gradients.items()},
-                    rates, step, 1e-15)
+        uploaded = {k: types[k](np.ascontiguousarray(g.T if g.shape[1] > 1 else g[:, 0])) for k, g in gradients.items()}
+        device.adam(uploaded, rates, step, 1e-15)
         for k, g in gradients.items():
             g = g.astype(float)
             m[k], s[k] = .9 * m[k] + .1 * g, .999 * s[k] + .001 * g * g

@@ -87,7 +87,8 @@ def test_mass():
 
 
 def test_order_is_x_fastest():
-    cloud = Cloud([[-.5, .1, .1], [.1, .5, .1], [.1, .1, .7]], .1 * np.ones((3, 3)), np.tile([0, 0, 0, 1], (3, 1)), [1., 2, 3])
+    cloud = Cloud([[-.5, .1, .1], [.1, .5, .1], [.1, .1, .7]], .1 * np.ones((3, 3)), np.tile([0, 0, 0, 1], (3, 1)),
+                  [1., 2, 3])
     values, _ = run(cloud, boxed((10, 10, 10), [-1] * 3, [1] * 3), np.ones(1000))
     volume = values.reshape(10, 10, 10).transpose(2, 1, 0)  # [x, y, z]
     assert volume[2, 5, 5] > .99 and volume[5, 7, 5] > 1.99 and volume[5, 5, 8] > 2.99

@@ -1,0 +1,256 @@
+"""The fit on tiny scans: it descends, resumes to the bit, compiles nothing late, and refuses what it must."""
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fit.loop import run
+from lingo_mi.fit.settings import METHODS, R2
+from lingo_mi.fit.state import PARAMETERS, activate
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.phantoms.gaussians import Cloud
+from lingo_mi.scan import Scan
+
+SHORT = R2.changed(normalise=True, iterations=30, densify_from=5, densify_until=100, densify_every=6,
+                   densify_threshold=8e-3, decay_steps=0, rate_centre=(4e-3, 4e-4),
+                   rate_density=(5e-2, 5e-3), rate_scale=(5e-2, 5e-3),
+                   rate_rotation=(2e-2, 2e-3), tv_size=8, max_gaussians=2000)
+
+
+def geometry(views=3, **changes):
+    settings = dict(DSO=500., DSD=750., nDetector=(32, 32), dDetector=(12., 12.), nVoxel=(32, 32, 32),
+                    dVoxel=(8., 8., 8.), angles=circular(views, 180, start=10))
+    return Geometry(**{**settings, **changes})
+
+
+def tiny_scan(g, flat=False):
+    """Eight Gaussians of 256 mm's proportions and their exact projections."""
+    rng = np.random.default_rng(0)
+    centres, scales = rng.uniform(-60, 60, (8, 3)), rng.uniform(8, 25, (8, 3))
+    if flat:
+        centres[:, 2] = 0
+    turn = np.array([0, 0, 1, 1]) if flat else 1
+    cloud = Cloud(centres, scales, rng.normal(size=(8, 4)) * turn, rng.uniform(.2, 1, 8))
+    cloud = replace(cloud, quaternions=cloud.quaternions / np.linalg.norm(cloud.quaternions, axis=1, keepdims=True))
+    return Scan(g, cloud.project(g))
+
+
+def some_points(g, n=60, seed=1):
+    points = np.random.default_rng(seed).uniform(-.5, .5, (n, 3)) * np.minimum(g.half, 1)
+    if g.nVoxel[2] == 1:
+        points[:, 2] = 0
+    return InitialCloud(points, np.full(n, .1), np.full(n, .08))
+
+
+@pytest.fixture(scope='module')
+def scan():
+    return tiny_scan(geometry())
+
+
+@pytest.fixture(scope='module')
+def whole(scan):
+    """An uninterrupted run."""
+    return run(scan, SHORT, some_points(scan.geometry), seed=3)
+
+
+def error_of(fitted, scan):
+    image = fitted.stepper.render(DeviceState(fitted.state), scan.geometry)
+    return np.linalg.norm(image - scan.projections) / np.linalg.norm(scan.projections)
+
+
+def assert_equal_states(a, b):
+    assert len(a) == len(b)
+    for group in ('values', 'first', 'second'):
+        for k in PARAMETERS:
+            np.testing.assert_array_equal(getattr(a, group)[k], getattr(b, group)[k])
+    for name in ('gradient', 'seen', 'born'):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def stop_at(iteration):
+    def progress(done, **_):
+        if done == iteration:
+            raise KeyboardInterrupt
+    return progress
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Progress
+# ------------------------------------------------------------------------------------------------------------
+
+def test_loss_falls(scan, whole):
+    losses = [entry['loss'] for entry in whole.history]
+    assert [entry['iteration'] for entry in whole.history][-1] == 30
+    assert losses[-1] < .7 * losses[0]
+    before = run(scan, SHORT.changed(iterations=1), some_points(scan.geometry), seed=3)
+    assert error_of(whole, scan) < .7 * error_of(before, scan)
+    assert len(whole.state) > 60 and whole.state.born.any()  # densification did something
+    assert all(np.isfinite(v).all() for v in whole.state.values.values())
+
+
+def test_progress_and_measure_are_called(scan):
+    steps, measured = [], []
+    run(scan, SHORT.changed(iterations=8), some_points(scan.geometry),
+        measure=lambda stepper, state: measured.append(len(state)) or {'psnr2d': 1.},
+        progress=lambda done, loss, gaussians, **rest: steps.append((done, loss(), gaussians, rest)))
+    assert [s[0] for s in steps] == list(range(1, 9)) and all(np.isfinite(s[1]) for s in steps)
+    assert measured and steps[-1][3] == {'psnr2d': 1.}
+
+
+def test_same_seed_same_fit(scan, whole, variant):
+    if not variant.startswith('llvm'):
+        pytest.skip('a GPU adds atomically, in any order')
+    assert_equal_states(run(scan, SHORT, some_points(scan.geometry), seed=3).state, whole.state)
+    other = run(scan, SHORT, some_points(scan.geometry), seed=4).state
+    assert len(other) != len(whole.state) or not np.array_equal(other.values['centre'], whole.state.values['centre'])
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_each_method(method, scan):
+    settings = METHODS[method].changed(iterations=8, n_points=200, densify_from=2, densify_every=3, tv_size=8,
+                                       fdk_threshold=1e-3)
+    start = initial_cloud(scan, settings)
+    fitted = run(scan, settings, start)
+    assert len(fitted.state) > 0 and np.isfinite(error_of(fitted, scan))
+    assert fitted.history[-1]['iteration'] == 8
+    volume = fitted.stepper.volume(DeviceState(fitted.state))
+    assert volume.shape == scan.geometry.nVoxel and volume.max() > 0
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_fan_beam_stays_in_its_plane(mode):
+    """One row and one slice: nothing may leave the plane or turn out of it."""
+    g = geometry(6, nDetector=(1, 48), dDetector=(8., 8.), nVoxel=(32, 32, 1), mode=mode)
+    scan, start = tiny_scan(g, flat=True), some_points(g)
+    settings = SHORT.changed(split_size=.08, split_keeps_mass=True)
+    fitted = run(scan, settings, start)
+    assert fitted.state.born.any()  # clones and halves of splits, which are drawn at random
+    centre, scale, rotation, _ = activate(fitted.state, fitted.settings)
+    assert not centre[:, 2].any() and not rotation[:, :2].any()
+    np.testing.assert_allclose(scale[:, 2], .08, rtol=1e-5)
+    before = run(scan, settings.changed(iterations=1), start)
+    assert error_of(fitted, scan) < .9 * error_of(before, scan)
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Checkpoints
+# ------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('stop', [13, 12])
+def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
+    """Stopped between densifications or right after one."""
+    path = tmp_path / 'fit.npz'
+    with pytest.raises(KeyboardInterrupt):
+        run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(stop))
+    fitted = run(scan, SHORT, None, seed=3, path=path, resume=True)
+    if variant.startswith('llvm'):
+        assert_equal_states(fitted.state, whole.state)
+    else:
+        np.testing.assert_allclose(fitted.state.values['centre'], whole.state.values['centre'], atol=1e-4)
+    assert [h['iteration'] for h in fitted.history] == [h['iteration'] for h in whole.history]
+    np.testing.assert_array_equal(fitted.initial, whole.initial)
+
+
+def test_resuming_a_finished_fit_changes_nothing(scan, tmp_path):
+    path = tmp_path / 'fit.npz'
+    settings = SHORT.changed(iterations=3)
+    done = run(scan, settings, some_points(scan.geometry), path=path)
+    assert_equal_states(run(scan, settings, None, path=path, resume=True).state, done.state)
+
+
+@pytest.fixture
+def stored(scan, tmp_path):
+    path = tmp_path / 'fit.npz'
+    run(scan, SHORT.changed(iterations=2), some_points(scan.geometry), path=path)
+    return path
+
+
+@pytest.mark.parametrize('change', [dict(extent=4.), dict(iterations=40), dict(rate_scale=(1e-2, 1e-3))])
+def test_checkpoint_of_other_settings_is_refused(scan, stored, change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        run(scan, SHORT.changed(iterations=2).changed(**change), None, path=stored, resume=True)
+
+
+def test_checkpoint_of_another_scan_is_refused(scan, stored):
+    with pytest.raises(InputError, match='views'):
+        run(scan.subset([0, 1]), SHORT.changed(iterations=2), None, path=stored, resume=True)
+
+
+@pytest.mark.parametrize('share', [0, .3, .95])
+def test_truncated_checkpoint_is_refused(scan, stored, share):
+    content = stored.read_bytes()
+    stored.write_bytes(content[:int(len(content) * share)])
+    with pytest.raises(InputError, match='not a checkpoint'):
+        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+
+
+def test_damaged_checkpoint_is_refused(scan, stored):
+    content = bytearray(stored.read_bytes())
+    content[len(content) // 3] ^= 0xff
+    stored.write_bytes(bytes(content))
+    with pytest.raises(InputError, match='not a checkpoint'):
+        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+
+
+def test_absent_checkpoint_is_refused(scan, tmp_path):
+    with pytest.raises(InputError, match='no checkpoint'):
+        run(scan, SHORT, None, path=tmp_path / 'fit.npz', resume=True)
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Kernels and hard input
+# ------------------------------------------------------------------------------------------------------------
+
+def test_no_kernel_is_compiled_after_the_first_steps():
+    """Neither other views, rates and cubes nor other numbers of Gaussians may ask for new code.
+
+    Nor may the place of an array in memory: a panel of odd size and views that come up late would tell.
+    """
+    scan = tiny_scan(geometry(11, nDetector=(29, 31)))
+    settings = SHORT.changed(iterations=24, densify_from=0, densify_every=4, loss_scale='dynamic')
+    fresh, sizes = {}, {}
+
+    def progress(done, gaussians, **_):
+        history = dr.kernel_history([dr.KernelType.JIT])
+        fresh[done] = [k['hash'] for k in history if not k['cache_hit'] or k['cache_disk']]
+        sizes[done] = gaussians
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        run(scan, settings, some_points(scan.geometry, 61), progress=progress)
+    # Two steps, a densification at the fourth, and one step with its result.
+    assert len({sizes[i] for i in (5, 9, 13, 17, 21)}) > 2
+    assert not {i: len(hashes) for i, hashes in fresh.items() if i > 5 and hashes}
+
+
+def test_a_fit_that_loses_everything_says_so(scan):
+    with pytest.raises(InputError, match='every Gaussian was pruned'):
+        run(scan, SHORT.changed(prune_density=1e3), some_points(scan.geometry))
+
+
+def test_empty_projections_are_refused(scan):
+    empty = Scan(scan.geometry, np.zeros_like(scan.projections))
+    with pytest.raises(InputError, match='nothing to fit'):
+        run(empty, SHORT, some_points(scan.geometry))
+
+
+@pytest.mark.parametrize('n', [1, 2])
+def test_very_few_gaussians(scan, n):
+    fitted = run(scan, SHORT.changed(iterations=14), some_points(scan.geometry, n))
+    assert len(fitted.state) >= 1 and all(np.isfinite(v).all() for v in fitted.state.values.values())
+
+
+def test_all_gaussians_in_one_place(scan):
+    start = some_points(scan.geometry, 30)
+    start = replace(start, points=np.zeros((30, 3)))
+    fitted = run(scan, SHORT.changed(iterations=14), start)
+    assert all(np.isfinite(v).all() for v in fitted.state.values.values())
+
+
+def test_several_views_a_step(scan):
+    fitted = run(scan, SHORT.changed(iterations=6, batch=3), some_points(scan.geometry))
+    assert fitted.history[-1]['loss'] < fitted.history[0]['loss']
