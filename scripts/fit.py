@@ -70,6 +70,10 @@ def main():
     own = defaults(args.scene)  # a name of the scene goes before a setting's
     given = {k: v for k, v in defined.items() if k not in own}
     given |= {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
+    unknown = [k for k in given if not hasattr(METHODS[args.method], k)]
+    if unknown:
+        raise InputError(f'-D {unknown[0]}: neither a parameter of {args.scene} ({", ".join(sorted(own)) or "it has none"}) nor '
+                         'a setting of the fit (see lingo_mi/fit/settings.py)')
     settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 

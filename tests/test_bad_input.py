@@ -112,7 +112,7 @@ def test_bad_scene(tmp_path, monkeypatch, old, new, says):
 # ---- arguments -------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('args, says', [
-    (['-D', 'vews=3'], 'vews'), (['-D', 'views'], 'name=value'), (['-D', '=3'], 'name=value'),
+    (['-D', 'vews=3'], '(views)'), (['-D', 'views'], 'name=value'), (['-D', '=3'], 'name=value'),
     (['-D', 'views=many'], 'many'), (['-D', 'batch=many'], 'whole number'), (['-D', 'batch=0'], 'batch'),
     (['-D', 'batch=1.5'], 'whole number'), (['-D', 'normalise=perhaps'], 'true or false'), (['-D', 'extent=99'], 'extent'),
     (['-D', 'rate_scale=1,2,3'], 'rate_scale'), (['-D', 'rate_scale=-1'], 'rate_scale'),
