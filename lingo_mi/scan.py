@@ -1,7 +1,7 @@
 """A scan: projections and their geometry. Pure NumPy."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,21 @@ class Scan:
     def subset(self, index) -> Scan:
         """The views `index` only."""
         return Scan(self.geometry.subset(index), self.projections[index])
+
+    def binned(self, factor: int) -> Scan:
+        """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
+
+        A side of fewer than two new pixels is not binned.
+        """
+        g, p = self.geometry, self.projections
+        by = [factor if n >= 2 * factor else 1 for n in g.nDetector]
+        rows, columns = (n // f for n, f in zip(g.nDetector, by))
+        p = p[:, :rows * by[0], :columns * by[1]].reshape(len(self), rows, by[0], columns, by[1]).mean((2, 4))
+        # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
+        lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
+        offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
+        step = tuple(d * f for d, f in zip(g.dDetector, by))
+        return Scan(replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset), p)
 
     @property
     def normalised(self) -> np.ndarray:

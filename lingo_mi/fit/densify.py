@@ -16,11 +16,12 @@ from .state import PARAMETERS, State, activate, inverse_scale, inverse_softplus
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
-def densify(state: State, settings: Settings, half, rng) -> State:
+def densify(state: State, settings: Settings, half, rng, flat: bool = False) -> State:
     """Clone, split and prune once, then clear the statistic.
 
     half   half the volume's sides, [3]: Gaussians centred outside are removed
     rng    numpy Generator; places the halves of splits
+    flat   whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
     """
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
     _, scale, _, _ = activate(state, settings)
@@ -29,7 +30,7 @@ def densify(state: State, settings: Settings, half, rng) -> State:
         strong[:] = False
     large = scale.max(1) > settings.split_size
     state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
-                  settings, rng)
+                  settings, rng, flat)
     return prune(state, settings, half)
 
 
@@ -39,16 +40,19 @@ def clone(state: State, chosen) -> State:
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
-def split(state: State, chosen, settings: Settings, rng) -> State:
+def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> State:
     """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.scale_min, settings.scale_max
     centre, scale, rotation, _ = activate(state, settings)
-    factor = .5 * SHRINK ** 3 if settings.split_keeps_mass else .5
+    shrink = np.array([SHRINK, SHRINK, 1. if flat else SHRINK])
+    factor = .5 * shrink.prod() if settings.split_keeps_mass else .5
     children = _fresh(_with_density(state, chosen, factor), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
+    if flat:
+        offset[:, 2] = 0
     children.values['centre'] = (centre[parents] + _rotate(rotation[parents], offset)).astype(np.float32)
-    smaller = np.clip(scale[parents] / SHRINK, low * 1.01, high * .99)
+    smaller = np.clip(scale[parents] / shrink, low * 1.01, high * .99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32)
     return _append(_take(state, ~chosen), children)
 

@@ -21,11 +21,13 @@ class DeviceState:
     def __init__(self, state: State):
         types = _types()
 
+        def column(values):
+            return mi.Float(_aligned(values))
+
         def upload(columns):
-            return {k: types[k](np.ascontiguousarray(columns[k].T if size > 1 else columns[k][:, 0]))
-                    for k, size in PARAMETERS.items()}
+            return {k: types[k](*(column(c) for c in columns[k].T)) for k in PARAMETERS}
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
-        self.gradient, self.seen = mi.Float(state.gradient), mi.Float(state.seen)
+        self.gradient, self.seen = column(state.gradient), column(state.seen)
         self.born = state.born
         # A single Gaussian's arrays of width one would otherwise be literals, and be compiled in.
         dr.make_opaque(self.values, self.first, self.second, self.gradient, self.seen)
@@ -36,7 +38,8 @@ class DeviceState:
     def host(self) -> State:
         """The state as NumPy arrays."""
         def download(columns):
-            return {k: np.ascontiguousarray(np.array(columns[k], np.float32).reshape(size, -1).T)
+            # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
+            return {k: np.stack([c.numpy() for c in (columns[k] if size > 1 else [columns[k]])], 1)
                     for k, size in PARAMETERS.items()}
         return State(download(self.values), download(self.first), download(self.second), self.gradient.numpy(),
                      self.seen.numpy(), self.born)
@@ -46,9 +49,7 @@ class DeviceState:
         v = self.values
         low, high = dr.opaque(mi.Float, settings.scale_min), dr.opaque(mi.Float, settings.scale_max - settings.scale_min)
         scale = low + high / (1 + dr.exp(-v['scale']))
-        # softplus without overflow
-        density = dr.maximum(v['density'], 0) + dr.log(1 + dr.exp(-dr.abs(v['density'])))
-        return v['centre'], scale, v['rotation'], density
+        return v['centre'], scale, v['rotation'], _softplus(v['density'])
 
     def adam(self, gradients: dict, rates: dict, step: int, epsilon: float):
         """One Adam step (Kingma and Ba 2015); `step` counts from 1, for the bias correction."""
@@ -61,3 +62,24 @@ class DeviceState:
             self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + epsilon)
             self.first[name], self.second[name] = m, v
         dr.eval(self.values, self.first, self.second, self.gradient, self.seen)
+
+
+def _softplus(x):
+    """ln(1 + e^x) without overflow, to float32's relative precision at both ends."""
+    above = x > 0  # not by maximum and abs, whose derivatives at 0 add up to 0
+    small = dr.exp(dr.select(above, -x, x))
+    series = small * (1 - small * (1 / 2 - small * (1 / 3 - small / 4)))  # 1 + small would round small away
+    return dr.select(above, x, 0) + dr.select(small < .01, series, dr.log(1 + small))
+
+
+def _aligned(values):
+    """A copy that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
+
+    Dr.Jit reads NumPy's memory in place and compiles its alignment into the kernels, which would then be others after every
+    densification.
+    """
+    room = np.empty(len(values) + 16, np.float32)
+    start = -room.ctypes.data % 64 // 4
+    out = room[start:start + len(values)]
+    out[:] = values
+    return out

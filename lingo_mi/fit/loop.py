@@ -87,7 +87,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         order, iteration = rest, iteration + 1
         if (settings.densify_from < iteration < settings.densify_until
                 and iteration % settings.densify_every == 0):
-            state = DeviceState(densify(state.host(), settings, stepper.half, rng))
+            state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat))
             if len(state) == 0:
                 raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
         if iteration in marks:

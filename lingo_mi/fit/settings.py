@@ -16,6 +16,7 @@ class Settings:
     iterations         Adam steps
     decay_steps        iterations over which the rates fall from first to last; 0 stands for `iterations`
     batch              views a step
+    coarse_share       share of the iterations, the first ones, that see views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds how often a checkpoint is written
 
     Start
@@ -57,6 +58,7 @@ class Settings:
     iterations: int = 30_000
     decay_steps: int = 30_000
     batch: int = 1
+    coarse_share: float = 0.
     checkpoint_seconds: float = 30.
     init: str = 'r2'
     n_points: int = 50_000
@@ -102,6 +104,7 @@ class Settings:
         require(self.iterations >= 1, f'iterations must be at least 1, not {self.iterations}')
         require(self.batch >= 1, f'batch must be at least 1, not {self.batch}')
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
+        require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
         require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),

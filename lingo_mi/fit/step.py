@@ -39,6 +39,9 @@ class Stepper:
         self.settings, self.geometry = settings, scan.geometry
         self.unit = density_unit(scan, settings)
         self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
+        self.coarse_until = round(settings.coarse_share * settings.iterations)
+        coarse = scan.binned(2) if self.coarse_until else scan
+        self.coarse = [Target(coarse, i, self.unit) for i in range(len(scan))] if self.coarse_until else []
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
@@ -55,8 +58,9 @@ class Stepper:
         # Each view and the cube add their derivatives to these; then one pass takes them to the raw parameters.
         leaf = _leaf(gaussians)
         total = mi.Float(0)
+        targets = self.coarse if iteration < self.coarse_until else self.targets
         for view in views:
-            total += self._view(state, leaf, self.targets[view], len(views))
+            total += self._view(state, leaf, targets[view], len(views))
         if s.lambda_tv > 0:
             total += self._total_variation(leaf, rng)
         _pass_on(leaf, gaussians)
@@ -97,8 +101,8 @@ class Stepper:
         factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
         dr.backward(loss * weight * (1 / batch))
+        gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])  # not while derivatives are suspended: they would read as zero
         with dr.suspend_grad():
-            gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])
             norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
             state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
             state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
