@@ -96,6 +96,17 @@ def load(packed, index):
     return [x for j in range(3) for x in dr.gather(mi.Vector4f, packed, index * 3 + j)]
 
 
+def pair(a, b):
+    """Two corrections in one number, eight binary digits each; `unpair` gives them back."""
+    a, b = (dr.reinterpret_array(mi.UInt32, x) & 0xffff0000 for x in (a, b))
+    return dr.reinterpret_array(mi.Float, a | (b >> 16))
+
+
+def unpair(both):
+    bits = dr.reinterpret_array(mi.UInt32, both)
+    return dr.reinterpret_array(mi.Float, bits & 0xffff0000), dr.reinterpret_array(mi.Float, bits << 16)
+
+
 def span(low, high, offset, column, empty, packets):
     """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
     far = 1e8  # keeps what lies far outside within Int32
@@ -107,9 +118,9 @@ def span(low, high, offset, column, empty, packets):
 
 
 def position(packet, column, offset):
-    """t of the elements of a packet."""
-    t = mi.Float(packet * PACKET - column) - offset
-    return mi.Vector4f(t, t + 1, t + 2, t + 3)
+    """t of the elements of a packet: exact to its last digit wherever the whole elements cancel."""
+    whole = mi.Float(packet * PACKET - column)
+    return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)
 
 
 @dr.syntax

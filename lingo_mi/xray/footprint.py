@@ -19,7 +19,8 @@ Both are divided by (k|w|)^2, and the first is sheared to a sum of two squares, 
 
 The sum of squares is what keeps a needle's footprint accurate in float32. For a parallel beam den = 1. These eleven numbers
 a Gaussian (amplitude, mx, my, shear, e1 ... e22, and the centre) are computed in float64, which costs nothing beside the
-pixels and saves the digits that differences of world coordinates lose, and are handed on in float32.
+pixels and saves the digits that differences of world coordinates lose. Shear and centre are handed on in float64, since a
+needle that crosses the image cancels t to its own width, the others in float32.
 
 The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|: an ellipse as long as the
 kappa-ellipsoid lies between source and detector. Gaussians for which it does not are left to `segment`.
@@ -35,15 +36,16 @@ SQRT_2PI = 2.5066282746310002
 
 # Names of the differentiable numbers, in the order in which the kernels keep them.
 NAMES = ('amplitude', 'mx', 'my', 'shear', 'e1', 'e2', 'e11', 'e12', 'e22', 'x', 'y')
+DOUBLE = 'shear', 'x', 'y'
 
 
 @dataclass
 class Footprints:
     """Footprints of N Gaussians in one view.
 
-    values    the eleven differentiable numbers named in NAMES, Float [N] each; x and y are the fraction of the centre's
-              position in pixels, in [0, 1), relative to (column, row)
-    column, row            Int32 [N], whole part of the centre
+    values    the eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; x and y
+              place the projected centre, in pixels from the centre of the pixel (column, row) in which it lies
+    column, row            Int32 [N]
     row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; empty where it has none
     width                  Float [N], pixels across the widest row, for balancing work
     straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate
@@ -151,9 +153,9 @@ def project(centre, scale, rotation, density, view, extent: float) -> Footprints
         far_out = 1e9  # keeps the whole part of a centre far outside the image within Int32
         column = mi.Int32(dr.clip(dr.select(visible, dr.floor(x), 0), -far_out, far_out))
         row = mi.Int32(dr.clip(dr.select(visible, dr.floor(y), 0), -far_out, far_out))
-    values = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, x - Float64(column), y - Float64(row))
-    return Footprints(tuple(mi.Float(v) for v in values), column, row, row_begin, dr.maximum(row_end, row_begin),
-                      mi.Float(end - begin), straddles)
+    values = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, x - (Float64(column) + .5), y - (Float64(row) + .5))
+    values = tuple(v if name in DOUBLE else mi.Float(v) for name, v in zip(NAMES, values))
+    return Footprints(values, column, row, row_begin, dr.maximum(row_end, row_begin), mi.Float(end - begin), straddles)
 
 
 def _roots(a, b, c):

@@ -7,6 +7,10 @@ stored between forward and backward but the footprints.
 
 Each row of a footprint is cut exactly where the cut-off ends, then widened to whole packets. Forward, backward and tangent
 visit the same pixels, so they are each other's exact adjoints and derivatives.
+
+t = dx + shear dy cancels where a needle leans: thousands of pixels from its centre, t is a fraction of a pixel. Therefore the
+kernels know where the ridge t = 0 crosses the row of the centre (`ridge`, rather than the centre's x) and take it from row to
+row in twice float32's digits. In a row, t is then the whole pixels from the one on the ridge, less a fraction.
 """
 from __future__ import annotations
 
@@ -15,12 +19,15 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from .balance import LANES, PACKET, Work, block_range, deposit, first_item, load, pack, position, span
+from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, load, pack, pair, position, span,
+                      unpair)
 from .footprint import NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 LOG2E = 1.4426950408889634
+
+FAR = 1e9  # keeps whole numbers of pixels within Int32; what exceeds it stays in the fraction
 
 
 def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True):
@@ -38,9 +45,7 @@ class _Splat(dr.CustomOp):
         return self.plan.image() if primal else dr.zeros(mi.Float, height * width)
 
     def forward(self):
-        count = self.plan.count
-        grads = (g if dr.width(g) == count else g + dr.zeros(mi.Float, count) for g in self.grad_in('values'))
-        self.set_grad_out(self.plan.tangent(tuple(grads)))
+        self.set_grad_out(self.plan.tangent(self.grad_in('values')))
 
     def backward(self):
         self.set_grad_in('values', self.plan.gradient(self.grad_out()))
@@ -57,8 +62,19 @@ class _Plan:
         self.packets = -(-width // PACKET)
         self.work = Work(mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES,
                          mi.UInt32(rest.width) // PACKET + SETUP)
-        self.packed = pack(mi.Vector4f, mi.Float, (*values, mi.Float(0)))
-        self.whole = pack(mi.Vector4i, mi.Int32, (rest.column, rest.row, rest.row_begin, rest.row_end))
+        amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
+        Float64 = dr.float64_array_t(mi.Float)
+        self.types = [type(v) for v in values]
+        self.shear = Float64(shear)
+        ridge = Float64(x) + self.shear * Float64(y)
+        whole = dr.clip(dr.round(ridge), -FAR, FAR)
+        ridge -= whole
+        shear, high = mi.Float(self.shear), mi.Float(ridge)
+        low = pair(mi.Float(self.shear - Float64(shear)), mi.Float(ridge - Float64(high)))
+        columns = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, high, mi.Float(y), low)
+        self.packed = pack(mi.Vector4f, mi.Float, columns)
+        column = rest.column + mi.Int32(whole)
+        self.whole = pack(mi.Vector4i, mi.Int32, (column, rest.row, rest.row_begin, rest.row_end))
         dr.eval(self.packed, self.whole)
         self.arguments = dict(packed=self.packed, whole=self.whole, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets))
@@ -67,7 +83,11 @@ class _Plan:
         return self._crop(self.work.add_up(_forward, self.packets * self.height, **self.arguments))
 
     def tangent(self, tangents):
-        moved = pack(mi.Vector4f, mi.Float, (*tangents, mi.Float(0)))
+        *others, x, y = tangents
+        # A needle that moves along itself: in float32 its ridge would seem to move, too.
+        ridge = type(self.shear)(x) + self.shear * type(self.shear)(y)
+        zeros = dr.zeros(mi.Float, self.count)  # a tangent that vanishes has width 1
+        moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
         return self._crop(self.work.add_up(_tangent, self.packets * self.height, **self.arguments, moved=moved))
 
@@ -85,25 +105,35 @@ class _Plan:
         out = [dr.zeros(mi.Float, self.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
         dr.eval(_backward(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
-        return tuple(out)
+        # The kernel's derivative by y leaves the ridge where it is.
+        out[-1] = type(self.shear)(out[-1]) + self.shear * type(self.shear)(out[-2])
+        return tuple(kind(v) for kind, v in zip(self.types, out))
 
 
 def _row(c, whole, y, extent2, packets):
     """Constants of row y of a footprint and its packets [begin, end).
 
-    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0, begin and end.
+    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin and
+    end.
     """
-    _, mx, my, shear, e1, e2, e11, e12, e22, fx, fy, _ = c
-    dy = mi.Float(y - whole.y) + (.5 - fy)
+    _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
+    shear_low, ridge_low = unpair(low)
+    n = mi.Float(y - whole.y)
+    dy = n - fy
     m = dr.square(my * dy)
     d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
     d1 = dr.fma(2 * e12, dy, e1)
     # num <= extent^2 den, a quadratic in t
     a, b, c0 = dr.square(mx) - extent2 * e11, .5 * extent2 * d1, extent2 * d0 - m
     root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
-    offset = (fx - .5) - shear * dy
-    begin, end = span((b - root) / a, (b + root) / a, offset, whole.x, y >= whole.w, packets)
-    return dy, m, d0, d1, offset, begin, end
+    along = shear * n
+    rounding = dr.fma(shear, n, -along)
+    steps = dr.clip(dr.round(along - ridge), -FAR, FAR)
+    # Where the ridge is close to a pixel's centre, so that t needs its digits, these differences are exact.
+    offset = (ridge - (along - steps)) + (ridge_low - dr.fma(shear_low, n, rounding))
+    column = whole.x - mi.Int32(steps)
+    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= whole.w, packets)
+    return dy, m, d0, d1, column, offset, begin, end
 
 
 def _shape(t, mx, m, d0, d1, e11):
@@ -125,10 +155,10 @@ def _forward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, e
         w = dr.gather(mi.Vector4i, whole, g)
         while block < stop:
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, offset, packet, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
             while packet < last:
-                t = position(packet, w.x, offset)
+                t = position(packet, column, offset)
                 _, _, shape = _shape(t, c[1], m, d0, d1, c[6])
                 value = c[0] * shape
                 deposit(target, value, line + packet, private)
@@ -149,12 +179,12 @@ def _backward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, 
         sums = [mi.Float(0) for _ in NAMES]
         while block < stop:
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, offset, packet, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
             line = y * packets
             s, n0, n1, n2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
             h0, h1, h2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
             while packet < last:
-                t = position(packet, w.x, offset)
+                t = position(packet, column, offset)
                 inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 h, but for the amplitude
                 value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
@@ -179,10 +209,11 @@ def _chain(sums, c, dy, s, n0, n1, n2, h0, h1, h2):
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     half = -.5 * amplitude
     n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
-    # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy.
+    # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy. The last number is the
+    # derivative by the centre's y along the ridge, at constant t.
     d1 = dr.fma(2 * e12, dy, e1)
     dt = 2 * dr.square(mx) * n1 + d1 * h0 + 2 * e11 * h1
-    ddy = 2 * dr.square(my) * dy * n0 + dr.fma(2 * e22, dy, e2) * h0 + 2 * e12 * h1 + shear * dt
+    ddy = 2 * dr.square(my) * dy * n0 + dr.fma(2 * e22, dy, e2) * h0 + 2 * e12 * h1
     parts = (s, 2 * mx * n2, 2 * my * dr.square(dy) * n0, dy * dt, h1, dy * h0, h2, 2 * dy * h1, dr.square(dy) * h0,
              -dt, -ddy)
     return [a + b for a, b in zip(sums, parts)]
@@ -198,10 +229,10 @@ def _tangent(lane, begin, end, packed, whole, blocks, block_cost, ends, count, e
         w = dr.gather(mi.Vector4i, whole, g)
         while block < stop:
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, offset, packet, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
             while packet < last:
-                t = position(packet, w.x, offset)
+                t = position(packet, column, offset)
                 inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
                 value = shape * _tangent_factor(c, dc, t, dy, d1, inverse, ratio)
                 deposit(target, value, line + packet, private)
@@ -215,8 +246,8 @@ def _tangent(lane, begin, end, packed, whole, blocks, block_cost, ends, count, e
 def _tangent_factor(c, dc, t, dy, d1, inverse, ratio):
     """The footprint's directional derivative over its shape."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
-    d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_x, d_y, _ = dc
-    t_dot = dy * d_shear - d_x - shear * d_y
+    d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_ridge, d_y, _ = dc
+    t_dot = dy * d_shear - d_ridge
     num_dot = 2 * mx * t * (d_mx * t + mx * t_dot) + 2 * my * dy * (d_my * dy - my * d_y)
     den_dot = (t * (d_e1 + d_e11 * t) + dy * (d_e2 + 2 * d_e12 * t + d_e22 * dy)
                + (d1 + 2 * e11 * t) * t_dot - (e2 + 2 * e12 * t + 2 * e22 * dy) * d_y)
