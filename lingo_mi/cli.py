@@ -20,7 +20,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def guard(main) -> None:
-    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C. Warnings are one line each."""
+    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
+
+    Warnings become one line each.
+    """
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
@@ -46,8 +49,8 @@ def guard(main) -> None:
 def between_steps():
     """Hold Ctrl-C back: yields a function that raises KeyboardInterrupt if it was pressed since the last call.
 
-    A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A second
-    Ctrl-C stops at once.
+    A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A
+    second Ctrl-C stops at once.
     """
     pressed = []
 
@@ -79,7 +82,9 @@ def definitions(pairs) -> dict[str, str]:
 
 
 def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
-    """The output folder, which can be made and written to, or an error that refuses to spoil one. Leaves nothing behind.
+    """The output folder, which can be made and written to, or an error that refuses to spoil one.
+
+    Leaves nothing behind.
 
     owns   name of a file that tells an earlier result
     force, resume   whether a folder with files in it will do

@@ -142,4 +142,5 @@ def summary(result: dict) -> str:
         f'held-out views  PSNR {show("psnr_2d", "{:.2f}", " dB")}, SSIM {show("ssim_2d", "{:.4f}", "")}',
         f'volume          PSNR {show("psnr_3d", "{:.2f}", " dB")}, SSIM {show("ssim_3d", "{:.4f}", "")}',
         f'cloud           {result["gaussians"]:,} Gaussians after {result["iterations"]} iterations of '
-        f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, {result["seconds_fit"]:.0f} s to fit'])
+        f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
+        f'{result["seconds_fit"]:.0f} s to fit'])

@@ -106,8 +106,8 @@ def data_file(name: str, parameter: str) -> str:
         found = Path(folder) / name
     if not found.exists():
         where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
-        raise InputError(f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder that '
-                         f'holds it, or name your file: -D {parameter}=FILE')
+        raise InputError(f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
+                         f'that holds it, or name your file: -D {parameter}=FILE')
     return str(found)
 
 

@@ -69,9 +69,10 @@ def check_memory(*geometries: Geometry | None):
     needed = 4 * (3 * voxels + 2 * pixels)
     room = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') if hasattr(os, 'sysconf') else math.inf
     if needed > room:
-        raise InputError(f'{" x ".join(map(str, known[0].nVoxel))} voxels and {sum(map(len, known))} views of '
-                         f'{" x ".join(map(str, known[0].nDetector))} pixels need at least {needed / 2 ** 30:,.0f} GiB of '
-                         f'memory, but this machine has {room / 2 ** 30:,.0f} GiB: lower nVoxel, nDetector or the views')
+        size = [' x '.join(map(str, counts)) for counts in (known[0].nVoxel, known[0].nDetector)]
+        raise InputError(f'{size[0]} voxels and {sum(map(len, known))} views of {size[1]} pixels need at least '
+                         f'{needed / 2 ** 30:,.0f} GiB of memory, but this machine has {room / 2 ** 30:,.0f} GiB: '
+                         'lower nVoxel, nDetector or the views')
 
 
 def defaults(path) -> set[str]:
@@ -101,8 +102,8 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
     views    how many to fit, evenly spaced among the scanner's (0: all of them)
     volume   `files.volumes.Volume` to scan instead of the scene's objects
 
-    The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given where it
-    is known on the scanner's grid.
+    The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given
+    where it is known on the scanner's grid.
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:
@@ -224,5 +225,5 @@ def _warn_if_truncated(geometry: Geometry):
     widest = max(geometry.sVoxel[:2])
     if widest > field * 1.0001:
         import warnings
-        warnings.warn(f'the volume is {widest:g} mm wide, but the panel sees only {field:g} mm of it: projections may be '
-                      'truncated', stacklevel=2)
+        warnings.warn(f'the volume is {widest:g} mm wide, but the panel sees only {field:g} mm of it: projections may '
+                      'be truncated', stacklevel=2)

@@ -50,14 +50,14 @@ class CTScanner(mi.Sensor):
        - Views held out of the fit, at angles drawn uniformly from the same range with a fixed seed. (Default: 0)
      * - projections
        - |string|
-       - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. It is looked for
-         beside the scene, then in the folder that LINGO_MI_DATA names. An empty name is none.
+       - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. It is looked
+         for beside the scene, then in the folder that LINGO_MI_DATA names. An empty name is none.
      * - view
        - |int|
        - The view that this sensor renders. (Default: 0)
 
-    The source runs on a circle in the plane z = 0; `lingo_mi.geometry` states the frame. One view of a scanner is a sensor
-    like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scanning.scan` renders them all.
+    The source runs on a circle in the plane z = 0; `lingo_mi.geometry` states the frame. One view of a scanner is a
+    sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scanning.scan` renders them all.
     """
 
     def __init__(self, props):
@@ -134,7 +134,8 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
     g = geometry
     return dict(type='ct_scanner', mode=g.mode, DSO=g.DSO, DSD=g.DSD, nDetector=join(g.nDetector),
                 dDetector=join(g.dDetector), offDetector=join(g.offDetector), nVoxel=join(g.nVoxel),
-                dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()), view=index)
+                dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()),
+                view=index)
 
 
 def _one(props, name, default):
@@ -181,7 +182,8 @@ def _read(props):
     far = 1. if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
     geometry = Geometry(mode=mode, DSO=_distance(props, 'DSO', far), DSD=_distance(props, 'DSD', far), angles=angles,
                         dDetector=_numbers(props, 'dDetector'), dVoxel=_numbers(props, 'dVoxel'),
-                        offDetector=_numbers(props, 'offDetector', 0.), offOrigin=_numbers(props, 'offOrigin', 0.), **counts)
+                        offDetector=_numbers(props, 'offDetector', 0.), offOrigin=_numbers(props, 'offOrigin', 0.),
+                        **counts)
     if not held_out:
         return geometry, None
     drawn = np.sort(np.random.default_rng(0).uniform(0, total, held_out)) + start

@@ -19,8 +19,8 @@ def create(props):
 
      * - filename
        - |string|
-       - A CT volume: NIfTI, NRRD, MHA/MHD, NPY/NPZ, a TIFF stack or a DICOM folder (see `lingo_mi.files.volumes`). It is
-         looked for beside the scene, then in the folder that the environment variable LINGO_MI_DATA names.
+       - A CT volume: NIfTI, NRRD, MHA/MHD, NPY/NPZ, a TIFF stack or a DICOM folder (see `lingo_mi.files.volumes`). It
+         is looked for beside the scene, then in the folder that the environment variable LINGO_MI_DATA names.
      * - phantom
        - |string|
        - Instead of a file: `foot`, `chest`, `shepp_logan`, `gaussians` or `mesh`.
@@ -38,13 +38,14 @@ def create(props):
        - Where the volume is: as for a `gridvolume`, the voxels fill the unit cube of its local frame. The voxel
          size in the file is *not* used; the scanner's grid says where the volume lies.
 
-    It loads the values and hands them to Mitsuba's `heterogeneous` medium with a `gridvolume`; everything else (rendering
-    with volume path tracers, `mi.traverse`, gradients) is Mitsuba's own. Place it in a shape of type `cube`.
+    It loads the values and hands them to Mitsuba's `heterogeneous` medium with a `gridvolume`; everything else
+    (rendering with volume path tracers, `mi.traverse`, gradients) is Mitsuba's own. Place it in a shape of type `cube`.
     """
     filename, phantom = props.get('filename', ''), props.get('phantom', '')
     size, seed = props.get('size', 256), props.get('seed', 0)
     mu_water = props.get('mu_water', 0.)
-    for key, value, kinds in (('filename', filename, str), ('phantom', phantom, str), ('mu_water', mu_water, (int, float))):
+    for key, value, kinds in (('filename', filename, str), ('phantom', phantom, str),
+                              ('mu_water', mu_water, (int, float))):
         if not isinstance(value, kinds):
             raise InputError(f'ct_volume: {key} = {value!r} is of the wrong type')
     to_world = props.get('to_world', mi.ScalarTransform4f())

@@ -6,9 +6,10 @@
     python scripts/fit.py scenes/chest.xml --volume my_ct.nii.gz --views 25
     python scripts/fit.py scenes/x3d_foot.xml --projections foot_50.pickle
 
-The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of measured
-ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a volume
-in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json.
+The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
+measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a
+volume in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and
+metrics.json.
 """
 import argparse
 import shlex
@@ -29,10 +30,10 @@ def arguments():
     p.add_argument('--views', type=int, default=0, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
     p.add_argument('--init', choices=('lingo', 'r2'), help='initial cloud: Otsu masks (lingo) or an FDK volume (r2)')
-    p.add_argument('--projections', metavar='F', help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, .npy with '
-                   'a geometry .yml beside it, or a folder of EXR images')
-    p.add_argument('--volume', metavar='F', help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, NPY/NPZ, "
-                   'raw, a TIFF stack or a DICOM folder')
+    p.add_argument('--projections', metavar='F', help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, '
+                   '.npy with a geometry .yml beside it, or a folder of EXR images')
+    p.add_argument('--volume', metavar='F', help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, "
+                   'NPY/NPZ, raw, a TIFF stack or a DICOM folder')
     p.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
     p.add_argument('--dtype', help='type of a raw --volume, such as uint8')
     p.add_argument('--mu-water', type=float, metavar='MU', help='a --volume in HU becomes MU (1 + HU / 1000) per mm '
@@ -72,8 +73,9 @@ def main():
     given |= {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
     unknown = [k for k in given if not hasattr(METHODS[args.method], k)]
     if unknown:
-        raise InputError(f'-D {unknown[0]}: neither a parameter of {args.scene} ({", ".join(sorted(own)) or "it has none"}) nor '
-                         'a setting of the fit (see lingo_mi/fit/settings.py)')
+        names = ', '.join(sorted(own)) or 'it has none'
+        raise InputError(f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit '
+                         '(see lingo_mi/fit/settings.py)')
     settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
@@ -90,7 +92,8 @@ def main():
             bar.update(iteration, **fields)
             check()
         try:
-            fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT, args.resume)
+            fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT,
+                      args.resume)
         except KeyboardInterrupt:
             again = [a for a in sys.argv if a not in ('--resume', '--force')] + ['--resume']
             raise KeyboardInterrupt(f'go on with  python {shlex.join(again)}') from None

@@ -71,7 +71,8 @@ def check(args):
         raise InputError(f'--views must be at least 1, not {args.views}')
     if args.projections and args.kind == 'naf' and args.projections.suffix not in ('.pickle', '.pkl'):
         raise InputError(f'{args.projections}: --kind naf writes a pickle; give a name that ends in .pickle')
-    for path in filter(None, (args.out, args.projections)):
+    meshes = args.name == 'mesh' and args.out is not None and args.out.suffix == '.ply'
+    for path in filter(None, (args.out, bolts_beside(args.out) if meshes else None, args.projections)):
         if path.is_dir() and path == args.out:
             raise InputError(f'{path}: is a folder; give a file name that ends in .nii.gz')
         if path.exists() and not (args.force and path.is_file()):
@@ -83,7 +84,13 @@ def check(args):
         if args.out.suffix != '.ply':
             raise InputError(f'{args.out}: volumes are written as NIfTI; give a name that ends in .nii.gz')
         if args.name not in ('gaussians', 'mesh'):
-            raise InputError(f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in .nii.gz')
+            raise InputError(f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in '
+                             '.nii.gz')
+
+
+def bolts_beside(path):
+    """Where the bolts of a flange in `path` go."""
+    return path.with_stem(path.stem + '_bolts')
 
 
 def write_ply(path, phantom):
@@ -95,7 +102,7 @@ def write_ply(path, phantom):
         print(f'{path}: {len(cloud)} Gaussians')
         return
     from lingo_mi.phantoms.mesh import bolts
-    for name, mesh in ((path, phantom.analytic.mesh), (path.with_stem(path.stem + '_bolts'), bolts())):
+    for name, mesh in ((path, phantom.analytic.mesh), (bolts_beside(path), bolts())):
         mesh.export(name)
         print(f'{name}: {len(mesh.faces)} triangles')
 

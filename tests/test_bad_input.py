@@ -65,7 +65,8 @@ def test_missing_scene(tmp_path):
 @pytest.mark.parametrize('old, new, says', [
     ('<integer name="test_views" value="3"/>', '<float name="sod" value="3"/>', 'sod'),
     ('name="DSO"', 'name="DS0"', 'DSO is missing'),
-    ('<integrator type="lingo_xray"/>', '<integrator type="lingo_xray"><float name="cut" value="3"/></integrator>', 'cut'),
+    ('<integrator type="lingo_xray"/>', '<integrator type="lingo_xray"><float name="cut" value="3"/></integrator>',
+     'cut'),
     ('name="size"', 'name="sise"', 'sise'),
     ('name="phantom" value="foot"', 'name="phantom" value="hand"', 'hand'),
     ('name="phantom" value="foot"', 'name="filename" value="no.nii.gz"', 'LINGO_MI_DATA'),
@@ -114,13 +115,15 @@ def test_bad_scene(tmp_path, monkeypatch, old, new, says):
 @pytest.mark.parametrize('args, says', [
     (['-D', 'vews=3'], '(views)'), (['-D', 'views'], 'name=value'), (['-D', '=3'], 'name=value'),
     (['-D', 'views=many'], 'many'), (['-D', 'batch=many'], 'whole number'), (['-D', 'batch=0'], 'batch'),
-    (['-D', 'batch=1.5'], 'whole number'), (['-D', 'normalise=perhaps'], 'true or false'), (['-D', 'extent=99'], 'extent'),
+    (['-D', 'batch=1.5'], 'whole number'), (['-D', 'normalise=perhaps'], 'true or false'),
+    (['-D', 'extent=99'], 'extent'),
     (['-D', 'rate_scale=1,2,3'], 'rate_scale'), (['-D', 'rate_scale=-1'], 'rate_scale'),
     (['-D', 'lambda_tv=nan'], 'lambda_tv'), (['-D', 'iterations=0'], 'iterations'), (['-D', 'n_points=-1'], 'n_points'),
     (['--iterations', '0'], 'iterations'), (['--views', '-1'], '--views'), (['--views', '9'], '9 views'),
     (['--views', 'x'], '--views'), (['--method', 'magic'], '--method'), (['--init', 'magic'], '--init'),
-    (['--variant', 'magic'], '--variant'), (['--variant', 'scalar_rgb'], '--variant'), (['--frobnicate'], '--frobnicate'),
-    (['--projections', 'a.pickle', '--volume', 'b.nii'], 'exclude'), (['--mu-water', '0.02'], '--volume'), (['--resume'], 'no checkpoint'),
+    (['--variant', 'magic'], '--variant'), (['--variant', 'scalar_rgb'], '--variant'),
+    (['--frobnicate'], '--frobnicate'), (['--projections', 'a.pickle', '--volume', 'b.nii'], 'exclude'),
+    (['--mu-water', '0.02'], '--volume'), (['--resume'], 'no checkpoint'),
     (['--seed', '-1'], 'seed')])
 def test_bad_arguments(scene, tmp_path, args, says):
     code, _, err = fit(scene, *args, '--out', tmp_path / 'new' / 'folder')
@@ -163,7 +166,8 @@ def damaged(volume, kind):
     volume = volume.copy()
     if kind == 'NaN':
         volume[3, 4, 5] = np.nan
-    return {'NaN': volume, 'flat': volume[0], 'empty': volume[:0], 'zero': volume * 0, 'text': np.array('density')}[kind]
+    return {'NaN': volume, 'flat': volume[0], 'empty': volume[:0], 'zero': volume * 0,
+            'text': np.array('density')}[kind]
 
 
 @pytest.mark.parametrize('kind', ['NaN', 'flat', 'empty', 'zero', 'text'])
@@ -173,7 +177,8 @@ def test_bad_volume(scene, tmp_path, kind):
 
 
 @pytest.mark.parametrize('name, content', [
-    ('ct.nii.gz', b'\x1f\x8b\x08\x00truncated'), ('ct.nii', b'not a header'), ('ct.npy', b'\x93NUMPY\x01'), ('ct.raw', b'123'),
+    ('ct.nii.gz', b'\x1f\x8b\x08\x00truncated'), ('ct.nii', b'not a header'), ('ct.npy', b'\x93NUMPY\x01'),
+    ('ct.raw', b'123'),
     ('ct.txt', b'1 2 3'), ('ct.mha', b'ObjectType = Image\n'), ('ct.tif', b'II*\0')])
 def test_damaged_volume_file(scene, tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
@@ -214,7 +219,8 @@ def test_pickle_runs_no_code(scene, tmp_path):
 
 
 @pytest.mark.parametrize('kind, says', [
-    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'zero everywhere'), ('none', 'filled array'), ('no geometry', 'geometry'),
+    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'zero everywhere'), ('none', 'filled array'),
+    ('no geometry', 'geometry'),
     ('key', 'nDetektor'), ('angles', 'angles'), ('truncated', 'damaged'), ('huge', 'GiB of memory')])
 def test_bad_projections(scene, scan, tmp_path, kind, says):
     path = tmp_path / 'scan.npy'
@@ -236,7 +242,8 @@ def test_bad_projections(scene, scan, tmp_path, kind, says):
     assert says in refused(tmp_path, scene, '--projections', path)
 
 
-@pytest.mark.parametrize('name', ['none.pickle', 'none', 'none.npy', 'scan.txt', 'empty.pickle', 'list.pickle', 'folder'])
+@pytest.mark.parametrize('name', [
+    'none.pickle', 'none', 'none.npy', 'scan.txt', 'empty.pickle', 'list.pickle', 'folder'])
 def test_no_projections(scene, tmp_path, name):
     (tmp_path / 'scan.txt').write_text('1 2 3')
     (tmp_path / 'empty.pickle').touch()

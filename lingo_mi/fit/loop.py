@@ -49,8 +49,8 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     initial    where to start; may be None with `resume`
     seed       of the views' order, the total variation's cubes and splits
     measure    called as measure(stepper, state) at a few iterations; returns numbers for the history
-    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where everything
-               is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where
+               everything is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
     resume     go on from `path`: the same steps as without the interruption
     """
@@ -75,8 +75,9 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             checkpoint.save(path, state.host(), dict(
-                seed=seed, rng=rng.bit_generator.state, iteration=iteration, seconds=seconds + time.perf_counter() - clock,
-                history=history, info=info, settings=asdict(settings), views=len(scan)),
+                seed=seed, rng=rng.bit_generator.state, iteration=iteration,
+                seconds=seconds + time.perf_counter() - clock, history=history, info=info,
+                settings=asdict(settings), views=len(scan)),
                 dict(initial=points, order=np.array(order, int)))
 
     while iteration < settings.iterations:
@@ -139,12 +140,12 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
 
 def _same_fit(host, extra, settings, scan, seed, path):
     """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
-    columns = [(host.values[k], host.first[k], host.second[k], size) for k, size in PARAMETERS.items()]
+    columns = [(group[k], size) for group in (host.values, host.first, host.second) for k, size in PARAMETERS.items()]
     if not ({'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys()
             and len(host.gradient) == len(host.seen) == len(host)
-            and all(x.shape == (len(host), size) and np.isfinite(x).all() for *arrays, size in columns for x in arrays)):
-        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again without '
-                         '--resume')
+            and all(x.shape == (len(host), size) and np.isfinite(x).all() for x, size in columns)):
+        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again '
+                         'without --resume')
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     changed = [k for k in now if before.get(k) != now[k] and k != 'checkpoint_seconds']
