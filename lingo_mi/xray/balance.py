@@ -91,9 +91,29 @@ def pack(Packet, Element, columns):
     return target
 
 
-def load(packed, index):
-    """Row `index` of twelve numbers from an array made by `pack`."""
-    return [x for j in range(3) for x in dr.gather(mi.Vector4f, packed, index * 3 + j)]
+def load(packed, index, packets=3):
+    """Row `index` of an array made by `pack`."""
+    return [x for j in range(packets) for x in dr.gather(mi.Vector4f, packed, index * packets + j)]
+
+
+FAR = 3e8  # keeps whole numbers of elements, and sums of a few, within Int32; what exceeds it stays in the fraction
+
+
+def whole(x):
+    """The whole number next to x, for Float and Float64."""
+    return dr.clip(dr.round(x), -FAR, FAR)
+
+
+def high_low(x):
+    """A Float64 as the sum of two Floats."""
+    high = mi.Float(x)
+    return high, mi.Float(x - type(x)(high))
+
+
+def times(high, low, n):
+    """The product of a pair of Floats with a whole number, as a pair."""
+    product = high * n
+    return product, dr.fma(low, n, dr.fma(high, n, -product))
 
 
 def pair(a, b):

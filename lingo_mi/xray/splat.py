@@ -8,9 +8,9 @@ stored between forward and backward but the footprints.
 Each row of a footprint is cut exactly where the cut-off ends, then widened to whole packets. Forward, backward and tangent
 visit the same pixels, so they are each other's exact adjoints and derivatives.
 
-t = dx + shear dy cancels where a needle leans: thousands of pixels from its centre, t is a fraction of a pixel. Therefore the
-kernels know where the ridge t = 0 crosses the row of the centre (`ridge`, rather than the centre's x) and take it from row to
-row in twice float32's digits. In a row, t is then the whole pixels from the one on the ridge, less a fraction.
+t = dx + shear dy cancels where a needle leans: thousands of pixels from its centre, t is a fraction of a pixel. Therefore
+the kernels know where the ridge t = 0 crosses the row of the centre (`ridge`, rather than the centre's x) and take it from
+row to row in twice float32's digits. In a row, t is then the whole pixels from the one on the ridge, less a fraction.
 """
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, load, pack, pair, position, span,
-                      unpair)
+from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, high_low, load, pack, pair, position, span,
+                      times, unpair, whole)
 from .footprint import NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 LOG2E = 1.4426950408889634
-
-FAR = 1e9  # keeps whole numbers of pixels within Int32; what exceeds it stays in the fraction
 
 
 def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True):
@@ -67,13 +65,11 @@ class _Plan:
         self.types = [type(v) for v in values]
         self.shear = Float64(shear)
         ridge = Float64(x) + self.shear * Float64(y)
-        whole = dr.clip(dr.round(ridge), -FAR, FAR)
-        ridge -= whole
-        shear, high = mi.Float(self.shear), mi.Float(ridge)
-        low = pair(mi.Float(self.shear - Float64(shear)), mi.Float(ridge - Float64(high)))
-        columns = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, high, mi.Float(y), low)
+        steps = whole(ridge)
+        (shear, shear_low), (ridge, ridge_low) = high_low(self.shear), high_low(ridge - steps)
+        columns = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, ridge, mi.Float(y), pair(shear_low, ridge_low))
         self.packed = pack(mi.Vector4f, mi.Float, columns)
-        column = rest.column + mi.Int32(whole)
+        column = rest.column + mi.Int32(steps)
         self.whole = pack(mi.Vector4i, mi.Int32, (column, rest.row, rest.row_begin, rest.row_end))
         dr.eval(self.packed, self.whole)
         self.arguments = dict(packed=self.packed, whole=self.whole, extent2=dr.opaque(mi.Float, extent * extent),
@@ -110,15 +106,15 @@ class _Plan:
         return tuple(kind(v) for kind, v in zip(self.types, out))
 
 
-def _row(c, whole, y, extent2, packets):
+def _row(c, w, y, extent2, packets):
     """Constants of row y of a footprint and its packets [begin, end).
 
-    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin and
+    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin,
     end.
     """
     _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
     shear_low, ridge_low = unpair(low)
-    n = mi.Float(y - whole.y)
+    n = mi.Float(y - w.y)
     dy = n - fy
     m = dr.square(my * dy)
     d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
@@ -126,13 +122,12 @@ def _row(c, whole, y, extent2, packets):
     # num <= extent^2 den, a quadratic in t
     a, b, c0 = dr.square(mx) - extent2 * e11, .5 * extent2 * d1, extent2 * d0 - m
     root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
-    along = shear * n
-    rounding = dr.fma(shear, n, -along)
-    steps = dr.clip(dr.round(along - ridge), -FAR, FAR)
+    along, along_low = times(shear, shear_low, n)
+    steps = whole(along - ridge)
     # Where the ridge is close to a pixel's centre, so that t needs its digits, these differences are exact.
-    offset = (ridge - (along - steps)) + (ridge_low - dr.fma(shear_low, n, rounding))
-    column = whole.x - mi.Int32(steps)
-    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= whole.w, packets)
+    offset = (ridge - (along - steps)) + (ridge_low - along_low)
+    column = w.x - mi.Int32(steps)
+    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, packets)
     return dy, m, d0, d1, column, offset, begin, end
 
 

@@ -4,7 +4,11 @@ sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2), the splat's ma
 on one line of voxels along x, and the whitened distance is a sum of three squares (a Cholesky factor), so that needles
 lose no digits:
 
-    |W delta|^2 = (m1 t)^2 + (m2 (dy + s3 dz))^2 + (m3 dz)^2,   t = dx + s1 dy + s2 dz
+    |W delta|^2 = (m1 t)^2 + (m2 r)^2 + (m3 dz)^2,   r = dy + s3 dz,   t = dx + s1 dy + s2 dz
+
+As in the splat, t and r cancel where a needle leans. The kernels know where t = 0 and r = 0 on the lines through the
+centre (`ridge`, in voxels along x, and `spine`, along y) and take both from line to line in twice float32's digits.
+Likewise they sum derivatives by what stays small, t and r, and those by dy and dz follow in float64.
 """
 from __future__ import annotations
 
@@ -13,11 +17,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .balance import LANES, PACKET, Work, block_range, deposit, first_item, load, pack, position, span
+from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, high_low, load, pack, position, span,
+                      times, whole)
 from .footprint import rotate_inverse
 from .splat import LOG2E, SETUP
 
-NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s2, s3, x, y, z
+NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s2, s3, x, y, z, the last six in float64
 
 
 @dataclass
@@ -51,14 +56,15 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
     at = (p - grid.corner) / grid.step
     with dr.suspend_grad():
         half = [extent * dr.norm(s * axis) / grid.step[i] for i, axis in enumerate(axes)]
-        whole = [mi.Int32(dr.floor(dr.clip(x, -1e9, 1e9))) for x in at]
+        middle = [mi.Int32(dr.floor(dr.clip(x, -1e9, 1e9))) for x in at]
         begin = [mi.Int32(dr.clip(dr.ceil(at[i] - half[i] - .5), 0, grid.shape[i])) for i in range(3)]
         end = [mi.Int32(dr.clip(dr.floor(at[i] + half[i] - .5) + 1, 0, grid.shape[i])) for i in range(3)]
         size = [dr.maximum(end[i] - begin[i], 0) for i in range(3)]
         lines = dr.select(size[0] > 0, size[1] * size[2], 0)
-        rest = (*whole, lines, begin[1], begin[2], dr.maximum(size[1], 1), mi.Int32(0))
-    values = (rho, m1, m2, m3, s1, s2, s3, *(at[i] - Float64(whole[i]) for i in range(3)))
-    return dr.custom(_Voxelize, tuple(mi.Float(v) for v in values), rest, mi.UInt32(size[0]), grid.shape, extent)
+        rest = (*middle, lines, begin[1], begin[2], dr.maximum(size[1], 1))
+    values = (*(mi.Float(v) for v in (rho, m1, m2, m3)), s1, s2, s3,
+              *(at[i] - (Float64(middle[i]) + .5) for i in range(3)))
+    return dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), grid.shape, extent)
 
 
 class _Voxelize(dr.CustomOp):
@@ -66,11 +72,18 @@ class _Voxelize(dr.CustomOp):
         self.shape, (nx, ny, nz) = shape, shape
         self.packets = -(-nx // PACKET)
         self.work = Work((mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP)
-        # whole: (column, row, slice, lines) and (first row, first slice, rows, 0)
-        packed = pack(mi.Vector4f, mi.Float, (*values, mi.Float(0), mi.Float(0)))
-        whole = pack(mi.Vector4i, mi.Int32, rest)
-        dr.eval(packed, whole)
-        self.arguments = dict(packed=packed, whole=whole, extent2=dr.opaque(mi.Float, extent * extent),
+        rho, m1, m2, m3, s1, s2, s3, x, y, z = values
+        self.slopes = s1, s2, s3
+        ridge, spine = x + s1 * y + s2 * z, y + s3 * z
+        along_x, along_y = whole(ridge), whole(spine)
+        pairs = [high_low(v) for v in (s1, s2, s3, ridge - along_x, spine - along_y)]
+        columns = (rho, m1, m2, m3, *(v for both in pairs for v in both), mi.Float(z), mi.Float(0))
+        packed = pack(mi.Vector4f, mi.Float, columns)
+        # (column of the ridge, row, slice, lines) and (first row, first slice, rows, row of the spine)
+        column, row, *others = rest
+        places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
+        dr.eval(packed, places)
+        self.arguments = dict(packed=packed, places=places, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets), rows=dr.opaque(mi.Int32, ny))
         padded = self.work.add_up(_fill, self.packets * ny * nz, **self.arguments)
         i = dr.arange(mi.UInt32, nx * ny * nz)
@@ -85,37 +98,58 @@ class _Voxelize(dr.CustomOp):
         out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
         dr.make_opaque(upstream, out)
         dr.eval(_collect(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
-        self.set_grad_in('values', tuple(out))
+        # The kernel's derivatives by y and z leave ridge and spine where they are; that by s1 leaves t at r = 0.
+        s1, s2, s3 = self.slopes
+        by_s1, by_s2, by_s3, x, y, z = (type(s1)(v) for v in out[4:])
+        slopes = by_s1 - s3 * by_s2, by_s2, by_s3
+        self.set_grad_in('values', (*out[:4], *slopes, x, y + s1 * x, z + s2 * x + s3 * y))
 
     def name(self):
         return 'voxelize'
 
 
 def _line(c, w, v, index, extent2, packets, rows):
-    """A line of voxels of a Gaussian: what is constant along it, its span in packets, and its first packet."""
-    _, m1, m2, m3, s1, s2, s3, fx, fy, fz, *_ = c
+    """A line of voxels of a Gaussian: what is constant along it, where t is 0 (a column and a fraction), its span in
+    packets and its first packet."""
+    _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
     y, z = v.x + index % v.z, v.y + index // v.z
-    dy, dz = mi.Float(y - w.y) + (.5 - fy), mi.Float(z - w.z) + (.5 - fz)
-    slant = dr.fma(s3, dz, dy)
-    m = dr.square(m2 * slant) + dr.square(m3 * dz)
-    offset = (fx - .5) - (s1 * dy + s2 * dz)
+    ny, nz = mi.Float(y - w.y), mi.Float(z - w.z)
+    dz = nz - fz
+    along, low = times(s3, s3_low, nz)
+    steps = whole(along - spine)
+    r = mi.Float(y - v.w + mi.Int32(steps)) + ((along - steps) - spine) + (low - spine_low)
+    m = dr.square(m2 * r) + dr.square(m3 * dz)
+    along_y, low_y = times(s1, s1_low, ny)
+    along_z, low_z = times(s2, s2_low, nz)
+    steps_y = whole(along_y)
+    rest, low = _sum(along_y - steps_y, -ridge)
+    steps_z = whole(along_z + rest)
+    offset = (ridge_low - low_y - low_z - low) - ((along_z - steps_z) + rest)
+    column = w.x - mi.Int32(steps_y) - mi.Int32(steps_z)
     half = dr.sqrt(dr.maximum(extent2 - m, 0)) / m1
-    begin, end = span(-half, half, offset, w.x, (index >= w.w) | (m > extent2), packets)
-    return dy, dz, slant, m, offset, begin, end, (z * rows + y) * packets
+    begin, end = span(-half, half, offset, column, (index >= w.w) | (m > extent2), packets)
+    return dz, r, m, column, offset, begin, end, (z * rows + y) * packets
+
+
+def _sum(a, b):
+    """a + b and what rounding took from it (Knuth)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
 
 
 @dr.syntax
-def _fill(lane, begin, end, blocks, block_cost, ends, count, packed, whole, extent2, packets, rows, target, base, private):
+def _fill(lane, begin, end, blocks, block_cost, ends, count, packed, places, extent2, packets, rows, target, base, private):
     g, start = first_item(begin, end, ends, count)
     while (g < count) & (start < end):
         block, stop = block_range(g, start, begin, end, blocks, block_cost)
-        c = load(packed, g)
-        w, v = dr.gather(mi.Vector4i, whole, 2 * g), dr.gather(mi.Vector4i, whole, 2 * g + 1)
+        c = load(packed, g, 4)
+        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
         while block < stop:
             index = mi.Int32(block * LANES + lane % LANES)
-            _, _, _, m, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
+            _, _, m, column, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
             while packet < last:
-                u = c[1] * position(packet, w.x, offset)
+                u = c[1] * position(packet, column, offset)
                 deposit(target, c[0] * dr.exp2(dr.fma(u, u, m) * (-.5 * LOG2E)), base + line + packet, private)
                 packet += 1
             block += 1
@@ -125,25 +159,25 @@ def _fill(lane, begin, end, blocks, block_cost, ends, count, packed, whole, exte
 
 
 @dr.syntax
-def _collect(lane, begin, end, blocks, block_cost, ends, count, packed, whole, extent2, packets, rows, upstream, out):
+def _collect(lane, begin, end, blocks, block_cost, ends, count, packed, places, extent2, packets, rows, upstream, out):
     g, start = first_item(begin, end, ends, count)
     while (g < count) & (start < end):
         block, stop = block_range(g, start, begin, end, blocks, block_cost)
-        c = load(packed, g)
-        w, v = dr.gather(mi.Vector4i, whole, 2 * g), dr.gather(mi.Vector4i, whole, 2 * g + 1)
+        c = load(packed, g, 4)
+        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
         sums = [mi.Float(0) for _ in range(NUMBERS)]
         while block < stop:
             index = mi.Int32(block * LANES + lane % LANES)
-            dy, dz, slant, m, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
+            dz, r, m, column, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
             n0, n1, n2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
             while packet < last:
-                t = position(packet, w.x, offset)
+                t = position(packet, column, offset)
                 u = c[1] * t
                 n = dr.gather(mi.Vector4f, upstream, line + packet) * dr.exp2(dr.fma(u, u, m) * (-.5 * LOG2E))
                 nt = n * t
                 n0, n1, n2 = n0 + n, n1 + nt, dr.fma(nt, t, n2)
                 packet += 1
-            sums = _chain(sums, c, dy, dz, slant, dr.sum(n0), dr.sum(n1), dr.sum(n2))
+            sums = _chain(sums, c, dz, r, dr.sum(n0), dr.sum(n1), dr.sum(n2))
             block += 1
         for i in range(len(out)):
             dr.scatter_add(out[i], sums[i], g, mode=dr.ReduceMode.Local)
@@ -152,14 +186,12 @@ def _collect(lane, begin, end, blocks, block_cost, ends, count, packed, whole, e
     return g
 
 
-def _chain(sums, c, dy, dz, slant, n0, n1, n2):
+def _chain(sums, c, dz, r, n0, n1, n2):
     """Add a line's part to the sums, from its moments in t: d/d(exponent's square) is -rho/2 times a moment."""
-    rho, m1, m2, m3, s1, s2, s3, *_ = c
+    rho, m1, m2, m3, *_ = c
     a0, a1, a2 = -rho * n0, -rho * n1, -rho * n2
     dt = dr.square(m1) * a1
-    d_slant = dr.square(m2) * slant * a0
-    d_dy = s1 * dt + d_slant
-    d_dz = s2 * dt + s3 * d_slant + dr.square(m3) * dz * a0
-    parts = (n0, m1 * a2, m2 * dr.square(slant) * a0, m3 * dr.square(dz) * a0, dy * dt, dz * dt, dz * d_slant,
-             -dt, -d_dy, -d_dz)
+    d_r = dr.square(m2) * r * a0
+    parts = (n0, m1 * a2, m2 * dr.square(r) * a0, m3 * dr.square(dz) * a0, r * dt, dz * dt, dz * d_r,
+             -dt, -d_r, -dr.square(m3) * dz * a0)
     return [a + b for a, b in zip(sums, parts)]
