@@ -58,8 +58,6 @@ class _Plan:
     def __init__(self, values, rest, height, width, extent):
         self.count, self.height, self.width = dr.width(values[0]), height, width
         self.packets = -(-width // PACKET)
-        self.work = Work(mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES,
-                         mi.UInt32(rest.width) // PACKET + SETUP)
         amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
         Float64 = dr.float64_array_t(mi.Float)
         self.types = [type(v) for v in values]
@@ -71,7 +69,10 @@ class _Plan:
         self.packed = pack(mi.Vector4f, mi.Float, columns)
         column = rest.column + mi.Int32(steps)
         self.whole = pack(mi.Vector4i, mi.Int32, (column, rest.row, rest.row_begin, rest.row_end))
-        dr.eval(self.packed, self.whole)
+        blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
+        cost = mi.UInt32(rest.width) // PACKET + SETUP
+        dr.eval(self.packed, self.whole, blocks, cost, rest)  # together: each alone would project all Gaussians again
+        self.work = Work(blocks, cost)
         self.arguments = dict(packed=self.packed, whole=self.whole, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets))
 
