@@ -1,4 +1,4 @@
-"""The one exception for input that a user can mend."""
+"""The one exception for input that a user can mend, and the one warning of numbers that are not as good as promised."""
 
 
 class InputError(ValueError):
@@ -6,3 +6,7 @@ class InputError(ValueError):
 
     Scripts print it and exit with code 2 (see `lingo_mi.cli.guard`).
     """
+
+
+class AccuracyWarning(UserWarning):
+    """Float32 cannot give this result to the usual digits. The message says why, and about how many are left."""

@@ -1,9 +1,19 @@
 """Line integrals of a cloud of Gaussians: the splat, and the general form for the few that it cannot express."""
 from __future__ import annotations
 
+import warnings
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import AccuracyWarning
 from .footprint import project
 from .segment import add_straddling
 from .splat import splat
+
+
+MANY = 10_000   # Gaussians in a cloud from which on their overlap is looked at
+DEEP = 5_000    # Gaussians in a pixel whose sum float32 still holds to 1e-5
 
 
 def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True):
@@ -16,10 +26,27 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     extent          cut-off in standard deviations
     primal          False where only derivatives are wanted: the splatted part of the image is then left at zero
 
-    Differentiable in all four and in the view's pose, in forward and reverse mode.
+    Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has no
+    extent or no rotation makes all of the image NaN. AccuracyWarning where too many Gaussians overlap for sums in float32.
     """
     footprints = project(centre, scale, rotation, density, view, extent)
     image = splat(footprints, view.height, view.width, extent, primal) * view.lengths()
+    if primal and dr.width(footprints.column) > MANY:
+        _warn_of_overlap(footprints, view)
     if view.parallel:
-        return image
+        return image + dr.sum(dr.select(footprints.straddles, dr.nan, mi.Float(0)))
     return add_straddling(image, centre, scale, rotation, density, view, footprints.straddles)
+
+
+def _warn_of_overlap(footprints, view):
+    """Warn where the mean over the image, or over one of 64 x 64 tiles, is more than DEEP Gaussians a pixel."""
+    with dr.suspend_grad():
+        pairs = mi.Float(footprints.row_end - footprints.row_begin) * footprints.width
+        tile = dr.maximum(view.width / 64, 1.), dr.maximum(view.height / 64, 1.)
+        x, y = (mi.UInt32(dr.clip(mi.Float(c) / t, 0, 63)) for c, t in zip((footprints.column, footprints.row), tile))
+        tiles = dr.zeros(mi.Float, 64 * 64)
+        dr.scatter_add(tiles, dr.minimum(pairs / (tile[0] * tile[1]), 1), y * 64 + x)
+        depth = max(dr.max(tiles)[0], dr.sum(pairs)[0] / (view.width * view.height))
+    if depth > DEEP:
+        warnings.warn(AccuracyWarning(f'about {depth:.0e} Gaussians overlap in a pixel: their sum in float32 may be off by '
+                                      f'{depth * 2e-9:.0e}'), stacklevel=3)

@@ -48,7 +48,8 @@ class Footprints:
     column, row            Int32 [N]
     row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; empty where it has none
     width                  Float [N], pixels across the widest row, for balancing work
-    straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate
+    straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate; also those that
+                           nothing can, because a number is not finite or a scale or quaternion zero
     """
 
     values: tuple
@@ -87,8 +88,8 @@ def project(centre, scale, rotation, density, view, extent: float) -> Footprints
         to_plane = p - view.corner
         hit = to_plane - view.source * (dr.dot(n, to_plane) / dr.dot(n, view.source))
         w = rotate_inverse(q, view.source) / s
-        straddles = dr.zeros(mi.Bool, dr.width(p))
-        visible = dr.isfinite(dr.detach(dr.squared_norm(w) + dr.squared_norm(hit)))
+        visible = dr.isfinite(dr.detach(dr.squared_norm(w) + dr.squared_norm(hit) + rho))
+        straddles = ~visible
         norm = dr.rsqrt(dr.squared_norm(w))
         what = w * norm
         amplitude = rho * SQRT_2PI * norm
@@ -112,8 +113,9 @@ def project(centre, scale, rotation, density, view, extent: float) -> Footprints
             if view.panel:
                 hidden |= near >= dr.abs(plane)
                 straddles |= far > dr.abs(plane)
-            straddles &= ~hidden
-            visible = ~hidden & ~straddles & dr.isfinite(half + dr.squared_norm(r))
+            sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(1 / s) + rho)
+            straddles = straddles & ~hidden | ~sound
+            visible = ~hidden & ~straddles
         k = plane / dr.select(visible, depth, plane)
         hit = k * r - axis
         w = dr.select(visible, rotate_inverse(q, r) / s, Vector3d(1, 0, 0))

@@ -2,17 +2,22 @@
 from __future__ import annotations
 
 import re
+import warnings
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
+from ..errors import AccuracyWarning, InputError
 from . import cloud, grid
 
 # Shapes hold no Python attributes of ours, so what was learnt of a shape (a mesh's edges) is kept here, the latest ones.
 _MESHES: dict = {}
 MOST_MESHES = 64
+
+# Of Gaussians, in the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
+MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
+SAFE_ASPECT = 1e6
 
 
 def find_objects(scene) -> list:
@@ -60,13 +65,25 @@ class Ellipsoids:
         self.scale = mi.Vector3f(*(column(j) for j in range(3, 6)))
         self.rotation = mi.Vector4f(*(column(j) for j in range(6, 10)))
         with dr.suspend_grad():
-            sound = (dr.isfinite(dr.sum(self.centre) + dr.sum(self.scale) + self.density)
-                     & (dr.min(self.scale) > 0) & (dr.squared_norm(self.rotation) > 1e-30)
-                     & dr.isfinite(dr.squared_norm(self.rotation)))
-            if not dr.all(sound):
+            shortest, longest = dr.min(self.scale), dr.max(self.scale)
+            turn = dr.squared_norm(self.rotation)
+            sound = (dr.isfinite(dr.sum(self.centre) + dr.sum(self.scale) + self.density + turn)
+                     & (dr.max(dr.abs(self.centre)) <= MOST_LENGTH) & (longest <= MOST_LENGTH)
+                     & (shortest >= 1 / MOST_LENGTH) & (dr.abs(self.density) <= MOST_DENSITY)
+                     & (turn > 1e-30) & (longest <= MOST_ASPECT * shortest))
+            thin = longest > SAFE_ASPECT * shortest
+            worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if count else 0
+            if worst == 2:
                 first = int(dr.compress(~sound)[0])
-                raise InputError(f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and '
-                                 'rotation must be finite, the quaternion not zero, and the scales positive')
+                raise InputError(
+                    f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and rotation must be '
+                    f'finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, lengths '
+                    f'below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}')
+            if worst == 1:
+                first = int(dr.compress(thin)[0])
+                warnings.warn(AccuracyWarning(
+                    f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} apart: '
+                    'its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
 
     def line_integrals(self, view, extent, primal):
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal)
