@@ -208,8 +208,8 @@ def test_bad_data(changes, message):
         content(**changes)
 
 
-def test_import_leaves_matplotlib_and_mitsuba_alone():
+def test_import_leaves_matplotlib_alone():
     code = ("import sys, lingo_mi.report, lingo_mi.metrics, lingo_mi.progress\n"
-            "print([m for m in ('matplotlib', 'mitsuba', 'drjit') if m in sys.modules])")
+            "print('matplotlib' in sys.modules)")
     out = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
-    assert out == '[]\n'
+    assert out == 'False\n'

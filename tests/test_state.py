@@ -134,13 +134,14 @@ def test_adam_against_numpy():
         for v in columns.values():
             v[:] = 0
     device, rates = DeviceState(state), dict(centre=1e-2, scale=2e-2, rotation=3e-3, density=5e-2)
+    settings = Settings(**{f'rate_{k}': (rate, rate) for k, rate in rates.items()})
     expected = {k: v.astype(float) for k, v in state.values.items()}
     m, s = ({k: np.zeros_like(v) for k, v in expected.items()} for _ in range(2))
     types = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
     for step in range(1, 6):
         gradients = {k: np.float32(rng.normal(size=v.shape) * 10. ** rng.integers(-4, 2)) for k, v in expected.items()}
         uploaded = {k: types[k](np.ascontiguousarray(g.T if g.shape[1] > 1 else g[:, 0])) for k, g in gradients.items()}
-        device.adam(uploaded, rates, step, 1e-15)
+        device.adam(uploaded, settings, step - 1)
         for k, g in gradients.items():
             g = g.astype(float)
             m[k], s[k] = .9 * m[k] + .1 * g, .999 * s[k] + .001 * g * g
@@ -159,5 +160,5 @@ def test_adam_without_a_derivative_stays_finite():
         for v in columns.values():
             v[:] = 0
     device = DeviceState(state)
-    device.adam({'density': dr.zeros(mi.Float, 2)}, {'density': .1}, 1, 1e-15)
+    device.adam({'density': dr.zeros(mi.Float, 2)}, Settings(), 0)
     np.testing.assert_array_equal(device.host().values['density'], state.values['density'])

@@ -8,9 +8,6 @@ import numpy as np
 from .settings import Settings
 from .state import PARAMETERS, State
 
-BETA1, BETA2 = .9, .999  # Adam's usual decay of the moments
-
-
 def _types():
     return dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
 
@@ -51,15 +48,16 @@ class DeviceState:
         scale = low + high / (1 + dr.exp(-v['scale']))
         return v['centre'], scale, v['rotation'], _softplus(v['density'])
 
-    def adam(self, gradients: dict, rates: dict, step: int, epsilon: float):
-        """One Adam step (Kingma and Ba 2015); `step` counts from 1, for the bias correction."""
+    def adam(self, gradients: dict, settings: Settings, iteration: int):
+        """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
+        b1, b2, step = settings.beta1, settings.beta2, iteration + 1
         # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
-        c1, c2 = dr.opaque(mi.Float, 1 / (1 - BETA1 ** step)), dr.opaque(mi.Float, 1 / (1 - BETA2 ** step))
+        c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1 ** step)), dr.opaque(mi.Float, 1 / (1 - b2 ** step))
         for name, g in gradients.items():
-            m = BETA1 * self.first[name] + (1 - BETA1) * g
-            v = BETA2 * self.second[name] + (1 - BETA2) * g * g
-            rate = dr.opaque(mi.Float, rates[name])
-            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + epsilon)
+            m = b1 * self.first[name] + (1 - b1) * g
+            v = b2 * self.second[name] + (1 - b2) * g * g
+            rate = dr.opaque(mi.Float, settings.rate(name, iteration))
+            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + settings.epsilon)
             self.first[name], self.second[name] = m, v
         dr.eval(self.values, self.first, self.second, self.gradient, self.seen)
 

@@ -68,7 +68,7 @@ class Stepper:
         if self.flat:
             gradients['centre'].z, gradients['scale'].z = 0, 0
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
-        state.adam(gradients, {name: s.rate(name, iteration) for name in gradients}, iteration + 1, s.epsilon)
+        state.adam(gradients, s, iteration)
         return total
 
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
