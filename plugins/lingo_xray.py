@@ -4,6 +4,7 @@ import mitsuba as mi
 
 from lingo_mi.errors import InputError
 from lingo_mi.xray.objects import find_objects
+from lingo_mi.xray.quality import Quality
 from lingo_mi.xray.sensors import view_of
 
 
@@ -16,10 +17,31 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     .. pluginparameters::
 
+     * - accuracy
+       - |string|
+       - A preset of the cut-off, with these relative L2 errors and times (docs/accuracy.md says of what, and why):
+
+         =============  =======  ========  =================  =============
+         preset         extent   image     worst derivative   relative time
+         =============  =======  ========  =================  =============
+         `draft`        3        6e-3      5e-2               0.7
+         `default`      5        2e-6      4e-5               1
+         `reference`    7        8e-8      2e-7               1.3
+         =============  =======  ========  =================  =============
+
+         (Default: `default`)
      * - extent
        - |float|
-       - Cut-off of Gaussians in standard deviations. The relative error of the image falls from about 6e-3 at 3 to
-         2e-4 at 4, 4e-6 at 5 and rounding (1e-7) from 6 on; the time grows with the square. (Default: 5)
+       - Cut-off of Gaussians in standard deviations, whatever the preset says.
+     * - footprint
+       - |string|
+       - `exact`, the closed form; or `affine`, the EWA model of Gaussian splatting, to compare with: it is off by
+         4e-4 for Gaussians of a few pixels, more for larger ones, exact in parallel beams, and not faster. (Default: `exact`)
+     * - pixel
+       - |string| or |int|
+       - `centre`, the ray through a pixel's centre; or n, the mean over n x n rays, for pixels that are not small against
+         the Gaussians. In transmission, intensities are averaged, as a detector does. Time and memory grow with n x n.
+         (Default: `centre`)
      * - output
        - |string|
        - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral).
@@ -33,7 +55,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
 
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
-    centres: one evaluation a pixel, without random numbers, whatever the sample count. Sensors: `ct_scanner`,
+    centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
     `perspective` and `orthographic`. A scanner's integrals through Gaussians end at its panel, a camera's do not.
 
     Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`. Gradients reach the Gaussians' centres, scales, rotations and
@@ -42,10 +64,9 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.extent = props.get('extent', 5.)
+        self.quality = Quality.of(props.get('accuracy', 'default'), props.get('extent', None),
+                                  props.get('footprint', 'exact'), props.get('pixel', 'centre'))
         self.output = props.get('output', 'line_integral')
-        if not 1 <= self.extent <= 20:
-            raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {self.extent:g}')
         if self.output not in ('line_integral', 'transmission'):
             raise InputError(f"lingo_xray: output is 'line_integral' or 'transmission', not {self.output!r}")
 
@@ -72,11 +93,13 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         """The image as a tensor [height, width, channels of the film]."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         view = view_of(sensor)
-        total = dr.zeros(mi.Float, view.height * view.width)
+        rays = self.quality.subdivided(view)
+        total = dr.zeros(mi.Float, rays.height * rays.width)
         for thing in find_objects(scene):
-            total += thing.line_integrals(view, self.extent, primal)
+            total += self.quality.line_integrals(thing, rays, primal)
         if self.output == 'transmission':
             total = dr.exp(-total)
+        total = self.quality.averaged(total, view)
         film = sensor.film()
         film.prepare([])
         channels = film.develop().shape[2]
@@ -85,7 +108,9 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         return mi.TensorXf(total, shape=(view.height, view.width, channels))
 
     def to_string(self):
-        return f'LingoXray[extent = {self.extent:g}, output = {self.output}]'
+        q = self.quality
+        return (f'LingoXray[extent = {q.extent:g}, footprint = {q.footprint}, pixel = {q.pixel} x {q.pixel}, '
+                f'output = {self.output}]')
 
 
 create = LingoXray

@@ -2,21 +2,24 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import AccuracyWarning
-from .footprint import project
+from .footprint import NAMES, project
 from .segment import add_straddling
 from .splat import splat
 
 
+DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
 MANY = 10_000   # Gaussians in a cloud from which on their overlap is looked at
 DEEP = 5_000    # Gaussians in a pixel whose sum float32 still holds to 1e-5
 
 
-def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True):
+def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True,
+                   affine: bool = False):
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
@@ -25,28 +28,40 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     view            `frame.View`
     extent          cut-off in standard deviations
     primal          False where only derivatives are wanted: the splatted part of the image is then left at zero
+    affine          the model of Gaussian splatting (EWA): |d|^2 frozen at each Gaussian's centre
 
-    Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has no
-    extent or no rotation makes all of the image NaN. AccuracyWarning where too many Gaussians overlap for sums in float32.
+    Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
+    no extent or no rotation leaves no finite pixel. AccuracyWarning where too many overlap for sums in float32.
     """
     footprints = project(centre, scale, rotation, density, view, extent)
+    if affine:
+        footprints = _frozen(footprints)
     image = splat(footprints, view.height, view.width, extent, primal) * view.lengths()
     if primal and dr.width(footprints.column) > MANY:
-        _warn_of_overlap(footprints, view)
+        _warn_of_overlap(footprints, view, extent)
     if view.parallel:
         return image + dr.sum(dr.select(footprints.straddles, dr.nan, mi.Float(0)))
     return add_straddling(image, centre, scale, rotation, density, view, footprints.straddles)
 
 
-def _warn_of_overlap(footprints, view):
+def _frozen(footprints):
+    """Footprints whose denominators are 1; opaque zeros, so that the kernels are those of the exact model."""
+    zero = dr.opaque(mi.Float, 0, dr.width(footprints.column))
+    values = (zero if name in DENOMINATOR else value for name, value in zip(NAMES, footprints.values))
+    return replace(footprints, values=tuple(values))
+
+
+def _warn_of_overlap(footprints, view, extent):
     """Warn where the mean over the image, or over one of 64 x 64 tiles, is more than DEEP Gaussians a pixel."""
     with dr.suspend_grad():
+        _, mx, my, *_ = (dr.detach(v) for v in footprints.values)
         pairs = mi.Float(footprints.row_end - footprints.row_begin) * footprints.width
+        pairs = dr.minimum(pairs, dr.pi * extent * extent / (mx * my))  # boxes are rounded up to whole pixels
         tile = dr.maximum(view.width / 64, 1.), dr.maximum(view.height / 64, 1.)
         x, y = (mi.UInt32(dr.clip(mi.Float(c) / t, 0, 63)) for c, t in zip((footprints.column, footprints.row), tile))
         tiles = dr.zeros(mi.Float, 64 * 64)
         dr.scatter_add(tiles, dr.minimum(pairs / (tile[0] * tile[1]), 1), y * 64 + x)
         depth = max(dr.max(tiles)[0], dr.sum(pairs)[0] / (view.width * view.height))
     if depth > DEEP:
-        warnings.warn(AccuracyWarning(f'about {depth:.0e} Gaussians overlap in a pixel: their sum in float32 may be off by '
-                                      f'{depth * 2e-9:.0e}'), stacklevel=3)
+        warnings.warn(AccuracyWarning(f'about {depth:.0e} Gaussians overlap in a pixel: their sum in float32 may be off '
+                                      f'by {depth * 2e-9:.0e}'), stacklevel=3)

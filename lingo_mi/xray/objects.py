@@ -76,17 +76,18 @@ class Ellipsoids:
             if worst == 2:
                 first = int(dr.compress(~sound)[0])
                 raise InputError(
-                    f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and rotation must be '
-                    f'finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, lengths '
-                    f'below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}')
+                    f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and rotation must '
+                    f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
+                    f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}')
             if worst == 1:
                 first = int(dr.compress(thin)[0])
                 warnings.warn(AccuracyWarning(
-                    f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} apart: '
-                    'its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
+                    f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} '
+                    'apart: its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
 
-    def line_integrals(self, view, extent, primal):
-        return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal)
+    def line_integrals(self, view, extent, primal, affine=False):
+        return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal,
+                                    affine)
 
 
 class GridInCube:
@@ -109,7 +110,7 @@ class GridInCube:
         self.data, self.size = tensor.array, tensor.shape[2::-1]
         self.low, self.high = box.min, box.max
 
-    def line_integrals(self, view, extent, primal):
+    def line_integrals(self, view, extent, primal, affine=False):
         nx, ny, nz = self.size
         # The projector wants z fastest, Mitsuba stores x fastest.
         i = dr.arange(mi.UInt32, nx * ny * nz)
@@ -152,7 +153,7 @@ class HomogeneousMesh:
             _MESHES[key] = (shape, arrays, from_mitsuba(shape))
         self.paths = _MESHES[key][-1]
 
-    def line_integrals(self, view, extent, primal):
+    def line_integrals(self, view, extent, primal, affine=False):
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
 
 
