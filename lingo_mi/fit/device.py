@@ -48,6 +48,10 @@ class DeviceState:
         scale = low + high / (1 + dr.exp(-v['scale']))
         return v['centre'], scale, v['rotation'], _softplus(v['density'])
 
+    def finite(self) -> bool:
+        """Whether all parameters are finite; waits for the device."""
+        return bool(dr.all(dr.isfinite(sum(dr.sum(x) if k != 'density' else x for k, x in self.values.items()))))
+
     def adam(self, gradients: dict, settings: Settings, iteration: int):
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
         b1, b2, step = settings.beta1, settings.beta2, iteration + 1

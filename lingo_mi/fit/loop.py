@@ -94,8 +94,8 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         if iteration in marks:
             dr.sync_thread()
             value = float(loss[0])
-            if not np.isfinite(value):
-                raise InputError(f'the loss is not finite at iteration {iteration}: lower the rates, or check the '
+            if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not would silently leave the image
+                raise InputError(f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the '
                                  'projections')
             seconds += time.perf_counter() - clock
             entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
