@@ -36,11 +36,13 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
      * - footprint
        - |string|
        - `exact`, the closed form; or `affine`, the EWA model of Gaussian splatting, to compare with: it is off by
-         4e-4 for Gaussians of a few pixels, more for larger ones, exact in parallel beams, and not faster. (Default: `exact`)
+         4e-4 for Gaussians of a few pixels, more for larger ones, exact in parallel beams, and not faster.
+         (Default: `exact`)
      * - pixel
        - |string| or |int|
-       - `centre`, the ray through a pixel's centre; or n, the mean over n x n rays, for pixels that are not small against
-         the Gaussians. In transmission, intensities are averaged, as a detector does. Time and memory grow with n x n.
+       - `centre`, the ray through a pixel's centre; or n, the mean over n x n rays, for pixels that are not small
+         against the Gaussians. In transmission, intensities are averaged, as a detector does. Time and memory grow
+         with n x n.
          (Default: `centre`)
      * - output
        - |string|

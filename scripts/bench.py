@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Time the integrator, forward and backward, against a kernel written by hand for this one job.
+"""Time the integrator, forward and backward, against a kernel written by hand for this job and against Mitsuba's tree.
 
     python scripts/bench.py
     python scripts/bench.py --gaussians 50000 --size 512 --extent 3 --json bench.json
@@ -7,6 +7,9 @@
 Renders a random cloud through mi.render and differentiates it through dr.backward, Python and set-up included, and runs
 scripts/limit.cpp (AVX2, two threads, nothing but the arithmetic of a pixel in a fixed box) on as many pairs, in turn, so
 that both see the same machine. A pair is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
+
+Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
+against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out.
 """
 import argparse
 import json
@@ -21,6 +24,9 @@ import numpy as np
 from lingo_mi.cli import guard
 from lingo_mi.runtime import use_variant
 
+EPSILON = .0128     # mm, 1e-4 of half the volume's side: where the tree errs least
+PIXELS = 400        # of which errors are measured
+
 
 def arguments():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -29,6 +35,7 @@ def arguments():
     p.add_argument('--pixels', type=float, default=234, help="mean pixels in a Gaussian's box")
     p.add_argument('--extent', type=float, default=3., help='cut-off in standard deviations')
     p.add_argument('--repeats', type=int, default=15)
+    p.add_argument('--no-bvh', dest='bvh', action='store_false', help="leave out Mitsuba's tree")
     p.add_argument('--json', type=Path, help='write the numbers there')
     p.add_argument('--variant')
     return p.parse_args()
@@ -58,8 +65,60 @@ def cloud(args):
     # A box of 2 extent sigma on a side; magnified 1.5 times, on pixels of 512 / size mm. 1.16: the spread of the scales.
     sigma = np.sqrt(args.pixels) / (2 * args.extent) / 1.5 * 512 / args.size / 1.16
     scale = sigma * np.exp(rng.normal(0, .35, (n, 3)))
-    data = np.concatenate([centre, scale, rng.normal(size=(n, 4))], 1)
+    rotation = rng.normal(size=(n, 4))
+    data = np.concatenate([centre, scale, rotation / np.linalg.norm(rotation, axis=1, keepdims=True)], 1)
     return data.astype(np.float32), rng.uniform(.1, 1, (n, 1)).astype(np.float32)
+
+
+def against_tree(scene, sensor, data, density, args) -> dict:
+    """Time one image and its derivatives by marching through Mitsuba's tree; errors of both ways on a few pixels."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from lingo_mi.closed_form import NAMES, rays_and_gradients
+    from lingo_mi.xray.alternatives import Tree, rays
+    from lingo_mi.xray.sensors import view_of
+
+    view, rng = view_of(sensor), np.random.default_rng(1)
+    chosen = np.sort(rng.permutation(args.size ** 2)[:PIXELS])
+    weights = np.zeros(args.size ** 2, np.float32)
+    weights[chosen] = rng.normal(size=len(chosen))
+    source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
+    directions = corner + np.outer(chosen % args.size + .5, u) + np.outer(chosen // args.size + .5, v) - source
+    columns = data[:, :3], data[:, 3:6], data[:, 6:], density[:, 0]
+    starts = np.broadcast_to(source, directions.shape)
+    image, gradients = rays_and_gradients(columns, starts, directions, weights[chosen])
+
+    def errors(found, by_data, by_density):
+        by = (by_data[:, :3], by_data[:, 3:6], by_data[:, 6:], by_density)
+        worst = max(np.linalg.norm(a - gradients[k]) / np.linalg.norm(gradients[k]) for k, a in zip(NAMES, by))
+        return float(np.linalg.norm(found[chosen] - image) / np.linalg.norm(image)), float(worst)
+
+    def timed(function, *more):
+        begun = time.perf_counter()
+        out = function(*more)
+        dr.sync_thread()
+        return out, 1e3 * (time.perf_counter() - begun)
+
+    params = mi.traverse(scene)
+    ours = mi.render(scene, params, sensor=sensor)
+    dr.backward(ours * mi.TensorXf(weights.reshape(ours.shape)))
+    grads = [dr.grad(params[name]).numpy() for name in ('cloud.data', 'cloud.density')]
+    out = dict(zip(('image_error', 'gradient_error'), errors(ours.numpy().ravel(), grads[0].reshape(-1, 10), grads[1])))
+
+    tree = Tree(mi.TensorXf(data), mi.TensorXf(density), args.extent, EPSILON)
+    start = rays(view, 2 * 128.)
+    upstream = mi.Float(weights)
+    tree.image(*(type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start))  # builds the tree
+    found, out['bvh_forward_ms'] = timed(tree.image, *start)
+    by, out['bvh_backward_ms'] = timed(tree.gradients, *start, upstream)
+    worst = errors(found.numpy(), by[0].numpy().reshape(-1, 10), by[1].numpy())
+    out |= dict(zip(('bvh_image_error', 'bvh_gradient_error'), worst))
+    print(f'tree      {out["bvh_forward_ms"]:7.0f} ms forward, {out["bvh_backward_ms"]:.0f} ms backward '
+          f'(epsilon {EPSILON:g} mm)')
+    print(f'errors    image {out["image_error"]:.1e}, worst derivative {out["gradient_error"]:.1e}; '
+          f'tree {out["bvh_image_error"]:.1e}, {out["bvh_gradient_error"]:.1e}; on {len(chosen)} pixels')
+    return out
 
 
 def main():
@@ -127,6 +186,8 @@ def main():
     if limits:
         total = sum(result[f'{n}_ns_per_pair'] for n in times) / sum(result[f'limit_{n}_ns_per_pair'] for n in times)
         print(f'together ratio {total:.2f}')
+    if args.bvh:
+        result |= against_tree(scene, sensors[0], data, density, args)
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + '\n')
 

@@ -1,4 +1,4 @@
-"""What a scene may pay for accuracy: the cut-off, the model of a footprint, the rule for a pixel, and presets of them."""
+"""What a scene may pay for accuracy: the cut-off, the model of a footprint, the rule for a pixel, and presets."""
 from __future__ import annotations
 
 import math
@@ -70,5 +70,6 @@ def _subpixels(pixel) -> int:
     except (TypeError, ValueError):
         n = math.nan
     if not (math.isfinite(n) and n == round(n) and 1 <= n <= MOST_SUBPIXELS):
-        raise InputError(f"lingo_xray: pixel is 'centre' or n for n x n rays, from 1 to {MOST_SUBPIXELS}, not {pixel!r}")
+        raise InputError(f"lingo_xray: pixel is 'centre' or n for n x n rays, from 1 to {MOST_SUBPIXELS}, "
+                         f'not {pixel!r}')
     return int(n)

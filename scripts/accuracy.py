@@ -1,0 +1,46 @@
+#!/usr/bin/env python3
+"""Measure what accuracy costs: error, time and memory of every way to compute the same projections, scaling, and fits.
+
+    python scripts/accuracy.py
+    python scripts/accuracy.py --quick
+
+Writes accuracy.json and accuracy.md to --out. The full run (under 20 minutes on two cores) also renews docs/figures/ and
+the tables in docs/accuracy.md; --quick (under 3 minutes) leaves them alone and writes its plots to --out.
+"""
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from lingo_mi.cli import guard
+from lingo_mi.runtime import use_variant
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+
+
+def arguments():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
+    p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
+    p.add_argument('--figures', type=Path, metavar='DIR',
+                   help='folder of the plots (default: docs/figures, or --out if quick)')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    return p.parse_args()
+
+
+def main():
+    args = arguments()
+    use_variant(args.variant)
+    from lingo_mi.accuracy import FULL, QUICK, measure
+    from lingo_mi.accuracy_report import write
+
+    begun = time.perf_counter()
+    found = measure(QUICK if args.quick else FULL,
+                    lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr))
+    figures = args.figures or (args.out if args.quick else DOCS / 'figures')
+    write(found, args.out, figures, None if args.quick else DOCS / 'accuracy.md')
+    print(f'{args.out}/: accuracy.json, accuracy.md; {figures}/: pareto.png, scaling.png, fits.png')
+
+
+if __name__ == '__main__':
+    guard(main)
