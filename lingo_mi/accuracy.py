@@ -72,7 +72,7 @@ class Sizes:
     panels: tuple = (64, 128, 256, 512, 1024, 2048)
     phantoms: tuple = (64, 128)
     points: tuple = (1_000, 4_000, 16_000)
-    iterations: tuple = (150, 500, 1_200)
+    iterations: tuple = (150, 400, 1_000)
     views: int = 25
 
 
