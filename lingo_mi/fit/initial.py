@@ -34,7 +34,8 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     else:
         def render(points, density, spacing, views):
             state = start(points, spacing, density / unit, settings)
-            return Stepper(scan.subset(views[:1]), settings).render(DeviceState(state), g.subset(views)) * g.scale
+            stepper = Stepper(scan.subset(views[:1]), settings, unit)
+            return stepper.render(DeviceState(state), g.subset(views)) * g.scale
         settings = bounded(settings, scan)
         chosen = lingo.Settings(
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,

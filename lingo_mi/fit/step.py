@@ -35,9 +35,10 @@ class Target:
 class Stepper:
     """Steps of a fit on one scan with one set of settings."""
 
-    def __init__(self, scan: Scan, settings: Settings):
+    def __init__(self, scan: Scan, settings: Settings, unit: float | None = None):
+        """unit: the density that counts as 1, where another scan than this one decides it (`density_unit`)."""
         self.settings, self.geometry = settings, scan.geometry
-        self.unit = density_unit(scan, settings)
+        self.unit = density_unit(scan, settings) if unit is None else unit
         self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
         self.coarse_until = round(settings.coarse_share * settings.iterations)
         coarse = scan.binned(2) if self.coarse_until else scan
