@@ -3,6 +3,10 @@
 
     python scripts/recipes.py scenes/x3d_foot.xml scenes/chest.xml scenes/x3d_engine.xml
     python scripts/recipes.py scenes/x3d_foot.xml --methods fast r2 --views 25 --iterations 5000
+    python scripts/recipes.py scenes/x3d_foot.xml --methods lingo r2 lingo:init=r2 lingo:loss_scale=none
+
+A method may be followed by settings that differ (`METHOD:name=value,name=value`): so each part of a recipe can be
+exchanged alone.
 
 Runs scripts/fit.py for each combination that has no result yet in --out (an interrupted one goes on where it stopped), then
 draws all histories and prints a Markdown table. --iterations is for lingo and r2; fast keeps its own number.
@@ -17,17 +21,26 @@ from lingo_mi.cli import guard
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS
 
-COLOURS = dict(fast='tab:green', lingo='tab:blue', r2='tab:red')
 COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'), ('ssim_2d', 'SSIM', '{:.4f}'),
            ('psnr_3d', 'volume, dB', '{:.2f}'), ('ssim_3d', 'SSIM 3D', '{:.4f}'), ('ipsd', 'IPSD', '{:.4f}'),
            ('ipsd_targets', 'born', '{:,}'), ('gaussians', 'Gaussians', '{:,}'), ('iterations', 'iterations', '{}'),
            ('seconds_init', 'init, s', '{:.1f}'), ('seconds_fit', 'fit, s', '{:.0f}'))
 
 
+def method(text):
+    """Check a method with settings; returns the text."""
+    name, _, changes = text.partition(':')
+    if name not in METHODS:
+        raise argparse.ArgumentTypeError(f'{name!r} is not one of {", ".join(METHODS)}')
+    if changes and not all('=' in change for change in changes.split(',')):
+        raise argparse.ArgumentTypeError(f'{changes!r} is not name=value,name=value')
+    return text
+
+
 def arguments():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path)
-    p.add_argument('--methods', nargs='+', choices=METHODS, default=list(METHODS))
+    p.add_argument('--methods', nargs='+', type=method, default=list(METHODS), metavar='METHOD[:name=value,...]')
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)
     p.add_argument('--out', type=Path, default=Path('out/recipes'), help='folder of the results')
@@ -37,11 +50,13 @@ def arguments():
 
 def result(scene, method, args) -> dict:
     """The metrics of one fit, run now unless they are there."""
-    folder = args.out / f'{scene.stem}_{args.views}_{method}'
+    name, _, changes = method.partition(':')
+    folder = args.out / '_'.join([scene.stem, str(args.views), name, *changes.split(',')]).rstrip('_')
     if not (folder / 'metrics.json').exists():
-        command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', method,
+        command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', name,
                    '--views', str(args.views), '--out', str(folder)]
-        command += [] if method == 'fast' else ['--iterations', str(args.iterations)]
+        command += [word for change in changes.split(',') if change for word in ('-D', change)]
+        command += [] if name == 'fast' else ['--iterations', str(args.iterations)]
         command += ['--resume'] if (folder / 'checkpoint.npz').exists() else []
         print(' '.join(command), file=sys.stderr)
         if code := subprocess.run(command).returncode:
@@ -61,7 +76,7 @@ def draw(results, figure):
         for row, key in enumerate(('psnr_2d', 'psnr_3d')):
             axis = axes[row, scenes.index(scene)]
             points = [(e['seconds'], e[key]) for e in metrics['history'] if e.get(key) is not None]
-            axis.semilogx(*zip(*points), '.-', color=COLOURS[method], label=f'{method}, {metrics["iterations"]} iterations')
+            axis.semilogx(*zip(*points), '.-', label=f'{method}, {metrics["iterations"]} iterations')
             axis.set(title=scene if row == 0 else None, xlabel='time in steps [s]',
                      ylabel=f'PSNR, {"held-out views" if row == 0 else "volume"} [dB]')
             axis.grid(alpha=.3, which='both')

@@ -156,8 +156,12 @@ def test_no_growth_beyond_the_maximum():
     state = state_of(np.random.default_rng(7), 10, size=.05)
     state.gradient[:], state.seen[:] = 5, 1
     assert len(densify(state, SETTINGS.changed(max_gaussians=20), HALF, np.random.default_rng(0))) == 20
-    after = densify(state, SETTINGS.changed(max_gaussians=19), HALF, np.random.default_rng(0))
-    assert len(after) == 10 and not after.gradient.any()
+    state.gradient[:] = np.arange(10, 20)
+    after = densify(state, SETTINGS.changed(max_gaussians=13), HALF, np.random.default_rng(0))
+    assert len(after) == 13 and not after.gradient.any()
+    np.testing.assert_array_equal(after.values['centre'][10:], state.values['centre'][7:])  # the three strongest
+    full = densify(state, SETTINGS.changed(max_gaussians=5), HALF, np.random.default_rng(0))
+    np.testing.assert_array_equal(full.values['centre'], state.values['centre'])
 
 
 @pytest.mark.parametrize('operation', [

@@ -93,6 +93,13 @@ def test_loss_falls(scan, whole):
     assert all(np.isfinite(v).all() for v in whole.state.values.values())
 
 
+def test_a_small_scan_bounds_the_number_of_gaussians(scan, whole):
+    assert len(whole.state) > 65
+    few = SHORT.changed(values_per_gaussian=scan.projections.size / 65, n_points=500, init='lingo')
+    assert len(run(scan, few, some_points(scan.geometry), seed=3).state) <= 65
+    assert len(initial_cloud(scan, few)) == 65
+
+
 def test_progress_and_measure_are_called(scan):
     steps, measured = [], []
     run(scan, SHORT.changed(iterations=8), some_points(scan.geometry),

@@ -3,7 +3,7 @@
 R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one split in
 two. A clone and its original take half the density each, which keeps the mass. The halves of a split are smaller by 1.6;
 R2 gives them half the density too, so that three quarters of the mass vanish; with `split_keeps_mass` they get what
-keeps it. Afterwards faint and stray Gaussians are removed. Adam's moments travel with their Gaussian; new ones start at
+keeps it. Afterwards faint and stray Gaussians are removed. Where there is not room for all, the strongest go first (R2-Gaussian stops). Adam's moments travel with their Gaussian; new ones start at
 zero.
 """
 from __future__ import annotations
@@ -26,8 +26,8 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False) -> 
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
     _, scale, _, _ = activate(state, settings)
     strong = mean >= settings.densify_threshold
-    if len(state) + strong.sum() > settings.max_gaussians:
-        strong[:] = False
+    room = max(settings.max_gaussians - len(state), 0)  # each adds one
+    strong[np.argsort(-mean, kind='stable')[room:]] = False
     large = scale.max(1) > settings.split_size
     state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
                   settings, rng, flat)

@@ -24,6 +24,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     gives no cloud.
     """
     begun = time.perf_counter()
+    settings = bounded(settings, scan)
     rng = np.random.default_rng(seed)
     g, unit = scan.geometry, density_unit(scan, settings)
     if settings.init == 'r2':
@@ -36,7 +37,6 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings, unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
-        settings = bounded(settings, scan)
         chosen = lingo.Settings(
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
             resolution=settings.occupancy_voxels, V_S=settings.V_S, density=settings.init_density,

@@ -123,11 +123,16 @@ def measure_at(iterations: int) -> list[int]:
 
 
 def bounded(settings: Settings, scan: Scan) -> Settings:
-    """The settings with the largest scale so small that no Gaussian in the volume can reach the source.
+    """The settings with the bounds that a scan sets.
 
-    Beyond it the integral of a cone beam's Gaussian is no footprint (see `xray.footprint`).
+    The largest scale becomes so small that no Gaussian in the volume can reach the source: beyond it the integral of a
+    cone beam's Gaussian is no footprint (see `xray.footprint`). `values_per_gaussian` bounds the number of Gaussians.
+    Raises InputError where the source is in the volume.
     """
     g = scan.geometry
+    if settings.values_per_gaussian > 0:
+        most = min(max(int(scan.projections.size / settings.values_per_gaussian), 1), settings.max_gaussians)
+        settings = replace(settings, max_gaussians=most, n_points=min(settings.n_points, most))
     if g.mode == 'parallel':
         return settings
     frames = g.normalised_frames()

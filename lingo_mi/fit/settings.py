@@ -51,6 +51,9 @@ class Settings:
     split_keeps_mass   whether the halves of a split weigh what their parent did (R2: no)
     prune_density      Gaussians below vanish, as do those outside the volume (1e-5)
     max_gaussians      no densification beyond (500k)
+    values_per_gaussian
+                       measured values that there must be for each Gaussian (own; 0: any number): bounds the Gaussians at
+                       the start and later, since a small scan cannot determine many
 
     Bounds
     scale_min, scale_max   standard deviations (R2: 5e-4 and 0.5 of the longest side)
@@ -93,6 +96,7 @@ class Settings:
     split_keeps_mass: bool = False
     prune_density: float = 1e-5
     max_gaussians: int = 500_000
+    values_per_gaussian: float = 0.
     scale_min: float = 1e-3
     scale_max: float = 1.
 
@@ -113,6 +117,9 @@ class Settings:
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
+        require(self.max_gaussians >= 1, f'max_gaussians must be at least 1, not {self.max_gaussians}')
+        require(self.values_per_gaussian >= 0,
+                f'values_per_gaussian must not be negative, not {self.values_per_gaussian:g}')
         require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
