@@ -38,7 +38,7 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
         footprints = _frozen(footprints)
     image = splat(footprints, view.height, view.width, extent, primal) * view.lengths()
     if primal and dr.width(footprints.column) > MANY:
-        _warn_of_overlap(footprints, view, extent)
+        _warn_of_overlap(footprints, view)
     if view.parallel:
         return image + dr.sum(dr.select(footprints.straddles, dr.nan, mi.Float(0)))
     return add_straddling(image, centre, scale, rotation, density, view, footprints.straddles)
@@ -51,17 +51,14 @@ def _frozen(footprints):
     return replace(footprints, values=tuple(values))
 
 
-def _warn_of_overlap(footprints, view, extent):
+def _warn_of_overlap(footprints, view):
     """Warn where the mean over the image, or over one of 64 x 64 tiles, is more than DEEP Gaussians a pixel."""
     with dr.suspend_grad():
-        _, mx, my, *_ = (dr.detach(v) for v in footprints.values)
-        pairs = mi.Float(footprints.row_end - footprints.row_begin) * footprints.width
-        pairs = dr.minimum(pairs, dr.pi * extent * extent / (mx * my))  # boxes are rounded up to whole pixels
         tile = dr.maximum(view.width / 64, 1.), dr.maximum(view.height / 64, 1.)
         x, y = (mi.UInt32(dr.clip(mi.Float(c) / t, 0, 63)) for c, t in zip((footprints.column, footprints.row), tile))
         tiles = dr.zeros(mi.Float, 64 * 64)
-        dr.scatter_add(tiles, dr.minimum(pairs / (tile[0] * tile[1]), 1), y * 64 + x)
-        depth = max(dr.max(tiles)[0], dr.sum(pairs)[0] / (view.width * view.height))
+        dr.scatter_add(tiles, dr.minimum(footprints.area / (tile[0] * tile[1]), 1), y * 64 + x)
+        depth = max(dr.max(tiles)[0], dr.sum(footprints.area)[0] / (view.width * view.height))
     if depth > DEEP:
         warnings.warn(AccuracyWarning(f'about {depth:.0e} Gaussians overlap in a pixel: their sum in float32 may be off '
                                       f'by {depth * 2e-9:.0e}'), stacklevel=3)

@@ -48,6 +48,7 @@ class Footprints:
     column, row            Int32 [N]
     row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; empty where it has none
     width                  Float [N], pixels across the widest row, for balancing work
+    area                   Float [N], pixels covered: of the ellipse, or of the box where that is smaller
     straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate; also those that
                            nothing can, because a number is not finite or a scale or quaternion zero
     """
@@ -58,6 +59,7 @@ class Footprints:
     row_begin: object
     row_end: object
     width: object
+    area: object
     straddles: object
 
 
@@ -155,9 +157,11 @@ def project(centre, scale, rotation, density, view, extent: float) -> Footprints
         far_out = 1e9  # keeps the whole part of a centre far outside the image within Int32
         column = mi.Int32(dr.clip(dr.select(visible, dr.floor(x), 0), -far_out, far_out))
         row = mi.Int32(dr.clip(dr.select(visible, dr.floor(y), 0), -far_out, far_out))
+        width, row_end = mi.Float(end - begin), dr.maximum(row_end, row_begin)
+        area = dr.minimum(mi.Float(row_end - row_begin) * width, mi.Float(dr.pi * extent * extent / (mx * my)))
     values = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, x - (Float64(column) + .5), y - (Float64(row) + .5))
     values = tuple(v if name in DOUBLE else mi.Float(v) for name, v in zip(NAMES, values))
-    return Footprints(values, column, row, row_begin, dr.maximum(row_end, row_begin), mi.Float(end - begin), straddles)
+    return Footprints(values, column, row, row_begin, row_end, width, area, straddles)
 
 
 def _roots(a, b, c):
