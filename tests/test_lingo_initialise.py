@@ -5,7 +5,7 @@ import pytest
 from lingo_mi.errors import InputError
 from lingo_mi.fit.r2_init import r2_initialise
 from lingo_mi.geometry import Geometry, circular
-from lingo_mi.lingo.density import least_squares_factor, mean_pixel
+from lingo_mi.lingo.density import FAINTEST, least_squares_factor, mean_pixel
 from lingo_mi.lingo.initialise import Settings, draw, initialise
 from lingo_mi.lingo.ipsd import ipsd, neighbour_distance, reverse_distance
 from lingo_mi.lingo.masks import masks
@@ -150,6 +150,24 @@ def test_density_modes():
     assert calls == [(300, [0, 2, 4])] and lsq.info['density_factor'] == pytest.approx(0.25)
     with pytest.raises(InputError, match='render'):
         initialise(frames, projections, geometry.nVoxel, geometry.half, Settings())
+
+
+def test_densities_of_an_fdk_volume():
+    """A volume that is a plane along each axis is its own interpolation; what is faint counts as a little."""
+    geometry, frames, projections = sphere_scan()
+    slope = np.array([.3, .2, .1])
+    axes = [(2 * np.arange(n) + 1) / n - 1 for n in geometry.nVoxel]  # times `half`: the voxels' centres
+    volume = sum(s * h * x for s, h, x in zip(slope, geometry.half, np.meshgrid(*axes, indexing='ij')))
+
+    def cloud(**more):
+        return initialise(frames, projections, geometry.nVoxel, geometry.half, Settings(n_points=300, density='fdk'),
+                          np.random.default_rng(0), lambda points, density, spacing, views: projections[views] / 4, **more)
+    found = cloud(fdk=volume)
+    expected = np.maximum(found.points @ slope, FAINTEST * volume.max())
+    assert (expected > FAINTEST * volume.max()).any() and (found.points @ slope < 0).any()
+    np.testing.assert_allclose(found.density, 4 * expected, rtol=1e-6)
+    with pytest.raises(InputError, match='reconstruction'):
+        cloud()
 
 
 def test_empty_high_set_leaves_all_to_the_low_set():

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..lingo import initialise as lingo
 from ..lingo.initialise import InitialCloud
+from ..recon.fdk import fdk
 from ..scan import Scan
 from .device import DeviceState
 from .loop import bounded
@@ -28,7 +29,6 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     rng = np.random.default_rng(seed)
     g, unit = scan.geometry, density_unit(scan, settings)
     if settings.init == 'r2':
-        from ..recon.fdk import fdk
         volume = fdk(scan) / unit
         cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, rescale=settings.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)
@@ -41,6 +41,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
             resolution=settings.occupancy_voxels, V_S=settings.V_S, density=settings.init_density,
             misses=settings.misses, outside=settings.outside)
-        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render)
+        volume = fdk(scan) if settings.init_density == 'fdk' else None
+        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume)
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

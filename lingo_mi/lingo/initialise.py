@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry import Frames
-from .density import FACTORS, MODES, least_squares_factor, mean_pixel
+from .density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
 from .ipsd import neighbour_distance
 from .masks import masks
 from .scaling import occupancy, scale_factor, scaled_grid
@@ -43,9 +43,9 @@ class Settings:
     low_factor     T_l = low_factor T_h (section III-A: 0.1)
     resolution     V of the coarse grid for the occupancy (section III-B: 16)
     V_S            upper bound of the voxel scaling (section III-B: 20)
-    density        'lsq', 'paper' or 'raw', see `density` (the paper is silent on the factor)
-    lsq_views      evenly spaced views that the factor of 'lsq' is solved on (own choice: a few determine one
-                   number)
+    density        'lsq', 'paper', 'raw' or 'fdk', see `density` (the paper is silent on the factor)
+    lsq_views      evenly spaced views that the factor of 'lsq' is and 'fdk' is solved on (own choice: a few
+                   determine one number)
     misses         views that may miss a valid cell (paper: 0)
     outside        'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`
     """
@@ -79,7 +79,7 @@ def draw(cells, count: int, rng):
 
 
 def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = Settings(), rng=None,
-               render=None) -> InitialCloud:
+               render=None, fdk=None) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
     frames       n views in the normalised frame (`Geometry.normalised_frames`)
@@ -87,21 +87,24 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
     nVoxel       V_d, the volume's voxels (x, y, z); a single slice (fan beam) is fine
     half         half the volume's sides in the normalised frame, [3] (`Geometry.half`)
     rng          numpy Generator (default: seed 0)
-    render       for density 'lsq': render(points, density, spacing, views) -> projections [len(views), v, u]
+    render       for density 'lsq' and 'fdk': render(points, density, spacing, views) -> projections [len(views), v, u]
                  of that cloud of isotropic Gaussians, for the view indices `views`
+    fdk          for density 'fdk': the reconstruction [x, y, z]
 
     Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid; points of the low set
     sit at the cell centres, but for repeats (there may be fewer valid cells than points), which are jittered
     too. There is no jitter along an axis of one cell. An empty high set leaves all the points to the low set.
     A point's density is that of its cell.
 
-    Raises InputError where no cell is valid, or where 'lsq' has no `render`.
+    Raises InputError where no cell is valid, or where the density lacks what it needs.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(0) if rng is None else rng
     projections = np.asarray(projections, np.float32)
-    if settings.density == 'lsq' and render is None:
-        raise InputError("density 'lsq' needs a render function: give one, or choose 'paper' or 'raw'")
+    if settings.density in ('lsq', 'fdk') and render is None:
+        raise InputError(f"density '{settings.density}' needs a render function: give one, or choose 'paper' or 'raw'")
+    if settings.density == 'fdk' and fdk is None:
+        raise InputError("density 'fdk' needs a reconstruction: give one, or choose another density")
 
     found = masks(projections, settings.low_factor)
     P = occupancy(frames, found, half, nVoxel, settings.resolution, settings.misses, settings.outside)
@@ -125,10 +128,13 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
     jitter = rng.uniform(-0.5, 0.5, centres.shape) * (np.array(grid) > 1)
     points = np.where(jittered[:, None], centres + jitter * size, centres)
 
-    unique, inverse = np.unique(cells, return_inverse=True)
-    density = mean_pixel(frames, projections, voxel_centres(grid, half, unique))[inverse]
+    if settings.density == 'fdk':
+        density = sampled(fdk, points, half)
+    else:
+        unique, inverse = np.unique(cells, return_inverse=True)
+        density = mean_pixel(frames, projections, voxel_centres(grid, half, unique))[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
-    if settings.density == 'lsq':
+    if settings.density in ('lsq', 'fdk'):
         n = len(frames)
         views = np.unique(np.arange(min(n, settings.lsq_views)) * n // min(n, settings.lsq_views))
         factor = least_squares_factor(projections[views], render(points, density, spacing, views))
