@@ -3,7 +3,7 @@
 
     python scripts/recipes.py scenes/x3d_foot.xml scenes/chest.xml scenes/x3d_engine.xml
     python scripts/recipes.py scenes/x3d_foot.xml --methods fast r2 --views 25 --iterations 5000
-    python scripts/recipes.py scenes/x3d_foot.xml --methods lingo r2 lingo:init=r2 lingo:loss_scale=none
+    python scripts/recipes.py scenes/x3d_foot.xml --methods lingo r2 lingo:init=r2 lingo:loss_scale=none -D pixels=256 -D pixel_size=2
 
 A method may be followed by settings that differ (`METHOD:name=value,name=value`): so each part of a recipe can be
 exchanged alone.
@@ -43,6 +43,7 @@ def arguments():
     p.add_argument('--methods', nargs='+', type=method, default=list(METHODS), metavar='METHOD[:name=value,...]')
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)
+    p.add_argument('-D', dest='define', action='append', default=[], metavar='name=value', help='for every fit, see fit.py')
     p.add_argument('--out', type=Path, default=Path('out/recipes'), help='folder of the results')
     p.add_argument('--figure', type=Path, help='picture of the curves (default: recipes.png in --out)')
     return p.parse_args()
@@ -51,11 +52,12 @@ def arguments():
 def result(scene, method, args) -> dict:
     """The metrics of one fit, run now unless they are there."""
     name, _, changes = method.partition(':')
-    folder = args.out / '_'.join([scene.stem, str(args.views), name, *changes.split(',')]).rstrip('_')
+    changes = [*args.define, *filter(None, changes.split(','))]
+    folder = args.out / '_'.join([scene.stem, str(args.views), name, *changes])
     if not (folder / 'metrics.json').exists():
         command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', name,
                    '--views', str(args.views), '--out', str(folder)]
-        command += [word for change in changes.split(',') if change for word in ('-D', change)]
+        command += [word for change in changes for word in ('-D', change)]
         command += [] if name == 'fast' else ['--iterations', str(args.iterations)]
         command += ['--resume'] if (folder / 'checkpoint.npz').exists() else []
         print(' '.join(command), file=sys.stderr)
