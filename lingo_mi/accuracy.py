@@ -380,8 +380,8 @@ def by_tree(work: Workload, extent: float, epsilon: float) -> Method:
 def pixel(sizes: Sizes) -> list[dict]:
     """Rays a pixel, against the mean over the pixel."""
     work = Workload(sizes.few // 2, sizes.pixels, sizes.box, order=4)
-    return compare(work, [by_integrator('centre' if n == 1 else f'{n} × {n}', work, extent=7., pixel=n)
-                          for n in (1, 2, 4)], sizes)
+    return compare(work, [by_integrator(f'{n} × {n}' if isinstance(n, int) else n, work, extent=7., pixel=n)
+                          for n in ('centre', 2, 4, 'area')], sizes)
 
 
 def teams(work: Workload, sizes: Sizes) -> list[dict]:

@@ -126,6 +126,35 @@ def test_pixel_gradients(variant):
     assert all(fine[name] < coarse[name] / 8 for name in NAMES)
 
 
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_pixel_area(variant, mode):
+    """Better than 4 x 4 rays where the Gaussians are wider than a pixel, and nearly by the fourth power of its size."""
+    coarse, fine = (Workload(60, 64 * k, 80. * k ** 2, order=6, mode=mode) for k in (1, 2))
+    found, rays = errors(fine, extent=8., pixel='area'), errors(fine, extent=8., pixel=4)
+    assert all(found[name] < .8 * rays[name] for name in found)
+    assert found['image'] < 2e-4 and errors(coarse, extent=8., pixel='area')['image'] / found['image'] > 8
+
+
+def test_pixel_area_of_a_pixel_wide_ridge(variant):
+    """A Gaussian far longer than wide, along the rows: its profile across is the box's convolution, exactly known."""
+    from scipy.special import erf
+    sigma, step = .05, .1  # one pixel of the plane through the centre, two at the panel
+    scene = mi.load_dict(dict(
+        type='scene', scanner=dict(type='ct_scanner', mode='parallel', DSO=5, DSD=7, nDetector='33', dDetector=str(step),
+                                   nVoxel='8', dVoxel='.5', angles='0'),
+        cloud=dict(type='ellipsoids', data=mi.TensorXf(np.float32([[0, 0, 0, .4, 40, sigma, 0, 0, 0, 1]])),
+                   density=mi.TensorXf(np.float32([[1]])))))
+    image = mi.render(scene, integrator=mi.load_dict(dict(type='lingo_xray', extent=8, pixel='area'))).numpy()[..., 0]
+    z = (np.arange(33) - 16) * step
+    integral = .4 * np.sqrt(2 * np.pi)
+    mean = integral * sigma * np.sqrt(np.pi / 2) / step * (
+        erf((z + step / 2) / sigma / np.sqrt(2)) - erf((z - step / 2) / sigma / np.sqrt(2)))
+    assert abs(image[:, 16] - mean).max() < .05 * mean.max()      # of half a pixel's width, where it is at its worst
+    assert abs(image[:, 16].sum() / mean.sum() - 1) < 4e-3        # aliasing of the wider Gaussian, 2 exp(-2 pi^2 / 3)
+    centre = mi.render(scene, integrator=mi.load_dict(dict(type='lingo_xray', extent=8))).numpy()[..., 0]
+    assert abs(centre[:, 16] - mean).max() > .1 * mean.max() and abs(centre[:, 16].sum() / mean.sum() - 1) > .01
+
+
 def test_pixel_of_other_objects(variant):
     """A grid with 2 x 2 rays a pixel is the mean of four pixels half the size."""
     cube = dict(type='cube', bsdf=dict(type='null'), interior=dict(type='homogeneous', sigma_t=1., albedo=0.),
@@ -138,6 +167,9 @@ def test_pixel_of_other_objects(variant):
             scanner=dict(scanner, nDetector=f'{count}', dDetector=f'{side}')))))[..., 0]
     expected = image(40, .05).reshape(20, 2, 20, 2).mean((1, 3))
     np.testing.assert_allclose(image(20, .1, pixel=2), expected, rtol=1e-5, atol=1e-6)
+    with pytest.raises(RuntimeError) as error:
+        image(20, .1, pixel='area')
+    assert 'ellipsoids alone' in str(error.value.__cause__)
 
 
 def test_presets(cone):

@@ -14,12 +14,13 @@ from .splat import splat
 
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
+PIXEL_VARIANCE = 1 / 12  # of a square of side 1, along either side
 MANY = 10_000   # Gaussians in a cloud from which on their overlap is looked at
 DEEP = 5_000    # Gaussians in a pixel whose sum float32 still holds to 1e-5
 
 
 def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True,
-                   affine: bool = False):
+                   affine: bool = False, area: bool = False):
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
@@ -29,11 +30,13 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     extent          cut-off in standard deviations
     primal          False where only derivatives are wanted: the splatted part of the image is then left at zero
     affine          the model of Gaussian splatting (EWA): |d|^2 frozen at each Gaussian's centre
+    area            the mean over each pixel's area instead of the ray through its centre: the footprint convolved with a
+                    Gaussian of the pixel's variance
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
     no extent or no rotation leaves no finite pixel. AccuracyWarning where too many overlap for sums in float32.
     """
-    footprints = project(centre, scale, rotation, density, view, extent)
+    footprints = project(centre, scale, rotation, density, view, extent, PIXEL_VARIANCE if area else 0.)
     if affine:
         footprints = _frozen(footprints)
     image = splat(footprints, view.height, view.width, extent, primal) * view.lengths()

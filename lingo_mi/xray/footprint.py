@@ -70,13 +70,14 @@ def rotate_inverse(q, v):
     return v + q.w * c + dr.cross(u, c)
 
 
-def project(centre, scale, rotation, density, view, extent: float) -> Footprints:
+def project(centre, scale, rotation, density, view, extent: float, widen: float = 0.) -> Footprints:
     """Footprints of N Gaussians in a view.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
     rotation        Vector4f [N], quaternion (x, y, z, w), normalised here
     density         Float [N], value at the centre
     extent          cut-off in standard deviations
+    widen           variance in pixels^2 of a round Gaussian that footprints are convolved with, |d|^2 taken as constant
     """
     Vector3d = mi.Vector3d
     Float64 = dr.value_t(Vector3d)
@@ -142,6 +143,16 @@ def project(centre, scale, rotation, density, view, extent: float) -> Footprints
     mx = dr.norm(na)
     shear = dr.dot(na, nb) / dr.square(mx)
     my = dr.norm(dr.cross(na, nb)) / mx
+    if widen:
+        # The inverse of num's matrix is the footprint's covariance, which grows by `widen` on its diagonal.
+        det, xx, yy = dr.squared_norm(dr.cross(na, nb)), dr.squared_norm(na), dr.squared_norm(nb)
+        shrink = dr.rsqrt(1 + widen * (xx + yy + widen * det))
+        wide_x = xx + widen * det
+        amplitude = amplitude * shrink
+        mx, shear, my = dr.sqrt(wide_x) * shrink, dr.dot(na, nb) / wide_x, dr.sqrt(det / wide_x)
+        with dr.suspend_grad():
+            grow_x, grow_y = dr.sqrt(1 + widen * det / yy), dr.sqrt(wide_x / xx)
+            low_x, high_x, low_y, high_y = low_x * grow_x, high_x * grow_x, low_y * grow_y, high_y * grow_y
     # The denominator in the sheared coordinate, dx = t - shear dy.
     e22 = e22 + shear * (shear * e11 - 2 * e12)
     e12 = e12 - shear * e11

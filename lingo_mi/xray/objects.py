@@ -85,9 +85,9 @@ class Ellipsoids:
                     f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} '
                     'apart: its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
 
-    def line_integrals(self, view, extent, primal, affine=False):
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal,
-                                    affine)
+                                    affine, area)
 
 
 class GridInCube:
@@ -110,7 +110,8 @@ class GridInCube:
         self.data, self.size = tensor.array, tensor.shape[2::-1]
         self.low, self.high = box.min, box.max
 
-    def line_integrals(self, view, extent, primal, affine=False):
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
+        _no_area(area)
         nx, ny, nz = self.size
         # The projector wants z fastest, Mitsuba stores x fastest.
         i = dr.arange(mi.UInt32, nx * ny * nz)
@@ -118,6 +119,12 @@ class GridInCube:
         data = dr.gather(mi.Float, self.data, (z * ny + rest % ny) * nx + rest // ny, mode=dr.ReduceMode.Permute)
         origin, direction, t_min = _rays(view, (self.low + self.high) / 2)
         return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
+
+
+def _no_area(area):
+    if area:
+        raise InputError("lingo_xray: pixel = 'area' is for scenes of ellipsoids alone; with grids or meshes give n, for "
+                         'n x n rays')
 
 
 def _upright(cube, volume) -> bool:
@@ -153,7 +160,8 @@ class HomogeneousMesh:
             _MESHES[key] = (shape, arrays, from_mitsuba(shape))
         self.paths = _MESHES[key][-1]
 
-    def line_integrals(self, view, extent, primal, affine=False):
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
+        _no_area(area)
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
 
 

@@ -22,11 +22,13 @@ class Quality:
     extent      cut-off of Gaussians in standard deviations
     footprint   'exact', or 'affine': the ray's whitened length |d|^2 frozen at a Gaussian's centre (EWA)
     pixel       n: the mean of n x n rays a pixel, those through the centres of its n x n parts
+    area        the mean over each pixel's area, for Gaussians: see `cloud.line_integrals`
     """
 
     extent: float = PRESETS['default']
     footprint: str = 'exact'
     pixel: int = 1
+    area: bool = False
 
     @staticmethod
     def of(accuracy='default', extent=None, footprint='exact', pixel='centre') -> Quality:
@@ -38,11 +40,11 @@ class Quality:
             raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {extent:g}')
         if footprint not in FOOTPRINTS:
             raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')
-        return Quality(extent, footprint, _subpixels(pixel))
+        return Quality(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
 
     def line_integrals(self, thing, view, primal: bool = True):
         """Line integrals of an object of `objects.find_objects` along all rays of a view, Float [height * width]."""
-        return thing.line_integrals(view, self.extent, primal, self.footprint == 'affine')
+        return thing.line_integrals(view, self.extent, primal, self.footprint == 'affine', self.area)
 
     def subdivided(self, view):
         """The view with every pixel divided into its n x n parts."""
@@ -70,6 +72,6 @@ def _subpixels(pixel) -> int:
     except (TypeError, ValueError):
         n = math.nan
     if not (math.isfinite(n) and n == round(n) and 1 <= n <= MOST_SUBPIXELS):
-        raise InputError(f"lingo_xray: pixel is 'centre' or n for n x n rays, from 1 to {MOST_SUBPIXELS}, "
+        raise InputError(f"lingo_xray: pixel is 'centre', 'area' or n for n x n rays, from 1 to {MOST_SUBPIXELS}, "
                          f'not {pixel!r}')
     return int(n)
