@@ -47,10 +47,13 @@ class Scan:
         by = [factor if n >= 2 * factor else 1 for n in g.nDetector]
         rows, columns = (n // f for n, f in zip(g.nDetector, by))
         p = p[:, :rows * by[0], :columns * by[1]].reshape(len(self), rows, by[0], columns, by[1]).mean((2, 4))
+        step = tuple(d * f for d, f in zip(g.dDetector, by))
+        if g.poses is not None:
+            poses = replace(g.poses, u=g.poses.u * by[1], v=g.poses.v * by[0])
+            return Scan(replace(g, nDetector=(rows, columns), dDetector=step, poses=poses), p)
         # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
         lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
         offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
-        step = tuple(d * f for d, f in zip(g.dDetector, by))
         return Scan(replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset), p)
 
     @property
