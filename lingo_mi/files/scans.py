@@ -15,12 +15,21 @@ degrees:
                            excluded
     mode, offOrigin, offDetector   optional: cone or parallel; (x, y, z); TIGRE's (v, u), positive v towards
                                    +z
+    rotDetector, COR, tilt, pitch, z   optional: a panel turned by (roll, pitch, yaw), an axis off centre, a source
+                           lifted out of the plane of rotation, a helix by mm a turn (at z = 0 for the angle 0) or by
+                           the height of every view (`lingo_mi.frames.scanner_frames` defines them; angles in degrees)
+    poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
+                           name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
+                           the .npy, which run up in RTK's images
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
+
+DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one value for every
+view; an angle may be three, TIGRE's Euler angles.
 
 Any other name is refused, so that a misspelt or unsupported one is not lost; TIGRE's accuracy and filter,
 which do not describe the scanner, are passed over.
 
-A folder of EXR images: `geometry.yml` as above (with `test_angles` if there are held-out views),
+A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
 
 The Helsinki Tomography Challenge 2022 as .npz: `sinogram_<name>` [angles, pixels] of a fan beam, which is a
@@ -36,16 +45,17 @@ import yaml
 from ..errors import InputError
 from ..geometry import circular
 from ..scan import Dataset, Scan
-from . import arrays, naf, r2
+from . import arrays, astra, naf, r2
 from .images import read_exr, write_exr
 from .paths import new_folder, one_line, reading, replacing
-from .tigre import check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from .poses import read_poses
+from .tigre import MOTION, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry, to_posed
 from .volumes import first_voxel, read_volume, write_volume
 
 _KEYS = {'DSO', 'DSD', 'nDetector', 'dDetector', 'sDetector', 'nVoxel', 'dVoxel', 'sVoxel', 'mode',
          'offOrigin',
          'offDetector', 'angles', 'totalAngle', 'startAngle', 'input', 'I0', 'test_angles', 'accuracy',
-         'filter'}
+         'filter', 'poses', 'test_poses', *MOTION}
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
@@ -74,8 +84,26 @@ def _number(values, key, default, where):
     return float(value)
 
 
+def _geometry(values, n, where, test=False):
+    """The geometry of the n views to fit, or of those held out."""
+    prefix = 'test_' if test else ''
+    poses = values.get(prefix + 'poses')
+    if poses is None:
+        return to_geometry(values, _angles(values, prefix + 'angles', n, where), where)
+
+    def frames(n_detector, step, parallel, origin):
+        if isinstance(poses, str):
+            found = read_poses(Path(where).parent / poses, n_detector, step, parallel, origin)
+        else:
+            found = astra.from_vectors(poses, n_detector, parallel)
+        if len(found) != n:
+            raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
+        return found
+    return to_posed(values, frames, where)
+
+
 def _angles(values, key, n, where):
-    """n angles in radians."""
+    """n angles in radians, or [n, 3] Euler angles."""
     if values.get(key) is None:
         return circular(n, _number(values, 'totalAngle', 360., where),
                         _number(values, 'startAngle', 0., where))
@@ -83,9 +111,9 @@ def _angles(values, key, n, where):
         angles = np.radians(np.asarray(values[key], float))
     except (TypeError, ValueError):
         raise InputError(f'{where}: {key} must be a list of numbers, in degrees') from None
-    if angles.shape != (n,):
-        raise InputError(f'{where}: {key} lists {angles.size} angles, but there are {n} projections; these '
-                         'must agree')
+    if angles.shape not in ((n,), (n, 3)):
+        raise InputError(f'{where}: {key} lists {len(angles) if angles.ndim else 1} angles, but there are {n} '
+                         'projections; these must agree')
     return angles
 
 
@@ -107,8 +135,18 @@ def _line_integrals(projections, values, where, projections_path):
     return np.log(i0 / projections.astype(float))
 
 
-def _dump_yaml(path, geometry, **more):
-    values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist(), **more}
+def _dump_yaml(path, geometry, test=None, **more):
+    if any(g is not None and g.poses is not None for g in (geometry, test)):
+        values = {'mode': geometry.mode}
+        values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
+        values['poses'] = astra.to_vectors(geometry.frames(), geometry.nDetector).tolist()
+        if test is not None:
+            values['test_poses'] = astra.to_vectors(test.frames(), test.nDetector).tolist()
+    else:
+        values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
+        if test is not None:
+            values['test_angles'] = np.degrees(test.angles).tolist()
+    values |= more
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
 
@@ -121,8 +159,9 @@ def _read_npy(path, geometry):
                              'the file')
     projections = arrays.load(path, 3)
     values = _load_yaml(geometry)
-    angles = _angles(values, 'angles', len(projections), geometry)
-    g = to_geometry(values, angles, geometry)
+    g = _geometry(values, len(projections), geometry)
+    if str(values.get('poses')).lower().endswith('.xml'):
+        projections = projections[:, ::-1]
     return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path))
 
 
@@ -158,14 +197,15 @@ def _read_exr_folder(folder):
     where = folder / 'geometry.yml'
     values = _load_yaml(where)
     scans = {}
-    for split, key in (('train', 'angles'), ('test', 'test_angles')):
-        if split == 'test' and not (folder / split).is_dir() and values.get(key) is None:
+    for split in ('train', 'test'):
+        given = values.get('test_angles') is not None or values.get('test_poses') is not None
+        if split == 'test' and not (folder / split).is_dir() and not given:
             continue
-        if split == 'test' and values.get(key) is None:
+        if split == 'test' and not given:
             raise InputError(f'{where}: test_angles is missing, but there is a folder of test views; add it, '
                              'in degrees')
         projections = _read_stack(folder / split)
-        geometry = to_geometry(values, _angles(values, key, len(projections), where), where)
+        geometry = _geometry(values, len(projections), where, split == 'test')
         scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
     volume = folder / 'volume.nii.gz'
     return make_dataset(scans['train'], scans.get('test'),
@@ -173,10 +213,7 @@ def _read_exr_folder(folder):
 
 
 def _write_exr_folder(path, dataset):
-    check_one_scanner(dataset, path)
-    more = {'input': 'line_integral'}
-    if dataset.test is not None:
-        more['test_angles'] = np.degrees(dataset.test.geometry.angles).tolist()
+    check_one_scanner(dataset, path, poses=True)
     with new_folder(path) as folder:
         for split, scan in (('train', dataset.train), ('test', dataset.test)):
             if scan is not None:
@@ -186,7 +223,7 @@ def _write_exr_folder(path, dataset):
         geometry = dataset.train.geometry
         if dataset.volume is not None:
             write_volume(folder / 'volume.nii.gz', dataset.volume, geometry.dVoxel, first_voxel(geometry))
-        _dump_yaml(folder / 'geometry.yml', geometry, **more)
+        _dump_yaml(folder / 'geometry.yml', geometry, dataset.test and dataset.test.geometry, input='line_integral')
 
 
 # ---- Helsinki Tomography Challenge 2022 --------------------------------------------------------------------
