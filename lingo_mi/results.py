@@ -34,11 +34,17 @@ def quick_measure(dataset: Dataset, most: int = 4):
     def measure(stepper, state):
         out = {}
         if test is not None and len(test):
-            out['psnr_2d'] = _number(metrics.psnr_2d(stepper.render(state, test.geometry), test.projections))
+            rendered = _comparable(stepper.render(state, test.geometry), test)
+            out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(stepper.volume(state), dataset.volume))
         return out
     return measure
+
+
+def _comparable(rendered, test):
+    """Rendered views with the pixels that were not measured at zero, as in the scan."""
+    return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
 
 
 def world_cloud(fitted: Fitted, geometry):
@@ -91,6 +97,7 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
     born = fitted.state.values['centre'][fitted.state.born]
     test = dataset.test
     truth = test.projections if rendered is not None else None
+    rendered = None if rendered is None else _comparable(rendered, test)
 
     def of(function, result, reference):
         return None if result is None or reference is None else _number(function(result, reference))

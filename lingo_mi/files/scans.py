@@ -21,6 +21,7 @@ degrees:
     poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
+    valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
 
 DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one value for every
@@ -55,7 +56,7 @@ from .volumes import first_voxel, read_volume, write_volume
 _KEYS = {'DSO', 'DSD', 'nDetector', 'dDetector', 'sDetector', 'nVoxel', 'dVoxel', 'sVoxel', 'mode',
          'offOrigin',
          'offDetector', 'angles', 'totalAngle', 'startAngle', 'input', 'I0', 'test_angles', 'accuracy',
-         'filter', 'poses', 'test_poses', *MOTION}
+         'filter', 'poses', 'test_poses', 'valid', *MOTION}
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
@@ -117,6 +118,21 @@ def _angles(values, key, n, where):
     return angles
 
 
+def _valid(values, shape, where):
+    """The mask of valid pixels that a geometry file names; None where it names none."""
+    name = values.get('valid')
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise InputError(f'{where}: valid must be the name of a .npy file, not {name!r}')
+    path = Path(where).parent / name
+    mask = arrays.load(path, None)
+    if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
+        raise InputError(f'{path}: must be bool of the shape {shape} or {shape[1:]}, not {mask.dtype} of the shape '
+                         f'{mask.shape}')
+    return np.broadcast_to(mask, shape)
+
+
 def _line_integrals(projections, values, where, projections_path):
     kind = values.get('input', 'line_integral')
     if kind not in ('line_integral', 'intensity'):
@@ -157,12 +173,15 @@ def _read_npy(path, geometry):
         if geometry is None:
             raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name '
                              'the file')
-    projections = arrays.load(path, 3)
     values = _load_yaml(geometry)
+    projections = arrays.load(path, 3, finite=values.get('valid') is None)
+    valid = _valid(values, projections.shape, geometry)
+    if valid is not None:
+        projections = np.where(valid, projections, 1)  # which has a logarithm
     g = _geometry(values, len(projections), geometry)
     if str(values.get('poses')).lower().endswith('.xml'):
-        projections = projections[:, ::-1]
-    return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path))
+        projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
+    return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path, valid))
 
 
 def _write_npy(path, dataset):
@@ -173,9 +192,13 @@ def _write_npy(path, dataset):
     if dataset.test is not None or dataset.volume is not None:
         raise InputError(f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
                          'instead, or drop the test views and the volume')
+    more = {'input': 'line_integral'}
+    if dataset.train.valid is not None:
+        more['valid'] = path.stem + '.valid.npy'
+        arrays.save(path.with_name(more['valid']), dataset.train.valid)
     # Geometry first: without its projections it is never taken for a scan.
     with replacing(path.with_suffix('.yml')) as temporary:
-        _dump_yaml(temporary, dataset.train.geometry, input='line_integral')
+        _dump_yaml(temporary, dataset.train.geometry, **more)
     arrays.save(path, dataset.train.projections)
 
 
@@ -196,6 +219,8 @@ def _read_stack(folder):
 def _read_exr_folder(folder):
     where = folder / 'geometry.yml'
     values = _load_yaml(where)
+    if values.get('valid') is not None:
+        raise InputError(f'{where}: valid goes with .npy projections only')
     scans = {}
     for split in ('train', 'test'):
         given = values.get('test_angles') is not None or values.get('test_poses') is not None
@@ -298,11 +323,15 @@ def write_scan(path, dataset: Dataset | Scan, kind: str) -> None:
     """Writes a scan that `read_scan` reads back, whole or not at all.
 
     kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`
-           and its .yml, for training views alone
+           and its .yml, for training views alone, and the mask of valid pixels if there is one
 
     Raises InputError if the kind is unknown, a folder exists already, the file cannot be written, or the
     format cannot hold the data.
     """
     if kind not in _WRITERS:
         raise InputError(f'{kind!r} is no kind of scan file; choose one of {", ".join(_WRITERS)}')
-    _WRITERS[kind](path, Dataset(dataset) if isinstance(dataset, Scan) else dataset)
+    dataset = Dataset(dataset) if isinstance(dataset, Scan) else dataset
+    masked = any(scan is not None and scan.valid is not None for scan in (dataset.train, dataset.test))
+    if masked and kind != 'npy':
+        raise InputError(f"{path}: this format holds no mask of valid pixels; write 'npy'")
+    _WRITERS[kind](path, dataset)

@@ -184,10 +184,10 @@ def angle_range(angles: np.ndarray) -> tuple[float, float]:
     return float(low), float((high - low) * n / (n - 1)) if n > 1 else 360.
 
 
-def make_scan(geometry: Geometry, projections, where) -> Scan:
+def make_scan(geometry: Geometry, projections, where, valid=None) -> Scan:
     """A Scan whose InputError names the file."""
     try:
-        return Scan(geometry, projections)
+        return Scan(geometry, projections, valid)
     except InputError as error:
         raise InputError(f'{where}: {error}') from None
 

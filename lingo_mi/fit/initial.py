@@ -41,6 +41,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
             resolution=settings.occupancy_voxels, V_S=settings.V_S, density=settings.init_density,
             misses=settings.misses, outside=settings.outside)
-        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render)
+        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render,
+                                 scan.valid)
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

@@ -113,6 +113,7 @@ class Settings:
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
+        require(self.outside in ('invalid', 'ignore', 'auto'), f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
@@ -162,7 +163,7 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # Found by measurement on the foot and chest phantoms. Against LINGO: rates up to 40 times higher that fall over the
 # run, moments that forget faster, more weight on SSIM, which brings fine detail forward, and earlier densification.
 FAST = Settings(
-    init='lingo', normalise=True, iterations=1500, decay_steps=0, lambda_ssim=1.5, lambda_tv=.1,
+    init='lingo', outside='auto', normalise=True, iterations=1500, decay_steps=0, lambda_ssim=1.5, lambda_tv=.1,
     rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
     beta1=.8, beta2=.95, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     split_keeps_mass=True)

@@ -21,16 +21,29 @@ from .settings import Settings
 
 
 class Target:
-    """A measured view on the device: its rays and pixels (normalised line integrals over the fit's unit of density)."""
+    """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), and which
+    of them are valid (None: all)."""
 
     def __init__(self, scan: Scan, index: int, unit: float):
         height, width = scan.geometry.nDetector
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
-        self.view = View.of(scan.geometry.normalised_frames(), index, height, width, panel=False)
+        self.frames = scan.geometry.normalised_frames()[[index]]
+        self.view = View.of(self.frames, 0, height, width, panel=False)
         self.pixels = mi.Float(scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit))
         dr.eval(self.pixels)
 
+        self.valid = None
+        if scan.valid is not None and not scan.valid[index].all():
+            self.valid = mi.Bool(scan.valid[index].ravel())
+            dr.make_opaque(self.valid)
+
+    def seen(self, image):
+        """An image as this view compares it: pixels that are not valid are zero, in it as in the measured one.
+
+        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
+        """
+        return image if self.valid is None else dr.select(self.valid, image, 0)
 
 class Stepper:
     """Steps of a fit on one scan with one set of settings."""
@@ -98,7 +111,7 @@ class Stepper:
         footprints = project(*gaussians, view, s.extent)
         leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
         image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
-        loss = losses.combined(image, target.pixels, view.height, view.width, s.lambda_ssim)
+        loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
         factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
         dr.backward(loss * weight * (1 / batch))
