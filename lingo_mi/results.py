@@ -65,7 +65,7 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
     write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
     cloud = world_cloud(fitted, geometry)
     write_ply(folder / 'gaussians.ply', *cloud)
-    write_scene(folder / 'result.xml', geometry, fitted.settings.extent)
+    write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent)
     rendered = None
     if test is not None and len(test):
         rendered = fitted.stepper.render(state, test.geometry)
@@ -77,7 +77,7 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
             write_exr(views / f'{i:04d}.exr', image)
     measured = measure(fitted, dataset, volume, rendered) | dict(
         method=method, seed=seed, views=len(dataset.train), variant=mi.variant(), settings=asdict(fitted.settings),
-        initial=fitted.info, command=command,
+        initial=fitted.info, command=command, **_corrections(fitted),
         angles=_degrees(geometry), test_angles=_degrees(test.geometry) if rendered is not None else [],
         versions=versions())
     report = ReportData(
@@ -110,6 +110,13 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
         gaussians=len(fitted.state), iterations=fitted.settings.iterations,
         seconds_init=fitted.info['seconds'], seconds_fit=fitted.seconds,
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations, history=fitted.history)
+
+
+def _corrections(fitted) -> dict:
+    """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
+    poses = fitted.stepper.poses
+    return {} if poses is None else dict(pose_turns_degrees=np.degrees(poses.turn).tolist(),
+                                         pose_shifts_mm=(poses.shift / fitted.stepper.geometry.scale).tolist())
 
 
 def write_scene(path: Path, geometry, extent: float):

@@ -41,6 +41,8 @@ class Settings:
 
     Adam
     rate_centre, rate_density, rate_scale, rate_rotation
+    rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;
+                       0, 0 leaves the poses alone (see `lingo_mi.fit.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
     epsilon            added to the root of the second moment (R2: 1e-15)
 
@@ -82,6 +84,7 @@ class Settings:
     rate_density: tuple[float, float] = (1e-2, 1e-3)
     rate_scale: tuple[float, float] = (5e-3, 5e-4)
     rate_rotation: tuple[float, float] = (1e-3, 1e-4)
+    rate_pose: tuple[float, float] = (0., 0.)
     beta1: float = .9
     beta2: float = .999
     epsilon: float = 1e-15
@@ -110,19 +113,21 @@ class Settings:
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
         require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
+        require(self.outside in ('invalid', 'ignore', 'auto'), f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
-        require(self.outside in ('invalid', 'ignore', 'auto'), f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
         for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'):
             rate = getattr(self, name)
             require(len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}')
+        require(len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
+                f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}')
 
     def rate(self, name: str, iteration: int) -> float:
-        """Adam's step size for 'centre', 'density', 'scale' or 'rotation' at an iteration, counted from 0."""
+        """Adam's step size for 'centre', 'density', 'scale', 'rotation' or 'pose' at an iteration, counted from 0."""
         first, last = getattr(self, f'rate_{name}')
         share = min(iteration / max(self.decay_steps or self.iterations, 1), 1.)
         return first ** (1 - share) * last ** share
