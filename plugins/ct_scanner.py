@@ -50,8 +50,8 @@ class CTScanner(mi.Sensor):
        - Instead: every view's angle in degrees.
      * - pitch
        - |float|
-       - A helix: mm that source and panel climb along z in a turn, past z = 0 at the angle 0. Two turns around the middle are
-         startAngle -360 and totalAngle 720. (Default: 0)
+       - A helix: mm that source and panel climb along z in a turn, past z = 0 at the angle 0. Two turns around the
+         middle are startAngle -360 and totalAngle 720. (Default: 0)
      * - tilt
        - |float|
        - Laminography: degrees by which the source is lifted out of the plane of rotation, the panel sunk. (Default: 0)
@@ -161,8 +161,8 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
     g = geometry
     if g.poses is not None:
         vectors = astra.to_vectors(g.poses, g.nDetector)
-        return dict(type='ct_scanner', mode=g.mode, nDetector=join(g.nDetector), nVoxel=join(g.nVoxel), dVoxel=join(g.dVoxel),
-                    offOrigin=join(g.offOrigin), poses=join(vectors.ravel().tolist()), view=index)
+        return dict(type='ct_scanner', mode=g.mode, nDetector=join(g.nDetector), nVoxel=join(g.nVoxel),
+                    dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), poses=join(vectors.ravel().tolist()), view=index)
     return dict(type='ct_scanner', mode=g.mode, DSO=g.DSO, DSD=g.DSD, nDetector=join(g.nDetector),
                 dDetector=join(g.dDetector), offDetector=join(g.offDetector), nVoxel=join(g.nVoxel),
                 dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()),

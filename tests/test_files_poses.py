@@ -157,7 +157,8 @@ def test_matrices_in_the_file_for_rtk(tmp_path):
     f = rtk_geometry.read(rtk_file(tmp_path), SHAPE, STEP)
     rtk_geometry.write(tmp_path / 'again.xml', f, SHAPE)
     text = (tmp_path / 'again.xml').read_text()
-    found = [np.reshape([float(x) for x in part.split('</Matrix>')[0].split()], (3, 4)) for part in text.split('<Matrix>')[1:]]
+    parts = [part.split('</Matrix>')[0].split() for part in text.split('<Matrix>')[1:]]
+    found = [np.reshape([float(x) for x in part], (3, 4)) for part in parts]
     np.testing.assert_allclose(found, RTK_MATRICES, rtol=1e-11, atol=1e-9)
     circle = Geometry(300., 450., SHAPE, STEP, **GRID, angles=[.3, 1.], offDetector=(3., -4.))
     rtk_geometry.write(tmp_path / 'circle.xml', circle.frames(), SHAPE)
@@ -238,7 +239,8 @@ def test_moving_scanners_in_scenes(tmp_path):
     plain = dict(DSO=900, DSD=1400, dDetector='1.5, 2', angles='-80, 10, 400')
     angles = np.radians([-80, 10, 400])
     sensor = scanner(**plain, pitch=30., tilt=5., rotDetector='1, 2, 3', test_views=4)
-    like = dict(DSO=900., DSD=1400., nDetector=SHAPE, dDetector=STEP, **GRID, tilt=np.radians(5), rotDetector=np.radians([1, 2, 3]))
+    like = dict(DSO=900., DSD=1400., nDetector=SHAPE, dDetector=STEP, **GRID, tilt=np.radians(5),
+                rotDetector=np.radians([1, 2, 3]))
     same_poses(sensor.geometry.frames(), Geometry.per_view(**like, angles=angles, height=helix(angles, 30.)).frames())
     held_out = np.sort(np.random.default_rng(0).uniform(0, 2 * np.pi, 4))
     same_poses(sensor.test_geometry.frames(),
@@ -308,7 +310,8 @@ def test_what_rtk_cannot_say(tmp_path):
     from dataclasses import replace
     f, path = scan_of().frames(), tmp_path / 'g.xml'
     tilted = scan_of('parallel', rotDetector=(.1, 0., 0.)).frames()
-    for bad, match in ((replace(f, u=f.u + .1 * f.v), 'right angles'), (replace(f, u=f.u * [[1], [1], [1.1]]), 'one pixel size'),
+    for bad, match in ((replace(f, u=f.u + .1 * f.v), 'right angles'),
+                       (replace(f, u=f.u * [[1], [1], [1.1]]), 'one pixel size'),
                        (replace(f, u=-f.u), 'mirrored'), (tilted, 'askew')):
         with pytest.raises(InputError, match=match):
             rtk_geometry.write(path, bad, SHAPE)
@@ -319,7 +322,8 @@ def test_what_rtk_cannot_say(tmp_path):
     (dict(poses=[[1, 2, 3]]), '12 numbers'), (dict(poses='gone.txt'), 'no such file'),
     (dict(poses=[[0., 0, 900, 0, 0, 0, 1, 0, 0, 0, 1, 0]]), 'are 1 views, but there are 3'),
     (dict(poses='gone.txt', DSO=900), 'DSO and poses both'), (dict(DSO=[900, 905], DSD=1400), 'DSO must be 1 number'),
-    (dict(DSO=900, DSD=1400, pitch=3, z=[1, 2, 3]), 'pitch and z both'), (dict(DSO=900, DSD=1400, tilt='steep'), 'tilt must be'),
+    (dict(DSO=900, DSD=1400, pitch=3, z=[1, 2, 3]), 'pitch and z both'),
+    (dict(DSO=900, DSD=1400, tilt='steep'), 'tilt must be'),
     (dict(DSO=900, DSD=1400, rotDetector=[[1, 2, 3]] * 2), 'rotDetector must be 3 numbers'),
     (dict(DSO=900, DSD=[1400, 800, 1400], tilt=1), 'DSD >= DSO')])
 def test_bad_poses_in_yaml(tmp_path, changes, match):

@@ -75,7 +75,7 @@ def test_motions_of_all_views_are_the_objects():
 
 
 def recovered(views, iterations, points):
-    """A fit with the given poses and one that corrects them: errors of the poses before and after, of the views, the fits."""
+    """A fit with the given poses and one that corrects them: errors of the poses before and after, of the views."""
     g = geometry(views, angles=circular(views, 360, start=10))
     true, turn, shift = misaligned(g)
     scan = Scan(g, tiny_scan(true).projections)

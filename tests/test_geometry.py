@@ -1,4 +1,4 @@
-"""Poses of every kind of scan: equivalences between geometries, axes by hand, bad input. Pure NumPy but for one projector."""
+"""Poses of every kind of scan: equivalences between geometries, axes by hand, bad input."""
 import numpy as np
 import pytest
 
@@ -79,7 +79,8 @@ def test_poses_of_a_circle_are_that_circle(mode):
 
 @pytest.mark.parametrize('change', [
     dict(height=np.arange(5.)), dict(tilt=.01), dict(rotDetector=(0, 0, .01)), dict(DSO=300 + .1 * np.arange(5)),
-    dict(offDetector=.1 * np.arange(10).reshape(5, 2)), dict(COR=np.arange(5.)), dict(offOrigin=np.arange(15.).reshape(5, 3))])
+    dict(offDetector=.1 * np.arange(10).reshape(5, 2)), dict(COR=np.arange(5.)),
+    dict(offOrigin=np.arange(15.).reshape(5, 3))])
 def test_other_poses_are_kept(change):
     g = moving(**change)
     assert g.poses is not None and len(g) == 5 and g.mode == 'cone'

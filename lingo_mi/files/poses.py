@@ -35,7 +35,8 @@ def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=
     elif suffix in ('.txt', '.csv'):
         values = _table(path)
     else:
-        raise InputError(f'{path}: is no known file of poses; give RTK\'s .xml, or a .npy, .txt or .csv of 12 numbers a view')
+        raise InputError(f'{path}: is no known file of poses; give RTK\'s .xml, or a .npy, .txt or .csv '
+                         'of 12 numbers a view')
     try:
         if values.ndim == 3 and values.shape[1:] == (3, 4):
             return matrices.from_matrices(values, nDetector, _needed(dDetector, path), parallel, towards)

@@ -24,8 +24,8 @@ degrees:
     valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
 
-DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one value for every
-view; an angle may be three, TIGRE's Euler angles.
+DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one
+value for every view; an angle may be three, TIGRE's Euler angles.
 
 Any other name is refused, so that a misspelt or unsupported one is not lost; TIGRE's accuracy and filter,
 which do not describe the scanner, are passed over.

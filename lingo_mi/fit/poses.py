@@ -1,8 +1,8 @@
 """Poses of the views, corrected together with the cloud: a rigid motion of source and panel for every view.
 
-A view's correction turns source and panel about the volume's centre and shifts them. The six numbers are found by Adam (Kingma
-and Ba 2015) in the tangent space: a step d makes the rotation exp([d1 d2 d3]) R and the shift t + (d4 d5 d6), so that the
-derivatives are always those at no rotation,
+A view's correction turns source and panel about the volume's centre and shifts them. The six numbers are found by Adam
+(Kingma and Ba 2015) in the tangent space: a step d turns the view as it stands by exp([d1 d2 d3]) and then shifts it by
+(d4 d5 d6), so that the derivatives are always those at no rotation,
 
     d loss / d turn  = sum over source, corner, u, v of  x cross (d loss / d x)
     d loss / d shift = d loss / d source + d loss / d corner

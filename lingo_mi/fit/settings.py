@@ -113,7 +113,8 @@ class Settings:
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
         require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
-        require(self.outside in ('invalid', 'ignore', 'auto'), f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
+        require(self.outside in ('invalid', 'ignore', 'auto'),
+                f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")

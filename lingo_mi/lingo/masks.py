@@ -42,8 +42,8 @@ def masks(projections, low_factor: float = 0.1, valid=None) -> Masks:
 
 
 def truncated(found: Masks, share: float = .05) -> np.ndarray:
-    """Views, bool [n], in which the object reaches the edge of the panel: the low mask holds more than `share` of the outermost
-    pixels of a side.
+    """Views, bool [n], in which the object reaches the edge of the panel: the low mask holds more than `share` of the
+    outermost pixels of a side.
 
     Across a side of one pixel (a fan beam's rows) nothing is said.
     """
