@@ -11,6 +11,10 @@ For the angle a (radians):
 Projections are stored [view, v, u], pixel centres at (i + 1/2) pixel steps. `offDetector` is TIGRE's (v, u): a positive
 first entry lifts the panel towards +z, against the row order. Volumes are stored [x, y, z].
 
+That is the circle. Any other motion is a pose for every view: `Geometry.per_view` makes them from TIGRE's numbers (helix,
+tilt, turned or moving panels), `Geometry.posed` takes them as they are (`lingo_mi.files.poses` reads RTK's, ASTRA's and
+projection matrices). Whatever projects asks `frames()`.
+
 Normalised frame: the volume's longest side is scaled to 2 and its centre moved to the origin. Lengths and line
 integrals are multiplied by `Geometry.scale` = 2 / max(sVoxel); densities keep their number.
 """
@@ -21,62 +25,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .errors import InputError
+from .frames import Frames, scanner_frames
 
+__all__ = ['Frames', 'Geometry', 'circular', 'helix', 'spread']
 
-@dataclass(frozen=True)
-class Frames:
-    """The rays of n flat-panel views.
-
-    The ray through the continuous pixel position (x, y), pixel centres at (i + 1/2, j + 1/2), is
-
-        cone       from `source` along  corner + x u + y v - source
-        parallel   from  corner + x u + y v  along `source`, which then holds the unit beam direction
-
-    source, corner, u, v : float64 [n, 3]; corner is the outer corner of pixel (0, 0), u and v are one pixel long steps.
-    """
-
-    source: np.ndarray
-    corner: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    parallel: bool
-
-    def __len__(self) -> int:
-        return len(self.corner)
-
-    def __getitem__(self, index) -> Frames:
-        """The views selected by a slice or an integer array; one view stays [1, 3] when given as a list."""
-        return Frames(self.source[index], self.corner[index], self.u[index], self.v[index], self.parallel)
-
-    def rays(self, view: int, x, y):
-        """Origins and (unnormalised) directions [..., 3] of the rays of one view at pixel positions x, y."""
-        x, y = np.asarray(x, float)[..., None], np.asarray(y, float)[..., None]
-        point = self.corner[view] + x * self.u[view] + y * self.v[view]
-        if self.parallel:
-            return point, np.broadcast_to(self.source[view], point.shape)
-        return np.broadcast_to(self.source[view], point.shape), point - self.source[view]
-
-    def project(self, points, view: int):
-        """Continuous pixel positions (x, y) of `points` [N, 3], NaN where a point is not in front of the source."""
-        points = np.asarray(points, float)
-        a, b, c = self.u[view], self.v[view], self.corner[view]
-        d = np.broadcast_to(self.source[view], points.shape) if self.parallel else points - self.source[view]
-        start = points if self.parallel else self.source[view]
-        # Solve  start + t d = c + x a + y b  by Cramer's rule.
-        n = np.cross(a, b)
-        along = d @ n
-        with np.errstate(divide='ignore', invalid='ignore'):
-            t = (c - start) @ n / along
-            hit = start + t[:, None] * d - c
-        if not self.parallel:
-            hit[~(t > 0)] = np.nan
-        nn = n @ n
-        return np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn
+_SAME = 1e-3  # pixels by which a pose may miss a circle and still be one
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """A circular scan with a flat panel.
+    """A scan with a flat panel: on a circle, or with a pose for every view.
 
     mode                  'cone' or 'parallel'
     DSO, DSD              distances from the source to the axis and to the panel, mm
@@ -85,6 +43,8 @@ class Geometry:
     angles                [n] radians
     offOrigin             centre of the volume, (x, y, z), mm
     offDetector           shift of the panel, (v, u), mm, positive v up
+    poses                 rays of every view, mm, where they are not those of the circle. They alone count then: DSO, DSD,
+                          dDetector, offDetector and angles are nominal, for labels (see `posed`)
     """
 
     DSO: float
@@ -97,6 +57,7 @@ class Geometry:
     mode: str = 'cone'
     offOrigin: tuple[float, float, float] = (0., 0., 0.)
     offDetector: tuple[float, float] = (0., 0.)
+    poses: Frames | None = field(default=None, repr=False)
 
     def __post_init__(self):
         def fix(name, kind, length):
@@ -126,9 +87,73 @@ class Geometry:
                 object.__setattr__(self, name, float(getattr(self, name)))
             except (TypeError, ValueError):
                 raise InputError(f'{name} must be one number, in mm, not {getattr(self, name)!r}') from None
-        if self.mode == 'cone' and not (np.isfinite(self.DSD) and self.DSD >= self.DSO > 0):
+        if self.poses is not None:
+            object.__setattr__(self, 'poses', self.poses.checked())
+            if len(self.poses) != len(angles) or self.poses.parallel != (self.mode == 'parallel'):
+                raise InputError(f'{len(angles)} angles of a {self.mode} beam contradict {len(self.poses)} poses of a '
+                                 f'{"parallel" if self.poses.parallel else "cone"} beam')
+        elif self.mode == 'cone' and not (np.isfinite(self.DSD) and self.DSD >= self.DSO > 0):
             raise InputError(f'a cone beam needs DSD >= DSO > 0, but DSO = {self.DSO:g} and DSD = {self.DSD:g} '
                              '(both are distances from the source, in mm)')
+
+    @classmethod
+    def posed(cls, frames: Frames, nDetector, nVoxel, dVoxel, offOrigin=(0., 0., 0.)) -> Geometry:
+        """A scan with a given pose for every view.
+
+        frames      in mm
+        nDetector   (v, u) pixels; the other arguments as for the class
+
+        Poses that are a circle's to a thousandth of a pixel (the source around z, the panel upright, rows down) give the
+        plain geometry of that circle, which filtered backprojection and every file format know. Otherwise the nominal
+        DSO is the mean distance from the source to the volume's centre, DSD that to the panel's plane, dDetector the
+        mean length of the steps, `angles` the directions to the source as seen from above. Raises InputError for poses
+        that are none, see `Frames.checked`.
+        """
+        frames = frames.checked()
+        nDetector = tuple(int(n) for n in nDetector)
+        toward = -frames.source if frames.parallel else frames.source - np.asarray(offOrigin, float)
+        normal = np.cross(frames.u, frames.v)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        angles = np.arctan2(toward[:, 1], toward[:, 0])
+        if frames.parallel:
+            DSO, DSD = 0., float(np.mean(np.abs(np.sum(frames.corner * normal, 1))))
+        else:
+            DSO = float(np.mean(np.linalg.norm(toward, axis=1)))
+            DSD = float(np.mean(np.abs(np.sum((frames.corner - frames.source) * normal, 1))))
+        step = tuple(float(np.mean(np.linalg.norm(x, axis=1))) for x in (frames.v, frames.u))
+        more = dict(nVoxel=nVoxel, dVoxel=dVoxel, offOrigin=offOrigin, mode='parallel' if frames.parallel else 'cone')
+        circle = _circle(frames, nDetector)
+        if circle is not None:
+            return cls(**circle, nDetector=nDetector, **more)
+        return cls(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=step, angles=angles, poses=frames, **more)
+
+    @classmethod
+    def per_view(cls, *, DSO, DSD, nDetector, dDetector, nVoxel, dVoxel, angles, mode='cone', offOrigin=(0., 0., 0.),
+                 **motion) -> Geometry:
+        """A scan whose numbers may change from view to view, in TIGRE's terms.
+
+        DSO, DSD    mm, one number or [n]
+        angles      [n] radians or [n, 3] Euler angles
+        offOrigin   (x, y, z) mm; or [n, 3], TIGRE's way to move the object: the grid then stays at their mean, and the
+                    scanner moves by what is left, the other way round
+        motion      offDetector, rotDetector, COR, height, tilt: see `frames.scanner_frames`
+
+        Raises InputError for numbers that make no scan.
+        """
+        if mode not in ('cone', 'parallel'):
+            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
+        panel = cls(1., 1., nDetector, dDetector, nVoxel, dVoxel, [0.])  # one number may stand for both
+        frames = scanner_frames(angles, DSO, DSD, panel.nDetector, panel.dDetector, mode == 'parallel', **motion)
+        if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
+            raise InputError('a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)')
+        origin = np.asarray(offOrigin, float)
+        if origin.ndim == 2:
+            if origin.shape != (len(frames), 3):
+                raise InputError(f'offOrigin must be 3 numbers, or that for each of {len(frames)} views, not an array of '
+                                 f'shape {origin.shape}')
+            mean = origin.mean(0)
+            frames, origin = frames.moved(shift=mean - origin), mean
+        return cls.posed(frames, panel.nDetector, nVoxel, dVoxel, origin)
 
     def __len__(self) -> int:
         return len(self.angles)
@@ -150,7 +175,14 @@ class Geometry:
 
     def subset(self, index) -> Geometry:
         """The same scan with the views `index` only."""
-        return replace(self, angles=self.angles[index])
+        return replace(self, angles=self.angles[index], poses=None if self.poses is None else self.poses[index])
+
+    def joined(self, other: Geometry) -> Geometry:
+        """The views of this scan, then those of another by the same scanner on the same grid."""
+        poses = None
+        if self.poses is not None or other.poses is not None:
+            poses = self.frames().joined(other.frames())
+        return replace(self, angles=np.concatenate([self.angles, other.angles]), poses=poses)
 
     def with_volume(self, nVoxel, dVoxel) -> Geometry:
         """The same scan with another voxel grid."""
@@ -158,15 +190,10 @@ class Geometry:
 
     def frames(self) -> Frames:
         """The rays of all views in the world frame, mm."""
-        c, s, zero = np.cos(self.angles), np.sin(self.angles), np.zeros(len(self))
-        out = np.stack([c, s, zero], 1)
-        u = np.stack([-s, c, zero], 1)
-        v = np.broadcast_to([0., 0., -1.], out.shape)
-        (dv, du), (nv, nu), (off_v, off_u) = self.dDetector, self.nDetector, self.offDetector
-        centre = (self.DSO - self.DSD) * out + off_u * u - off_v * v
-        corner = centre - nu / 2 * du * u - nv / 2 * dv * v
-        source = -out if self.mode == 'parallel' else self.DSO * out
-        return Frames(source, corner, du * u, dv * v, self.mode == 'parallel')
+        if self.poses is not None:
+            return self.poses
+        return scanner_frames(self.angles, self.DSO, self.DSD, self.nDetector, self.dDetector, self.mode == 'parallel',
+                              self.offDetector)
 
     def normalised_frames(self) -> Frames:
         """The rays of all views in the normalised frame, where the volume's longest side is [-1, 1]."""
@@ -187,8 +214,40 @@ def circular(n: int, total: float = 360., start: float = 0.) -> np.ndarray:
     return np.radians(start + total * np.arange(n) / n)
 
 
+def helix(angles, pitch: float) -> np.ndarray:
+    """Heights [n] in mm of a helix that climbs `pitch` mm a turn: 0 at the angle 0.
+
+    angles   [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi
+    """
+    return pitch * np.asarray(angles, float) / (2 * np.pi)
+
+
 def spread(total: int, n: int) -> np.ndarray:
     """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses."""
     if not 1 <= n <= total:
         raise InputError(f'{n} views were asked for, but the scan has {total}')
     return np.arange(n) * total // n
+
+
+def _circle(frames: Frames, nDetector) -> dict | None:
+    """DSO, DSD, dDetector, offDetector and angles of the circle that the poses are, None where they are none."""
+    out = -frames.source if frames.parallel else frames.source
+    angles = np.arctan2(out[:, 1], out[:, 0])
+    c, s = np.cos(angles), np.sin(angles)
+    centre = frames.centre(nDetector)
+    DSO = 0. if frames.parallel else float(np.mean(np.hypot(out[:, 0], out[:, 1])))
+    circle = dict(
+        DSO=DSO, DSD=float(DSO - np.mean(centre[:, 0] * c + centre[:, 1] * s)), angles=angles,
+        dDetector=tuple(float(np.mean(np.linalg.norm(x, axis=1))) for x in (frames.v, frames.u)),
+        offDetector=(float(np.mean(centre[:, 2])), float(np.mean(centre[:, 1] * c - centre[:, 0] * s))))
+    if not frames.parallel and not circle['DSD'] >= DSO > 0:
+        return None
+    like = scanner_frames(circle['angles'], DSO, circle['DSD'], nDetector, circle['dDetector'], frames.parallel,
+                          circle['offDetector'])
+    # A beam's direction moves what it meets at a distance.
+    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1
+    allowed = _SAME * min(circle['dDetector'])
+    near = all(np.abs(a - b).max() * size <= allowed for a, b, size in (
+        (frames.source, like.source, reach), (frames.corner, like.corner, 1), (frames.u, like.u, nDetector[1]),
+        (frames.v, like.v, nDetector[0])))
+    return circle if near else None

@@ -34,11 +34,17 @@ def quick_measure(dataset: Dataset, most: int = 4):
     def measure(stepper, state):
         out = {}
         if test is not None and len(test):
-            out['psnr_2d'] = _number(metrics.psnr_2d(stepper.render(state, test.geometry), test.projections))
+            rendered = _comparable(stepper.render(state, test.geometry), test)
+            out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(stepper.volume(state), dataset.volume))
         return out
     return measure
+
+
+def _comparable(rendered, test):
+    """Rendered views with the pixels that were not measured at zero, as in the scan."""
+    return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
 
 
 def world_cloud(fitted: Fitted, geometry):
@@ -59,7 +65,7 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
     write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
     cloud = world_cloud(fitted, geometry)
     write_ply(folder / 'gaussians.ply', *cloud)
-    write_scene(folder / 'result.xml', geometry, fitted.settings.extent)
+    write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent)
     rendered = None
     if test is not None and len(test):
         rendered = fitted.stepper.render(state, test.geometry)
@@ -71,7 +77,7 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
             write_exr(views / f'{i:04d}.exr', image)
     measured = measure(fitted, dataset, volume, rendered) | dict(
         method=method, seed=seed, views=len(dataset.train), variant=mi.variant(), settings=asdict(fitted.settings),
-        initial=fitted.info, command=command,
+        initial=fitted.info, command=command, **_corrections(fitted),
         angles=_degrees(geometry), test_angles=_degrees(test.geometry) if rendered is not None else [],
         versions=versions())
     report = ReportData(
@@ -91,6 +97,7 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
     born = fitted.state.values['centre'][fitted.state.born]
     test = dataset.test
     truth = test.projections if rendered is not None else None
+    rendered = None if rendered is None else _comparable(rendered, test)
 
     def of(function, result, reference):
         return None if result is None or reference is None else _number(function(result, reference))
@@ -103,6 +110,13 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
         gaussians=len(fitted.state), iterations=fitted.settings.iterations,
         seconds_init=fitted.info['seconds'], seconds_fit=fitted.seconds,
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations, history=fitted.history)
+
+
+def _corrections(fitted) -> dict:
+    """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
+    poses = fitted.stepper.poses
+    return {} if poses is None else dict(pose_turns_degrees=np.degrees(poses.turn).tolist(),
+                                         pose_shifts_mm=(poses.shift / fitted.stepper.geometry.scale).tolist())
 
 
 def write_scene(path: Path, geometry, extent: float):

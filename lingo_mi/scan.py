@@ -15,16 +15,28 @@ class Scan:
 
     geometry      in mm
     projections   float32 [view, v, u]: line integrals ln(I0 / I), density times mm
+    valid         bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are
+                  valid. What the projections hold in the others, NaN included, is forgotten: they become 0
     """
 
     geometry: Geometry
     projections: np.ndarray
+    valid: np.ndarray | None = None
 
     def __post_init__(self):
         p = np.asarray(self.projections, np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
         if p.shape != expected:
             raise InputError(f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}')
+        if self.valid is not None:
+            valid = np.asarray(self.valid)
+            if valid.shape != expected or valid.dtype != bool:
+                raise InputError(f'the mask of valid pixels must be true or false and of the shape of the projections, '
+                                 f'{expected}, not {valid.dtype} of the shape {valid.shape}')
+            if not valid.any():
+                raise InputError('no pixel of the scan is valid')
+            object.__setattr__(self, 'valid', None if valid.all() else valid)
+            p = np.where(valid, p, np.float32(0))
         if not np.isfinite(p).all():
             view = int(np.argwhere(~np.isfinite(p))[0, 0])
             raise InputError(f'the projections contain NaN or infinity (first in view {view}): '
@@ -36,22 +48,29 @@ class Scan:
 
     def subset(self, index) -> Scan:
         """The views `index` only."""
-        return Scan(self.geometry.subset(index), self.projections[index])
+        return Scan(self.geometry.subset(index), self.projections[index], None if self.valid is None else self.valid[index])
 
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
 
-        A side of fewer than two new pixels is not binned.
+        A side of fewer than two new pixels is not binned. Pixels of which one is not valid are not valid.
         """
-        g, p = self.geometry, self.projections
+        g = self.geometry
         by = [factor if n >= 2 * factor else 1 for n in g.nDetector]
         rows, columns = (n // f for n, f in zip(g.nDetector, by))
-        p = p[:, :rows * by[0], :columns * by[1]].reshape(len(self), rows, by[0], columns, by[1]).mean((2, 4))
+
+        def blocks(values):
+            return values[:, :rows * by[0], :columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
+        p = blocks(self.projections).mean((2, 4))
+        valid = None if self.valid is None else blocks(self.valid).all((2, 4))
+        step = tuple(d * f for d, f in zip(g.dDetector, by))
+        if g.poses is not None:
+            poses = replace(g.poses, u=g.poses.u * by[1], v=g.poses.v * by[0])
+            return Scan(replace(g, nDetector=(rows, columns), dDetector=step, poses=poses), p, valid)
         # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
         lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
         offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
-        step = tuple(d * f for d, f in zip(g.dDetector, by))
-        return Scan(replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset), p)
+        return Scan(replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset), p, valid)
 
     @property
     def normalised(self) -> np.ndarray:

@@ -5,7 +5,7 @@ import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -124,7 +124,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
     _warn_if_truncated(geometry)
     if views and test is not None:  # unused views are needed only where nothing else is held out
         geometry = geometry.subset(spread(len(geometry), views))
-    every = geometry if test is None else replace(geometry, angles=np.concatenate([geometry.angles, test.angles]))
+    every = geometry if test is None else geometry.joined(test)
     everything = Scan(every, _render(objects, every))
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
@@ -217,13 +217,15 @@ def _truth(objects, meshes, geometry) -> np.ndarray | None:
 
 
 def _warn_if_truncated(geometry: Geometry):
-    """Say so where the volume's midplane is wider than what the panel sees of it."""
-    if geometry.mode == 'parallel':
-        field = geometry.sDetector[1]
-    else:
-        field = geometry.sDetector[1] * geometry.DSO / geometry.DSD
-    widest = max(geometry.sVoxel[:2])
-    if widest > field * 1.0001:
+    """Say so where the volume's midplane is wider than what the panels see of it."""
+    frames, centre = geometry.frames(), np.array(geometry.offOrigin)
+    widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]
+    cut = 0
+    for view in range(len(frames)):
+        across = frames.u[view] / np.linalg.norm(frames.u[view]) * widest / 2
+        x, _ = frames.project(np.stack([centre - across, centre + across]), view)
+        cut += not (x.min() >= -1e-4 * columns and x.max() <= columns * (1 + 1e-4))  # also where it is NaN
+    if cut:
         import warnings
-        warnings.warn(f'the volume is {widest:g} mm wide, but the panel sees only {field:g} mm of it: projections may '
-                      'be truncated', stacklevel=2)
+        warnings.warn(f'the volume is {widest:g} mm wide, and the panel does not see all of it in {cut} of {len(frames)} '
+                      'views: projections may be truncated', stacklevel=2)

@@ -1,13 +1,16 @@
 """The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
-from dataclasses import replace
+from dataclasses import fields
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.files import astra
+from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan
-from lingo_mi.geometry import Geometry, circular
+from lingo_mi.files.tigre import to_posed
+from lingo_mi.geometry import Geometry, circular, helix
 from lingo_mi.runtime import data_file
 from lingo_mi.xray.frame import View
 
@@ -45,6 +48,22 @@ class CTScanner(mi.Sensor):
      * - angles
        - |string|
        - Instead: every view's angle in degrees.
+     * - pitch
+       - |float|
+       - A helix: mm that source and panel climb along z in a turn, past z = 0 at the angle 0. Two turns around the
+         middle are startAngle -360 and totalAngle 720. (Default: 0)
+     * - tilt
+       - |float|
+       - Laminography: degrees by which the source is lifted out of the plane of rotation, the panel sunk. (Default: 0)
+     * - rotDetector
+       - |string|
+       - Roll, pitch and yaw of the panel about its centre in degrees, as in TIGRE: about the vertical, about u, and in its
+         own plane. (Default: 0, 0, 0)
+     * - poses
+       - |string|
+       - Instead of DSO, DSD, angles and the like, a pose for every view: 12 numbers each as in ASTRA (source or beam, centre
+         of the panel, u, v), or a file of them, of projection matrices, or of RTK's geometry (see
+         `lingo_mi.files.poses`), looked for like `projections`. A file that leaves the pixel size open needs dDetector.
      * - test_views
        - |int|
        - Views held out of the fit, at angles drawn uniformly from the same range with a fixed seed. (Default: 0)
@@ -56,7 +75,8 @@ class CTScanner(mi.Sensor):
        - |int|
        - The view that this sensor renders. (Default: 0)
 
-    The source runs on a circle in the plane z = 0; `lingo_mi.geometry` states the frame. One view of a scanner is a
+    The source runs on a circle in the plane z = 0 unless told otherwise; `lingo_mi.geometry` states the frame, and
+    `lingo_mi.frames.scanner_frames` what moves it. One view of a scanner is a
     sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scanning.scan` renders them all.
     """
 
@@ -82,7 +102,11 @@ class CTScanner(mi.Sensor):
                 props[name]
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
-        self.frame = View.of(self.geometry.frames(), self.index, *self.geometry.nDetector)
+        frames = self.geometry.frames()
+        self.frame = View.of(frames, self.index, *self.geometry.nDetector)
+        # From where parallel rays start: well before the volume, wherever the panel is.
+        self.back = 2 * float(np.linalg.norm(frames.corner[self.index]) + np.linalg.norm(self.geometry.offOrigin)
+                              + np.linalg.norm(self.geometry.sVoxel))
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
         """The sensor of one view, of this scan or of another geometry."""
@@ -94,7 +118,7 @@ class CTScanner(mi.Sensor):
         point = (Vector3f(f.corner) + Vector3f(f.u) * (position_sample.x * f.width)
                  + Vector3f(f.v) * (position_sample.y * f.height))
         if f.parallel:
-            start, direction = point - Vector3f(f.source) * (2 * self.geometry.DSD), Vector3f(f.source)
+            start, direction = point - Vector3f(f.source) * self.back, Vector3f(f.source)
         else:
             start, direction = mi.Point3f(f.source), dr.normalize(point - Vector3f(f.source))
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active)
@@ -109,8 +133,9 @@ class CTScanner(mi.Sensor):
 
     def to_string(self):
         g = self.geometry
-        return (f'CTScanner[\n  mode = {g.mode}, DSO = {g.DSO:g}, DSD = {g.DSD:g},\n  nDetector = {g.nDetector}, '
-                f'dDetector = {g.dDetector}, offDetector = {g.offDetector},\n  nVoxel = {g.nVoxel}, '
+        way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if g.poses is None else 'a pose a view'
+        return (f'CTScanner[\n  mode = {g.mode}, {way},\n  nDetector = {g.nDetector}, '
+                f'dDetector = {g.dDetector},\n  nVoxel = {g.nVoxel}, '
                 f'dVoxel = {g.dVoxel}, offOrigin = {g.offOrigin},\n  views = {len(g)}, view = {self.index}\n]')
 
 
@@ -118,7 +143,9 @@ create = CTScanner
 
 MOST_VIEWS = 100_000
 _NAMES = ('mode', 'DSO', 'DSD', 'nDetector', 'dDetector', 'offDetector', 'nVoxel', 'dVoxel', 'offOrigin', 'views',
-          'totalAngle', 'startAngle', 'angles', 'test_views')
+          'totalAngle', 'startAngle', 'angles', 'test_views', 'pitch', 'tilt', 'rotDetector', 'poses')
+_CIRCLE = ('DSO', 'DSD', 'offDetector', 'angles', 'views', 'totalAngle', 'startAngle', 'pitch', 'tilt', 'rotDetector',
+           'test_views')
 
 
 def film(rows: int, columns: int) -> dict:
@@ -132,6 +159,10 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
     def join(values):
         return ', '.join(repr(float(x)) if isinstance(x, float) else str(x) for x in values)
     g = geometry
+    if g.poses is not None:
+        vectors = astra.to_vectors(g.poses, g.nDetector)
+        return dict(type='ct_scanner', mode=g.mode, nDetector=join(g.nDetector), nVoxel=join(g.nVoxel),
+                    dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), poses=join(vectors.ravel().tolist()), view=index)
     return dict(type='ct_scanner', mode=g.mode, DSO=g.DSO, DSD=g.DSD, nDetector=join(g.nDetector),
                 dDetector=join(g.dDetector), offDetector=join(g.offDetector), nVoxel=join(g.nVoxel),
                 dVoxel=join(g.dVoxel), offOrigin=join(g.offOrigin), angles=join(np.degrees(g.angles).tolist()),
@@ -164,8 +195,20 @@ def _distance(props, name, default):
     return values[0]
 
 
+def _counts(props, name):
+    values = _numbers(props, name)
+    if any(n % 1 != 0 for n in values):  # also of NaN and infinity
+        raise InputError(f'{name} must be whole numbers, not {values}')
+    return values
+
+
 def _read(props):
     """The scan's and the held-out views' geometry from a plugin's properties."""
+    mode = _one(props, 'mode', 'cone')
+    shared = dict(mode=mode, nDetector=_counts(props, 'nDetector'), nVoxel=_counts(props, 'nVoxel'),
+                  dVoxel=_numbers(props, 'dVoxel'), offOrigin=_numbers(props, 'offOrigin', 0.))
+    if _one(props, 'poses', ''):
+        return _read_poses(props, shared), None
     total, start = _one(props, 'totalAngle', 360.), _one(props, 'startAngle', 0.)
     views, held_out = _one(props, 'views', 50), _one(props, 'test_views', 0)
     if held_out < 0:
@@ -173,18 +216,40 @@ def _read(props):
     if max(views, held_out) > MOST_VIEWS:
         raise InputError(f'a scan has at most {MOST_VIEWS} views, not {max(views, held_out)}')
     angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(views, total, start)
-    counts = {}
-    for name in ('nDetector', 'nVoxel'):
-        counts[name] = _numbers(props, name)
-        if any(n % 1 != 0 for n in counts[name]):  # also of NaN and infinity
-            raise InputError(f'{name} must be whole numbers, not {counts[name]}')
-    mode = _one(props, 'mode', 'cone')
     far = 1. if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
-    geometry = Geometry(mode=mode, DSO=_distance(props, 'DSO', far), DSD=_distance(props, 'DSD', far), angles=angles,
-                        dDetector=_numbers(props, 'dDetector'), dVoxel=_numbers(props, 'dVoxel'),
-                        offDetector=_numbers(props, 'offDetector', 0.), offOrigin=_numbers(props, 'offOrigin', 0.),
-                        **counts)
+    shared |= dict(DSO=_distance(props, 'DSO', far), DSD=_distance(props, 'DSD', far),
+                   dDetector=_numbers(props, 'dDetector'), offDetector=_numbers(props, 'offDetector', 0.))
+    pitch, tilt, turned = _one(props, 'pitch', 0.), _one(props, 'tilt', 0.), _numbers(props, 'rotDetector', '0 0 0')
+    if len(turned) != 3:
+        raise InputError(f'rotDetector must be 3 angles (roll, pitch, yaw), not {turned}')
+
+    def geometry(at):
+        circle = Geometry(angles=at, **shared)
+        if not (pitch or tilt or any(turned)):
+            return circle
+        plain = {f.name: getattr(circle, f.name) for f in fields(circle) if f.name != 'poses'}
+        return Geometry.per_view(**plain, height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned))
     if not held_out:
-        return geometry, None
+        return geometry(angles), None
     drawn = np.sort(np.random.default_rng(0).uniform(0, total, held_out)) + start
-    return geometry, replace(geometry, angles=np.radians(drawn))
+    return geometry(angles), geometry(np.radians(drawn))
+
+
+def _read_poses(props, shared):
+    """A scan with a pose for every view."""
+    given = [name for name in _CIRCLE if name in props]
+    if given:
+        raise InputError(f'{given[0]} and poses both say which views there are; leave one of them out')
+    known = {k: v for k, v in shared.items() if k != 'mode'}
+    known |= {'dDetector': _numbers(props, 'dDetector')} if 'dDetector' in props else {}
+
+    def frames(n_detector, step, parallel, origin):
+        poses = props['poses']
+        try:
+            numbers = [float(x) for x in poses.replace(',', ' ').split()]
+        except ValueError:
+            return read_poses(data_file(poses, 'poses'), n_detector, step, parallel, origin)
+        if len(numbers) % 12:
+            raise InputError(f'poses must be 12 numbers for every view, not {len(numbers)}')
+        return astra.from_vectors(np.reshape(numbers, (-1, 12)), n_detector, parallel)
+    return to_posed(known | {'mode': shared['mode']}, frames, 'poses')

@@ -141,7 +141,7 @@ def test_intensity(tmp_path):
     ({'offDetector': [1, 2, 3]}, 'must be 2'),
     ({'input': 'counts'}, 'input must be'), ({'input': 'intensity'}, 'needs I0'),
     ({'input': 'intensity', 'I0': -1}, 'I0 must be'),
-    ({'rotDetector': [0, 0, 0]}, 'rotDetector is not'), ({'offdetector': [0, 0]}, 'offdetector is not')])
+    ({'rotdetector': [0, 0, 0]}, 'rotdetector is not'), ({'offdetector': [0, 0]}, 'offdetector is not')])
 def test_bad_geometry_files(tmp_path, changes, match):
     assert str(tmp_path) in refused(npy(tmp_path, **changes), match)
 

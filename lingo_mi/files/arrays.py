@@ -7,25 +7,25 @@ from ..errors import InputError
 from .paths import one_line, reading, replacing
 
 
-def numeric(array: np.ndarray, where, ndim: int) -> np.ndarray:
-    """`array`, after a check that it is real, finite, not empty and has `ndim` dimensions; else
-    InputError."""
+def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> np.ndarray:
+    """`array`, after a check that it is real, finite unless it need not be, not empty and has `ndim` dimensions
+    (None: any); else InputError."""
     if array.dtype.kind not in 'buif':
         raise InputError(f'{where}: holds {array.dtype} values; real numbers are needed')
-    if array.ndim != ndim or array.size == 0:
-        raise InputError(f'{where}: has the shape {array.shape}, but a filled array of {ndim} dimensions is '
-                         'needed')
-    if array.dtype.kind == 'f' and not np.isfinite(array).all():
+    if ndim not in (None, array.ndim) or array.size == 0:
+        raise InputError(f'{where}: has the shape {array.shape}, but a filled array of '
+                         f'{"" if ndim is None else f"{ndim} "}dimensions is needed')
+    if finite and array.dtype.kind == 'f' and not np.isfinite(array).all():
         first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise InputError(f'{where}: holds NaN or infinity (first at {first}); mask or repair those values '
                          'first')
     return array
 
 
-def load(path, ndim: int) -> np.ndarray:
-    """The array of a .npy file. Raises InputError if it is missing, damaged, pickled, not finite or not
-    `ndim`-D."""
-    return numeric(_numpy_load(path, np.ndarray), path, ndim)
+def load(path, ndim: int | None, finite: bool = True) -> np.ndarray:
+    """The array of a .npy file. Raises InputError if it is missing, damaged, pickled, not finite (unless it need
+    not be) or not `ndim`-D (None: any)."""
+    return numeric(_numpy_load(path, np.ndarray), path, ndim, finite)
 
 
 def load_many(path) -> dict[str, np.ndarray]:

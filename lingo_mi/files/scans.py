@@ -15,12 +15,22 @@ degrees:
                            excluded
     mode, offOrigin, offDetector   optional: cone or parallel; (x, y, z); TIGRE's (v, u), positive v towards
                                    +z
+    rotDetector, COR, tilt, pitch, z   optional: a panel turned by (roll, pitch, yaw), an axis off centre, a source
+                           lifted out of the plane of rotation, a helix by mm a turn (at z = 0 for the angle 0) or by
+                           the height of every view (`lingo_mi.frames.scanner_frames` defines them; angles in degrees)
+    poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
+                           name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
+                           the .npy, which run up in RTK's images
+    valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
+
+DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one
+value for every view; an angle may be three, TIGRE's Euler angles.
 
 Any other name is refused, so that a misspelt or unsupported one is not lost; TIGRE's accuracy and filter,
 which do not describe the scanner, are passed over.
 
-A folder of EXR images: `geometry.yml` as above (with `test_angles` if there are held-out views),
+A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
 
 The Helsinki Tomography Challenge 2022 as .npz: `sinogram_<name>` [angles, pixels] of a fan beam, which is a
@@ -36,16 +46,17 @@ import yaml
 from ..errors import InputError
 from ..geometry import circular
 from ..scan import Dataset, Scan
-from . import arrays, naf, r2
+from . import arrays, astra, naf, r2
 from .images import read_exr, write_exr
 from .paths import new_folder, one_line, reading, replacing
-from .tigre import check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from .poses import read_poses
+from .tigre import MOTION, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry, to_posed
 from .volumes import first_voxel, read_volume, write_volume
 
 _KEYS = {'DSO', 'DSD', 'nDetector', 'dDetector', 'sDetector', 'nVoxel', 'dVoxel', 'sVoxel', 'mode',
          'offOrigin',
          'offDetector', 'angles', 'totalAngle', 'startAngle', 'input', 'I0', 'test_angles', 'accuracy',
-         'filter'}
+         'filter', 'poses', 'test_poses', 'valid', *MOTION}
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
@@ -74,8 +85,26 @@ def _number(values, key, default, where):
     return float(value)
 
 
+def _geometry(values, n, where, test=False):
+    """The geometry of the n views to fit, or of those held out."""
+    prefix = 'test_' if test else ''
+    poses = values.get(prefix + 'poses')
+    if poses is None:
+        return to_geometry(values, _angles(values, prefix + 'angles', n, where), where)
+
+    def frames(n_detector, step, parallel, origin):
+        if isinstance(poses, str):
+            found = read_poses(Path(where).parent / poses, n_detector, step, parallel, origin)
+        else:
+            found = astra.from_vectors(poses, n_detector, parallel)
+        if len(found) != n:
+            raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
+        return found
+    return to_posed(values, frames, where)
+
+
 def _angles(values, key, n, where):
-    """n angles in radians."""
+    """n angles in radians, or [n, 3] Euler angles."""
     if values.get(key) is None:
         return circular(n, _number(values, 'totalAngle', 360., where),
                         _number(values, 'startAngle', 0., where))
@@ -83,10 +112,25 @@ def _angles(values, key, n, where):
         angles = np.radians(np.asarray(values[key], float))
     except (TypeError, ValueError):
         raise InputError(f'{where}: {key} must be a list of numbers, in degrees') from None
-    if angles.shape != (n,):
-        raise InputError(f'{where}: {key} lists {angles.size} angles, but there are {n} projections; these '
-                         'must agree')
+    if angles.shape not in ((n,), (n, 3)):
+        raise InputError(f'{where}: {key} lists {len(angles) if angles.ndim else 1} angles, but there are {n} '
+                         'projections; these must agree')
     return angles
+
+
+def _valid(values, shape, where):
+    """The mask of valid pixels that a geometry file names; None where it names none."""
+    name = values.get('valid')
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise InputError(f'{where}: valid must be the name of a .npy file, not {name!r}')
+    path = Path(where).parent / name
+    mask = arrays.load(path, None)
+    if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
+        raise InputError(f'{path}: must be bool of the shape {shape} or {shape[1:]}, not {mask.dtype} of the shape '
+                         f'{mask.shape}')
+    return np.broadcast_to(mask, shape)
 
 
 def _line_integrals(projections, values, where, projections_path):
@@ -107,8 +151,18 @@ def _line_integrals(projections, values, where, projections_path):
     return np.log(i0 / projections.astype(float))
 
 
-def _dump_yaml(path, geometry, **more):
-    values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist(), **more}
+def _dump_yaml(path, geometry, test=None, **more):
+    if any(g is not None and g.poses is not None for g in (geometry, test)):
+        values = {'mode': geometry.mode}
+        values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
+        values['poses'] = astra.to_vectors(geometry.frames(), geometry.nDetector).tolist()
+        if test is not None:
+            values['test_poses'] = astra.to_vectors(test.frames(), test.nDetector).tolist()
+    else:
+        values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
+        if test is not None:
+            values['test_angles'] = np.degrees(test.angles).tolist()
+    values |= more
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
 
@@ -119,11 +173,15 @@ def _read_npy(path, geometry):
         if geometry is None:
             raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name '
                              'the file')
-    projections = arrays.load(path, 3)
     values = _load_yaml(geometry)
-    angles = _angles(values, 'angles', len(projections), geometry)
-    g = to_geometry(values, angles, geometry)
-    return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path))
+    projections = arrays.load(path, 3, finite=values.get('valid') is None)
+    valid = _valid(values, projections.shape, geometry)
+    if valid is not None:
+        projections = np.where(valid, projections, 1)  # which has a logarithm
+    g = _geometry(values, len(projections), geometry)
+    if str(values.get('poses')).lower().endswith('.xml'):
+        projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
+    return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path, valid))
 
 
 def _write_npy(path, dataset):
@@ -134,9 +192,13 @@ def _write_npy(path, dataset):
     if dataset.test is not None or dataset.volume is not None:
         raise InputError(f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
                          'instead, or drop the test views and the volume')
+    more = {'input': 'line_integral'}
+    if dataset.train.valid is not None:
+        more['valid'] = path.stem + '.valid.npy'
+        arrays.save(path.with_name(more['valid']), dataset.train.valid)
     # Geometry first: without its projections it is never taken for a scan.
     with replacing(path.with_suffix('.yml')) as temporary:
-        _dump_yaml(temporary, dataset.train.geometry, input='line_integral')
+        _dump_yaml(temporary, dataset.train.geometry, **more)
     arrays.save(path, dataset.train.projections)
 
 
@@ -157,15 +219,18 @@ def _read_stack(folder):
 def _read_exr_folder(folder):
     where = folder / 'geometry.yml'
     values = _load_yaml(where)
+    if values.get('valid') is not None:
+        raise InputError(f'{where}: valid goes with .npy projections only')
     scans = {}
-    for split, key in (('train', 'angles'), ('test', 'test_angles')):
-        if split == 'test' and not (folder / split).is_dir() and values.get(key) is None:
+    for split in ('train', 'test'):
+        given = values.get('test_angles') is not None or values.get('test_poses') is not None
+        if split == 'test' and not (folder / split).is_dir() and not given:
             continue
-        if split == 'test' and values.get(key) is None:
+        if split == 'test' and not given:
             raise InputError(f'{where}: test_angles is missing, but there is a folder of test views; add it, '
                              'in degrees')
         projections = _read_stack(folder / split)
-        geometry = to_geometry(values, _angles(values, key, len(projections), where), where)
+        geometry = _geometry(values, len(projections), where, split == 'test')
         scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
     volume = folder / 'volume.nii.gz'
     return make_dataset(scans['train'], scans.get('test'),
@@ -173,10 +238,7 @@ def _read_exr_folder(folder):
 
 
 def _write_exr_folder(path, dataset):
-    check_one_scanner(dataset, path)
-    more = {'input': 'line_integral'}
-    if dataset.test is not None:
-        more['test_angles'] = np.degrees(dataset.test.geometry.angles).tolist()
+    check_one_scanner(dataset, path, poses=True)
     with new_folder(path) as folder:
         for split, scan in (('train', dataset.train), ('test', dataset.test)):
             if scan is not None:
@@ -186,7 +248,7 @@ def _write_exr_folder(path, dataset):
         geometry = dataset.train.geometry
         if dataset.volume is not None:
             write_volume(folder / 'volume.nii.gz', dataset.volume, geometry.dVoxel, first_voxel(geometry))
-        _dump_yaml(folder / 'geometry.yml', geometry, **more)
+        _dump_yaml(folder / 'geometry.yml', geometry, dataset.test and dataset.test.geometry, input='line_integral')
 
 
 # ---- Helsinki Tomography Challenge 2022 --------------------------------------------------------------------
@@ -261,11 +323,15 @@ def write_scan(path, dataset: Dataset | Scan, kind: str) -> None:
     """Writes a scan that `read_scan` reads back, whole or not at all.
 
     kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`
-           and its .yml, for training views alone
+           and its .yml, for training views alone, and the mask of valid pixels if there is one
 
     Raises InputError if the kind is unknown, a folder exists already, the file cannot be written, or the
     format cannot hold the data.
     """
     if kind not in _WRITERS:
         raise InputError(f'{kind!r} is no kind of scan file; choose one of {", ".join(_WRITERS)}')
-    _WRITERS[kind](path, Dataset(dataset) if isinstance(dataset, Scan) else dataset)
+    dataset = Dataset(dataset) if isinstance(dataset, Scan) else dataset
+    masked = any(scan is not None and scan.valid is not None for scan in (dataset.train, dataset.test))
+    if masked and kind != 'npy':
+        raise InputError(f"{path}: this format holds no mask of valid pixels; write 'npy'")
+    _WRITERS[kind](path, dataset)

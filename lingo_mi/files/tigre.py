@@ -2,13 +2,14 @@
 YAML file."""
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..errors import InputError
-from ..geometry import Geometry
+from ..geometry import Geometry, helix
 from ..scan import Dataset, Scan
+
+# Names that move the scanner off its circle.
+MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 
 def _numbers(values: dict, name: str, where, length: int):
@@ -45,12 +46,59 @@ def _steps(values, kind, counts, where):
     return d
 
 
+def _per_view(values, name, where, n, length, default=0.):
+    """A value given once or for every view: float64 [length] or [n, length] (a length of 1: one number or [n])."""
+    if values.get(name) is None:
+        return np.full(length, default) if length > 1 else np.float64(default)
+    try:
+        array = np.asarray(values[name], float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    shape = (n, length) if length > 1 else (n,)
+    if array.shape == shape and np.isfinite(array).all():
+        return array
+    if array.size not in (1, length) or array.ndim > 1 or not np.isfinite(array).all():
+        raise InputError(f'{where}: {name} must be {length} number{"s" * (length > 1)}, or that for each of {n} views, not '
+                         f'{str(values[name])[:80]}')
+    return np.broadcast_to(array.ravel(), length) if length > 1 else np.float64(array.ravel()[0])
+
+
+def moves(values: dict, n: int) -> bool:
+    """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
+    lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
+    several = any(np.ndim(values.get(k)) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
+                  for k, length in lengths.items())
+    return several or any(values.get(k) is not None for k in MOTION)
+
+
+def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mode) -> Geometry:
+    """`to_geometry` for a scanner that leaves the circle."""
+    n = len(angles)
+
+    def each(name, length=1):
+        return _per_view(values, name, where, n, length)
+    if values.get('pitch') is not None and values.get('z') is not None:
+        raise InputError(f'{where}: pitch and z both say the height of the views; remove one of them')
+    height = each('z')
+    if values.get('pitch') is not None:
+        if np.ndim(angles) == 2:
+            raise InputError(f'{where}: pitch needs one angle a view, not three; give z instead')
+        height = helix(angles, float(_numbers(values, 'pitch', where, 1)[0]))
+    return Geometry.per_view(
+        DSO=each('DSO'), DSD=each('DSD'), nDetector=n_detector, dDetector=d_detector, nVoxel=n_voxel, dVoxel=d_voxel,
+        angles=angles, mode=mode, offOrigin=each('offOrigin', 3), offDetector=each('offDetector', 2),
+        rotDetector=np.radians(each('rotDetector', 3)), COR=each('COR'), tilt=np.radians(each('tilt')), height=height)
+
+
 def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_order: str = 'vu') -> Geometry:
     """A Geometry from TIGRE's names.
 
     values           DSO, DSD, nDetector, dDetector or sDetector in (v, u), nVoxel, dVoxel or sVoxel in (x, y,
-                     z); optional: mode, offOrigin (x, y, z), offDetector; all lengths in mm
-    angles           [n] radians
+                     z); optional: mode, offOrigin (x, y, z), offDetector; all lengths in mm. With offset_order 'vu', DSO,
+                     DSD, offOrigin and offDetector may be lists of one value a view, and rotDetector, COR and tilt (one
+                     value or one a view; angles in degrees), pitch (mm a turn) or z (mm) may be given: see
+                     `Geometry.per_view` and `geometry.helix`
+    angles           [n] radians; [n, 3] for TIGRE's Euler angles
     where            the file, for messages
     detector_shape   (v, u) pixels of the projections; if nDetector has these the other way round, nDetector
                      and the panel's size are taken as (u, v)
@@ -74,20 +122,52 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
             if mode != 'parallel':
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
             values[name] = 0.  # places the panel on the axis, where a parallel beam does not care
+    d_voxel = _steps(values, 'Voxel', n_voxel, where)
+    try:
+        if offset_order == 'vu' and (np.ndim(angles) == 2 or moves(values, len(angles))):
+            return _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mode)
+    except InputError as error:
+        raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
     origin, offset = (np.zeros(length) if values.get(name) is None else _numbers(values, name, where, length)
                       for name, length in (('offOrigin', 3), ('offDetector', 2)))
     try:
         return Geometry(
             DSO=float(_numbers(values, 'DSO', where, 1)[0]), DSD=float(_numbers(values, 'DSD', where, 1)[0]),
             nDetector=n_detector, dDetector=d_detector,
-            nVoxel=n_voxel, dVoxel=_steps(values, 'Voxel', n_voxel, where), angles=angles, mode=mode,
+            nVoxel=n_voxel, dVoxel=d_voxel, angles=angles, mode=mode,
             offOrigin=origin, offDetector=offset[::-1] if offset_order == 'uv' else offset)
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
 
+def to_posed(values: dict, frames, where) -> Geometry:
+    """A Geometry of given poses: frames(nDetector, dDetector or None, parallel, offOrigin) gives them.
+
+    values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
+
+    Raises InputError where a value is missing or out of range, or one is given that the poses say already.
+    """
+    known = [k for k in ('DSO', 'DSD', 'offDetector', 'angles', 'totalAngle', 'startAngle', *MOTION)
+             if values.get(k) is not None]
+    if known:
+        raise InputError(f'{where}: {known[0]} and poses both say where source and panel are; remove one of them')
+    n_detector, n_voxel = _counts(values, 'nDetector', where, 2), _counts(values, 'nVoxel', where, 3)
+    step = None
+    if values.get('dDetector') is not None or values.get('sDetector') is not None:
+        step = _steps(values, 'Detector', n_detector, where)
+    origin = np.zeros(3) if values.get('offOrigin') is None else _numbers(values, 'offOrigin', where, 3)
+    mode = values.get('mode') or 'cone'
+    d_voxel = _steps(values, 'Voxel', n_voxel, where)
+    try:
+        if mode not in ('cone', 'parallel'):
+            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
+        return Geometry.posed(frames(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin)
+    except InputError as error:
+        raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
+
+
 def from_geometry(geometry: Geometry, offset_order: str = 'vu') -> dict:
-    """The inverse of `to_geometry` without the angles: plain floats, ints and lists, mm."""
+    """The inverse of `to_geometry` for a circular scan, without the angles: plain floats, ints and lists, mm."""
     offset = geometry.offDetector[::-1] if offset_order == 'uv' else geometry.offDetector
     return {
         'mode': geometry.mode, 'DSD': geometry.DSD, 'DSO': geometry.DSO,
@@ -104,10 +184,10 @@ def angle_range(angles: np.ndarray) -> tuple[float, float]:
     return float(low), float((high - low) * n / (n - 1)) if n > 1 else 360.
 
 
-def make_scan(geometry: Geometry, projections, where) -> Scan:
+def make_scan(geometry: Geometry, projections, where, valid=None) -> Scan:
     """A Scan whose InputError names the file."""
     try:
-        return Scan(geometry, projections)
+        return Scan(geometry, projections, valid)
     except InputError as error:
         raise InputError(f'{where}: {error}') from None
 
@@ -122,11 +202,18 @@ def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
     return Dataset(train, test, volume)
 
 
-def check_one_scanner(dataset: Dataset, where) -> None:
-    """Raises InputError unless the test views differ from the training views in their angles only."""
-    if dataset.test is None:
-        return
-    a, b = dataset.train.geometry, dataset.test.geometry
-    if from_geometry(a) != from_geometry(replace(b, angles=a.angles)):
+def check_one_scanner(dataset: Dataset, where, poses: bool = False) -> None:
+    """Raises InputError unless the test views differ from the training views in their angles only, or, where the format
+    holds `poses`, in those. Without them, all views must be on the circle."""
+    geometries = [scan.geometry for scan in (dataset.train, dataset.test) if scan is not None]
+    names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
+    if any(g.poses is not None for g in geometries):
+        if not poses:
+            raise InputError(f"{where}: this format holds circular scans only, and this one has other poses; write it as "
+                             "'npy' or 'exr'")
+        known = [{name: getattr(g, name) for name in names} for g in geometries]
+    else:
+        known = [from_geometry(g) for g in geometries]
+    if known[0] != known[-1]:
         raise InputError(f'{where}: this format holds one scanner, but the training and test views have '
                          'different geometries; write them as two files')

@@ -37,11 +37,15 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings, unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
+        # FDK knows the circle alone, and whole images.
+        possible = g.poses is None and scan.valid is None
+        density = settings.init_density if possible or settings.init_density != 'fdk' else 'lsq'
         chosen = lingo.Settings(
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
-            resolution=settings.occupancy_voxels, V_S=settings.V_S, density=settings.init_density,
+            resolution=settings.occupancy_voxels, V_S=settings.V_S, density=density,
             misses=settings.misses, outside=settings.outside)
-        volume = fdk(scan) if settings.init_density == 'fdk' else None
-        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume)
+        volume = fdk(scan) if density == 'fdk' else None
+        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume,
+                                 scan.valid)
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

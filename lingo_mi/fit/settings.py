@@ -23,7 +23,8 @@ class Settings:
     init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume)
     n_points           Gaussians to start with (paper: 50k)
     high_fraction, low_factor, occupancy_voxels, V_S, misses, outside, init_density
-                       of `lingo`: see `lingo_mi.lingo.initialise.Settings`
+                       of `lingo`: see `lingo_mi.lingo.initialise.Settings`; the density 'fdk' becomes 'lsq' where FDK
+                       cannot reconstruct (poses off the circle, invalid pixels)
     fdk_threshold, fdk_rescale
                        of `r2`: see `lingo_mi.fit.r2_init` (R2: 0.05 and 0.15)
     normalise          whether densities are fitted in a unit that makes the largest line integral 1 (own): SSIM's
@@ -41,6 +42,8 @@ class Settings:
 
     Adam
     rate_centre, rate_density, rate_scale, rate_rotation
+    rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;
+                       0, 0 leaves the poses alone (see `lingo_mi.fit.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
     epsilon            added to the root of the second moment (R2: 1e-15)
 
@@ -85,6 +88,7 @@ class Settings:
     rate_density: tuple[float, float] = (1e-2, 1e-3)
     rate_scale: tuple[float, float] = (5e-3, 5e-4)
     rate_rotation: tuple[float, float] = (1e-3, 1e-4)
+    rate_pose: tuple[float, float] = (0., 0.)
     beta1: float = .9
     beta2: float = .999
     epsilon: float = 1e-15
@@ -114,6 +118,8 @@ class Settings:
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
         require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
+        require(self.outside in ('invalid', 'ignore', 'auto'),
+                f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
@@ -126,9 +132,11 @@ class Settings:
         for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'):
             rate = getattr(self, name)
             require(len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}')
+        require(len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
+                f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}')
 
     def rate(self, name: str, iteration: int) -> float:
-        """Adam's step size for 'centre', 'density', 'scale' or 'rotation' at an iteration, counted from 0."""
+        """Adam's step size for 'centre', 'density', 'scale', 'rotation' or 'pose' at an iteration, counted from 0."""
         first, last = getattr(self, f'rate_{name}')
         share = min(iteration / max(self.decay_steps or self.iterations, 1), 1.)
         return first ** (1 - share) * last ** share
@@ -170,7 +178,8 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # times higher that fall over the run, moments that forget faster, more weight on SSIM, which brings fine detail forward,
 # and earlier densification, as far as the scan's size allows.
 FAST = Settings(
-    init='lingo', init_density='fdk', normalise=True, iterations=1500, decay_steps=0, lambda_ssim=1.5, lambda_tv=.1,
+    init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1500, decay_steps=0,
+    lambda_ssim=1.5, lambda_tv=.1,
     rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
     beta1=.8, beta2=.95, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     split_keeps_mass=True, values_per_gaussian=20)

@@ -17,19 +17,33 @@ from ..xray.voxelize import Grid, voxelize
 from . import losses
 from .device import DeviceState
 from .loss_scale import loss_scale
+from .poses import Poses, gathered, place
 from .settings import Settings
 
 
 class Target:
-    """A measured view on the device: its rays and pixels (normalised line integrals over the fit's unit of density)."""
+    """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), and which
+    of them are valid (None: all)."""
 
     def __init__(self, scan: Scan, index: int, unit: float):
         height, width = scan.geometry.nDetector
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
-        self.view = View.of(scan.geometry.normalised_frames(), index, height, width, panel=False)
+        self.frames = scan.geometry.normalised_frames()[[index]]
+        self.view = View.of(self.frames, 0, height, width, panel=False)
         self.pixels = mi.Float(scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit))
         dr.eval(self.pixels)
+        self.valid = None
+        if scan.valid is not None and not scan.valid[index].all():
+            self.valid = mi.Bool(scan.valid[index].ravel())
+            dr.make_opaque(self.valid)
+
+    def seen(self, image):
+        """An image as this view compares it: pixels that are not valid are zero, in it as in the measured one.
+
+        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
+        """
+        return image if self.valid is None else dr.select(self.valid, image, 0)
 
 
 class Stepper:
@@ -46,6 +60,7 @@ class Stepper:
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
+        self.poses = Poses(len(scan), self.flat) if max(settings.rate_pose) > 0 else None
 
     def step(self, state: DeviceState, views, iteration: int, rng):
         """Advance the state by one Adam step on the given views; returns the loss, Float [1], not yet evaluated.
@@ -61,7 +76,13 @@ class Stepper:
         total = mi.Float(0)
         targets = self.coarse if iteration < self.coarse_until else self.targets
         for view in views:
-            total += self._view(state, leaf, targets[view], len(views))
+            target = targets[view]
+            if self.poses is not None:
+                frames = self.poses.correct(target.frames, view)
+                place(target.view, frames)
+            total += self._view(state, leaf, target, len(views))
+            if self.poses is not None:
+                self.poses.step(view, frames, gathered(target.view), s.rate('pose', iteration), s)
         if s.lambda_tv > 0:
             total += self._total_variation(leaf, rng)
         _pass_on(leaf, gaussians)
@@ -71,6 +92,16 @@ class Stepper:
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
         state.adam(gradients, s, iteration)
         return total
+
+    def corrected(self) -> Geometry:
+        """The scan's geometry with its views where the fit has put them: as given, where it left them alone."""
+        g = self.geometry
+        if self.poses is None:
+            return g
+        f, centre = self.poses.correct(g.normalised_frames()), np.array(g.offOrigin)
+        source = f.source if f.parallel else f.source / g.scale + centre
+        frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
+        return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
         """Projections of the cloud in a scan's geometry, float32 [view, v, u], density times mm."""
@@ -98,7 +129,7 @@ class Stepper:
         footprints = project(*gaussians, view, s.extent)
         leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
         image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
-        loss = losses.combined(image, target.pixels, view.height, view.width, s.lambda_ssim)
+        loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
         factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
         dr.backward(loss * weight * (1 / batch))

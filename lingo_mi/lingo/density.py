@@ -23,20 +23,23 @@ MODES = (*FACTORS, 'lsq', 'fdk')
 FAINTEST = .02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
 
 
-def mean_pixel(frames: Frames, projections, points) -> np.ndarray:
+def mean_pixel(frames: Frames, projections, points, valid=None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
     frames       n views in the normalised frame
     projections  [n, v, u]
     points       [N, 3]
+    valid        bool [n, v, u], None: all pixels are valid
 
-    The mean is over the views whose image a point projects into (all of them in the paper's intersection); a
-    point that no view sees has the mean 0.
+    The mean is over the views whose image a point projects into (all of them in the paper's intersection), in a
+    valid pixel; a point that no view sees has the mean 0.
     """
     points = np.ascontiguousarray(np.asarray(points, float).T)
     total, seen = np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    for matrix, image in zip(camera_matrices(frames), projections):
+    for view, (matrix, image) in enumerate(zip(camera_matrices(frames), projections)):
         index, inside = pixels(matrix, points, image.shape)
+        if valid is not None:
+            inside &= valid[view].reshape(-1)[index]
         total += np.where(inside, image.reshape(-1)[index], 0)
         seen += inside
     return total / np.maximum(seen, 1)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +11,7 @@ from ..errors import InputError
 from ..geometry import Frames
 from .density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
 from .ipsd import neighbour_distance
-from .masks import masks
+from .masks import masks, truncated
 from .scaling import occupancy, scale_factor, scaled_grid
 from .voxel_filter import valid_voxels, voxel_centres
 
@@ -44,10 +45,11 @@ class Settings:
     resolution     V of the coarse grid for the occupancy (section III-B: 16)
     V_S            upper bound of the voxel scaling (section III-B: 20)
     density        'lsq', 'paper', 'raw' or 'fdk', see `density` (the paper is silent on the factor)
-    lsq_views      evenly spaced views that the factor of 'lsq' is and 'fdk' is solved on (own choice: a few
+    lsq_views      evenly spaced views that the factor of 'lsq' and 'fdk' is solved on (own choice: a few
                    determine one number)
     misses         views that may miss a valid cell (paper: 0)
-    outside        'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`
+    outside        'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`; 'auto' is 'ignore' where the object
+                   reaches the edge of the panel in some view (`masks.truncated`), else 'invalid'
     """
 
     n_points: int = 50_000
@@ -78,8 +80,19 @@ def draw(cells, count: int, rng):
     return np.concatenate(rounds)[:count], np.arange(count) >= len(cells)
 
 
+def _outside(wanted: str, found) -> str:
+    """What views say of cells outside their images, after a word on truncated scans."""
+    cut = truncated(found)
+    if not cut.any():
+        return 'invalid' if wanted == 'auto' else wanted
+    if wanted == 'invalid':
+        warnings.warn(f'the object reaches the edge of the panel in {np.count_nonzero(cut)} of {len(cut)} views, and what a '
+                      "view does not see is taken for empty: for a truncated scan set outside=ignore", stacklevel=3)
+    return 'ignore' if wanted == 'auto' else wanted
+
+
 def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = Settings(), rng=None,
-               render=None, fdk=None) -> InitialCloud:
+               render=None, fdk=None, valid=None) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
     frames       n views in the normalised frame (`Geometry.normalised_frames`)
@@ -90,6 +103,7 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
     render       for density 'lsq' and 'fdk': render(points, density, spacing, views) -> projections [len(views), v, u]
                  of that cloud of isotropic Gaussians, for the view indices `views`
     fdk          for density 'fdk': the reconstruction [x, y, z]
+    valid        bool [n, v, u], pixels to trust; None: all of them
 
     Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid; points of the low set
     sit at the cell centres, but for repeats (there may be fewer valid cells than points), which are jittered
@@ -106,11 +120,12 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
     if settings.density == 'fdk' and fdk is None:
         raise InputError("density 'fdk' needs a reconstruction: give one, or choose another density")
 
-    found = masks(projections, settings.low_factor)
-    P = occupancy(frames, found, half, nVoxel, settings.resolution, settings.misses, settings.outside)
+    found = masks(projections, settings.low_factor, valid)
+    outside = _outside(settings.outside, found)
+    P = occupancy(frames, found, half, nVoxel, settings.resolution, settings.misses, outside)
     S = scale_factor(P, settings.V_S)
     grid = scaled_grid(nVoxel, S)
-    low, high = valid_voxels(frames, found, grid, half, settings.misses, settings.outside)
+    low, high = valid_voxels(frames, found, grid, half, settings.misses, outside)
     if len(low) == 0:
         raise InputError('no voxel lies in the low-density mask of every view: check the geometry and '
                          "the volume's size, or, for a truncated scan, set outside='ignore' or misses > 0")
@@ -132,17 +147,19 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
         density = sampled(fdk, points, half)
     else:
         unique, inverse = np.unique(cells, return_inverse=True)
-        density = mean_pixel(frames, projections, voxel_centres(grid, half, unique))[inverse]
+        density = mean_pixel(frames, projections, voxel_centres(grid, half, unique), valid)[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
     if settings.density in ('lsq', 'fdk'):
         n = len(frames)
         views = np.unique(np.arange(min(n, settings.lsq_views)) * n // min(n, settings.lsq_views))
-        factor = least_squares_factor(projections[views], render(points, density, spacing, views))
+        rendered = render(points, density, spacing, views)
+        trusted = ... if valid is None else valid[views]
+        factor = least_squares_factor(projections[views][trusted], rendered[trusted])
     else:
         factor = FACTORS[settings.density]
     return InitialCloud(points, density * factor, spacing, {
         'method': 'lingo', 'P': P, 'S': S, 'grid': grid,
         'density': settings.density, 'density_factor': factor,
         'cells_low': len(low), 'cells_high': len(high), 'points_low': n_low, 'points_high': n_high,
-        'repeats': int(repeats),
+        'repeats': int(repeats), 'outside': outside,
         'T_high': float(found.t_high.mean()), 'seconds': time.perf_counter() - begun})

@@ -14,21 +14,40 @@ class Masks:
 
     low, high     bool [n, v, u]; high is part of low wherever the thresholds are positive
     t_low, t_high float64 [n], in units of the projections
+    valid         bool [n, v, u], pixels that were measured; None: all of them
     """
 
     low: np.ndarray
     high: np.ndarray
     t_low: np.ndarray
     t_high: np.ndarray
+    valid: np.ndarray | None = None
 
 
-def masks(projections, low_factor: float = 0.1) -> Masks:
+def masks(projections, low_factor: float = 0.1, valid=None) -> Masks:
     """M_h = I > T_h with T_h = Otsu(I), and M_l = I > T_l with T_l = `low_factor` T_h, per view.
 
     projections  [n, v, u] line integrals (the object is bright)
+    valid        bool [n, v, u]; other pixels count for no threshold and are in no mask. None: all are valid
     """
     projections = np.asarray(projections)
-    t_high = np.array([otsu(image) for image in projections])
+    known = [...] * len(projections) if valid is None else valid
+    t_high = np.array([otsu(image[v]) if v is ... or v.any() else 0. for image, v in zip(projections, known)])
     t_low = t_high * low_factor
     at = (slice(None), None, None)
-    return Masks(projections > t_low[at], projections > t_high[at], t_low, t_high)
+    low, high = projections > t_low[at], projections > t_high[at]
+    if valid is not None:
+        low, high = low & valid, high & valid
+    return Masks(low, high, t_low, t_high, valid)
+
+
+def truncated(found: Masks, share: float = .05) -> np.ndarray:
+    """Views, bool [n], in which the object reaches the edge of the panel: the low mask holds more than `share` of the
+    outermost pixels of a side.
+
+    Across a side of one pixel (a fan beam's rows) nothing is said.
+    """
+    low = found.low
+    sides = [low[:, :, 0], low[:, :, -1]] if low.shape[2] > 1 else []
+    sides += [low[:, 0], low[:, -1]] if low.shape[1] > 1 else []
+    return np.any([side.mean(1) > share for side in sides], 0) if sides else np.zeros(len(low), bool)

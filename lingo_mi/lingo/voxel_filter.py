@@ -101,6 +101,8 @@ def valid_voxels(frames: Frames, masks: Masks, grid, half, misses: int = 0, outs
     outside  what a view says of a cell that projects outside its image: 'invalid' counts as a miss (paper);
              'ignore' leaves the view out, for truncated scans (a cell that no view sees is still invalid)
 
+    A view says nothing of a cell that it sees in a pixel that is not valid.
+
     Raises InputError for another value of `outside`, or a number of masks that is not the number of views.
     """
     if outside not in ('invalid', 'ignore'):
@@ -109,22 +111,29 @@ def valid_voxels(frames: Frames, masks: Masks, grid, half, misses: int = 0, outs
         raise InputError(f'{len(masks.low)} masks were given for {len(frames)} views: one a view is needed')
     shape = masks.low.shape[1:]
     low_images, high_images = masks.low.reshape(len(frames), -1), masks.high.reshape(len(frames), -1)
+    valid = None if masks.valid is None else masks.valid.reshape(len(frames), -1)
     matrices = camera_matrices(frames)
     low, high = [], []
     total = int(np.prod(grid))
     cells = np.arange(total)
     if total > CHUNK:
-        cells = _candidates(matrices, masks.low, grid, half, misses, outside)
+        # Nothing is known behind pixels that are not valid.
+        possible = masks.low if valid is None else masks.low | ~masks.valid
+        cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):
         alive = cells[start:start + CHUNK]
         points = np.ascontiguousarray(voxel_centres(grid, half, alive).T)
         missed_low, missed_high, seen = (np.zeros(len(alive), np.int32) for _ in range(3))
-        for matrix, low_image, high_image in zip(matrices, low_images, high_images):
+        for view, (matrix, low_image, high_image) in enumerate(zip(matrices, low_images, high_images)):
             index, inside = pixels(matrix, points, shape)
             counts = inside if outside == 'ignore' else True
+            known = inside
+            if valid is not None:
+                known = inside & valid[view][index]
+                counts = counts & (known | ~inside)
             missed_low += counts & ~(low_image[index] & inside)
             missed_high += counts & ~(high_image[index] & inside)
-            seen += inside
+            seen += known
             keep = (missed_low <= misses) | (missed_high <= misses)
             if np.count_nonzero(keep) < 0.9 * len(keep):  # a cell out of both sets never comes back
                 alive, points, missed_low, missed_high, seen = (

@@ -142,9 +142,15 @@ def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
     A voxel outside a view's panel gets nothing from that view. With one detector row only the slice in the
     plane of the fan is meaningful. One compiled kernel serves all views.
 
-    Raises InputError for an unknown filter.
+    Raises InputError for an unknown filter, a scan that is no circle about z, or one with pixels
+    that are not valid.
     """
     geometry = scan.geometry
+    if geometry.poses is not None:
+        raise InputError('filtered backprojection needs a source on a circle about z and an upright panel; this scan has '
+                         'other poses')
+    if scan.valid is not None:
+        raise InputError('filtered backprojection needs every pixel, and some of this scan are not valid: fill them first')
     ramp(geometry.nDetector[1], 1., filter)  # an unknown name must fail before the work
     volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
     dr.make_opaque(volume)

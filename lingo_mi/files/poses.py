@@ -1,0 +1,63 @@
+"""Files of poses, one for every view, whatever their convention: `read_poses` finds the reader.
+
+    .xml            RTK's geometry (`rtk_geometry`): needs dDetector; the panel is centred but for the file's own offsets
+    .npy, .txt, .csv   12 numbers a view, ASTRA's vectors (`astra`): [n, 12]; or projection matrices (`matrices`):
+                    [n, 3, 4], which need dDetector, the pixel size that a matrix leaves open
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..frames import Frames
+from . import arrays, astra, matrices, rtk_geometry
+from .paths import one_line, reading
+
+
+def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=(0., 0., 0.)) -> Frames:
+    """The views of a file of poses, in mm.
+
+    nDetector   (v, u) pixels
+    dDetector   (v, u) mm, where the file does not say it
+    parallel    the beam of a .npy, .txt or .csv; an .xml says it itself
+    towards     a point in front of every source, which settles a matrix's sign: the volume's centre
+
+    Raises InputError where the file is missing, damaged, or of no known kind, or dDetector is wanted and missing.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == '.xml':
+        return rtk_geometry.read(path, nDetector, _needed(dDetector, path))
+    if suffix == '.npy':
+        values = arrays.load(path, None)
+    elif suffix in ('.txt', '.csv'):
+        values = _table(path)
+    else:
+        raise InputError(f'{path}: is no known file of poses; give RTK\'s .xml, or a .npy, .txt or .csv '
+                         'of 12 numbers a view')
+    try:
+        if values.ndim == 3 and values.shape[1:] == (3, 4):
+            return matrices.from_matrices(values, nDetector, _needed(dDetector, path), parallel, towards)
+        return astra.from_vectors(values, nDetector, parallel)
+    except InputError as error:
+        raise error if str(error).startswith(str(path)) else InputError(f'{path}: {error}') from None
+
+
+def _needed(dDetector, path):
+    if dDetector is None:
+        raise InputError(f'{path}: leaves the size of a pixel open; add dDetector')
+    return dDetector
+
+
+def _table(path):
+    try:
+        with reading(path):
+            text = path.read_text(encoding='utf-8')
+        rows = [line.split('#')[0].replace(',', ' ').split() for line in text.splitlines()]
+        return np.array([[float(x) for x in row] for row in rows if row], float)
+    except InputError:
+        raise
+    except ValueError as error:  # also of rows of several lengths, and of bytes that are no text
+        raise InputError(f'{path}: is no table of 12 numbers a view ({one_line(error)})') from None

@@ -1,0 +1,149 @@
+"""RTK's geometry files: `RTKThreeDCircularGeometry` in XML, versions 2 and 3.
+
+Every view has SourceToIsocenterDistance (SID), SourceToDetectorDistance (SDD; 0: a parallel beam), GantryAngle,
+OutOfPlaneAngle and InPlaneAngle in degrees, ProjectionOffsetX and Y, SourceOffsetX and Y, in mm; what all views share may
+stand before them. RTK's axes are (x, y, z) = (our y, our z, our x), and the view's own are
+
+    (e1, e2, e3) = Ry(GantryAngle) Rx(OutOfPlaneAngle) Rz(InPlaneAngle)
+    source       SourceOffsetX e1 + SourceOffsetY e2 + SID e3
+    panel        (x + ProjectionOffsetX) e1 + (y + ProjectionOffsetY) e2 + (SID - SDD) e3
+
+with x, y the position in the image of projections. The image's spacing and origin are not in the file: spacing is
+dDetector, and the image is taken as centred, its origin at minus half of (pixels - 1) spacings. RTK's rows run up, this
+package's down: the rows of RTK's stacks must be reversed, `stack[:, ::-1]`, to go with the poses read here.
+
+Rit et al., "The Reconstruction Toolkit (RTK)", J. Phys.: Conf. Ser. 489 (2014), and RTK's documentation, "Geometry".
+"""
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from ..frames import Frames, rotation
+from ..lingo.camera import camera_matrices
+from .paths import one_line, reading, replacing
+
+ROOT = 'RTKThreeDCircularGeometry'
+_NUMBERS = ('SourceToIsocenterDistance', 'SourceToDetectorDistance', 'GantryAngle', 'OutOfPlaneAngle', 'InPlaneAngle',
+            'ProjectionOffsetX', 'ProjectionOffsetY', 'SourceOffsetX', 'SourceOffsetY')
+_IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', 'CollimationVSup')
+_AXES = [2, 0, 1]  # our x, y, z in RTK's
+
+
+def read(path, nDetector, dDetector) -> Frames:
+    """The views of a file, in mm, rows down. nDetector, dDetector: (v, u), pixels and mm.
+
+    Raises InputError where the file is missing, damaged or another one, for cylindrical detectors, and for elements that
+    are not known. The matrices in the file, which follow from its numbers, and collimation are passed over.
+    """
+    views = [[view[name] for name in _NUMBERS] for view in _views(path)]
+    if not views:
+        raise InputError(f'{path}: holds no projections')
+    sid, sdd, gantry, out, turn, px, py, sx, sy = np.array(views).T
+    parallel = not sdd.any()
+    if not parallel and not (sdd > 0).all():
+        raise InputError(f'{path}: mixes parallel and cone beams (SourceToDetectorDistance of 0 and not), or has a negative '
+                         'distance')
+    axes = rotation('y', np.radians(gantry)) @ rotation('x', np.radians(out)) @ rotation('z', np.radians(turn))
+    e1, e2, e3 = (axes[:, _AXES, i] for i in range(3))
+    (nv, nu), (dv, du) = nDetector, dDetector
+    x, y, z = (a[:, None] for a in (px - nu / 2 * du, py + nv / 2 * dv, sid - sdd if not parallel else 0 * sid))
+    source = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
+    try:
+        return Frames(source, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from None
+
+
+def write(path, frames: Frames, nDetector) -> None:
+    """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
+
+    Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between
+    views, mirrored ones, panels askew to a parallel beam; and where the file cannot be written.
+    """
+    step_u, step_v = (np.linalg.norm(a, axis=1) for a in (frames.u, frames.v))
+    e1, e2 = frames.u / step_u[:, None], -frames.v / step_v[:, None]
+    e3 = np.cross(e1, e2)
+    if np.abs(np.sum(e1 * e2, 1)).max() > 1e-6:
+        raise InputError(f'{path}: RTK has no panels whose rows and columns are not at right angles')
+    if any(np.ptp(step) > 1e-6 * step.mean() for step in (step_u, step_v)):
+        raise InputError(f'{path}: RTK has one pixel size for all views')
+    centre = frames.centre(nDetector)
+    zero = np.zeros(len(frames))
+    if frames.parallel:
+        if np.abs(np.cross(frames.source, e3)).max() > 1e-6:
+            raise InputError(f'{path}: RTK has no panels askew to a parallel beam')
+        sid, sdd, sx, sy = np.full(len(frames), 1000.), zero, zero, zero
+    else:
+        sx, sy, sid = (np.sum(frames.source * e, 1) for e in (e1, e2, e3))
+        sdd = sid - np.sum(centre * e3, 1)
+    if (np.sum(frames.source * e3, 1) > 0 if frames.parallel else sdd <= 0).any():
+        raise InputError(f'{path}: RTK has no mirrored panels')
+    axes = np.stack([e[:, [1, 2, 0]] for e in (e1, e2, e3)], -1)
+    gantry, out, turn = Rotation.from_matrix(axes).as_euler('YXZ', degrees=True).T
+    px, py = (np.sum(centre * e, 1) for e in (e1, e2))
+    columns = dict(zip(_NUMBERS, (sid, sdd, np.mod(gantry, 360), out, turn, px, py, sx, sy)))
+    root = ElementTree.Element(ROOT, version='3')
+    for view, matrix in enumerate(_matrices(frames, nDetector, sdd, step_u, step_v)):
+        node = ElementTree.SubElement(root, 'Projection')
+        for name, values in columns.items():
+            ElementTree.SubElement(node, name).text = repr(float(values[view]))
+        ElementTree.SubElement(node, 'Matrix').text = '\n' + '\n'.join(' '.join(repr(float(x)) for x in row)
+                                                                       for row in matrix) + '\n'
+    ElementTree.indent(root)
+    text = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding='utf-8')
+
+
+def _views(path):
+    """Numbers of every view by name, with those that all views share."""
+    try:
+        with reading(path):
+            root = ElementTree.fromstring(Path(path).read_text(encoding='utf-8'))
+    except InputError:
+        raise
+    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(f'{path}: is no XML ({one_line(error)})') from None
+    if root.tag != ROOT or root.get('version') not in ('2', '3'):
+        raise InputError(f'{path}: is no {ROOT} of version 2 or 3')
+    shared = dict.fromkeys(_NUMBERS, 0.)
+    for node in root:
+        if node.tag != 'Projection':
+            shared.update(_number(node, path))
+    for node in root:
+        if node.tag == 'Projection':
+            view = dict(shared)
+            for item in node:
+                view.update(_number(item, path))
+            yield view
+
+
+def _number(node, path) -> dict:
+    if node.tag in _IGNORED:
+        return {}
+    try:
+        value = float(node.text)
+        if not np.isfinite(value):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise InputError(f'{path}: {node.tag} must be a finite number, not {node.text!r}') from None
+    if node.tag == 'RadiusCylindricalDetector' and value == 0:
+        return {}
+    if node.tag not in _NUMBERS:
+        raise InputError(f'{path}: {node.tag} = {value:g} is not supported')
+    return {node.tag: value}
+
+
+def _matrices(frames, nDetector, sdd, step_u, step_v):
+    """RTK's own matrices: from RTK's (x, y, z, 1) to the image's position in mm, times the negative distance."""
+    to_mm = np.zeros((len(frames), 3, 3))
+    to_mm[:, 0, 0], to_mm[:, 0, 2] = step_u, -nDetector[1] / 2 * step_u
+    to_mm[:, 1, 1], to_mm[:, 1, 2] = -step_v, nDetector[0] / 2 * step_v
+    to_mm[:, 2, 2] = 1
+    scale = np.ones(len(frames)) if frames.parallel else -sdd
+    return scale[:, None, None] * (to_mm @ camera_matrices(frames))[:, :, [1, 2, 0, 3]]

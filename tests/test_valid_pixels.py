@@ -1,0 +1,258 @@
+"""Pixels that are left out, and scans that the panel cuts off: in the scan, its file, the initial cloud and the fit."""
+import warnings
+
+import drjit as dr
+import numpy as np
+import pytest
+import yaml
+from test_fit import SHORT, error_of, geometry, some_points, tiny_scan
+
+from lingo_mi.errors import InputError
+from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fit.loop import run
+from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.step import Target
+from lingo_mi.geometry import circular
+from lingo_mi.lingo.initialise import Settings, initialise
+from lingo_mi.lingo.masks import masks, truncated
+from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.recon.fdk import fdk
+from lingo_mi.scan import Dataset, Scan
+
+
+@pytest.fixture(scope='module')
+def scan():
+    return tiny_scan(geometry(6))
+
+
+def patches(scan, seed=0):
+    """A mask that leaves out a patch of every view, a whole column, and one view's lower half."""
+    rng = np.random.default_rng(seed)
+    valid = np.ones(scan.projections.shape, bool)
+    for mask in valid:
+        row, column = rng.integers(6, 18, 2)
+        mask[row:row + 7, column:column + 6] = False
+    valid[:, :, 20] = False
+    valid[2, 16:] = False
+    return valid
+
+
+def spoilt(scan, valid, value):
+    return np.where(valid, scan.projections, value)
+
+
+# ---- the scan ----------------------------------------------------------------------------------------------
+
+def test_what_is_not_valid_is_forgotten(scan):
+    valid = patches(scan)
+    for value in (np.nan, 1e6, -3):
+        masked = Scan(scan.geometry, spoilt(scan, valid, value), valid)
+        np.testing.assert_array_equal(masked.projections, scan.projections * valid)
+    np.testing.assert_array_equal(masked.subset([4, 1]).valid, valid[[4, 1]])
+    assert Scan(scan.geometry, scan.projections, np.ones_like(valid)).valid is None
+    binned = masked.binned(2)
+    assert binned.valid.shape == binned.projections.shape
+    for v, row, column in ((0, 3, 10), (2, 8, 3), (3, 0, 0)):
+        assert binned.valid[v, row, column] == valid[v, 2 * row:2 * row + 2, 2 * column:2 * column + 2].all()
+    assert not binned.valid[:, :, 10].any() and binned.valid[3, 0, 0]
+
+
+@pytest.mark.parametrize('mask, match', [
+    (np.ones((6, 32, 31), bool), 'shape of the projections'), (np.ones((6, 32, 32)), 'true or false'),
+    (np.zeros((6, 32, 32), bool), 'no pixel')])
+def test_bad_masks(scan, mask, match):
+    with pytest.raises(InputError, match=match):
+        Scan(scan.geometry, scan.projections, mask)
+
+
+def test_files_keep_the_mask(tmp_path, scan):
+    valid = patches(scan)
+    masked = Scan(scan.geometry, scan.projections, valid)
+    write_scan(tmp_path / 'a.npy', masked, 'npy')
+    back = read_scan(tmp_path / 'a.npy').train
+    np.testing.assert_array_equal(back.valid, valid)
+    np.testing.assert_array_equal(back.projections, masked.projections)
+    for kind in ('naf', 'r2', 'exr'):
+        with pytest.raises(InputError, match='no mask of valid pixels'):
+            write_scan(tmp_path / 'b', masked, kind)
+    # One mask for all views; dead pixels of intensities have no logarithm, and NaN is no obstacle where it is masked.
+    values = yaml.safe_load((tmp_path / 'a.yml').read_text()) | {'input': 'intensity', 'I0': 1e4, 'valid': 'dead.npy'}
+    counts = 1e4 * np.exp(-scan.projections / scan.projections.max())
+    counts[:, 3, 4], counts[:, 5, 6] = 0, np.nan
+    dead = np.ones((32, 32), bool)
+    dead[3, 4] = dead[5, 6] = False
+    np.save(tmp_path / 'a.npy', counts)
+    np.save(tmp_path / 'dead.npy', dead)
+    (tmp_path / 'a.yml').write_text(yaml.safe_dump(values))
+    back = read_scan(tmp_path / 'a.npy').train
+    np.testing.assert_array_equal(back.valid, np.broadcast_to(dead, valid.shape))
+    np.testing.assert_allclose(back.projections, dead * scan.projections / scan.projections.max(), atol=1e-6)
+    for bad, match in ((dead.astype(float), 'must be bool'), (dead[:5], 'of the shape')):
+        np.save(tmp_path / 'dead.npy', bad)
+        with pytest.raises(InputError, match=match):
+            read_scan(tmp_path / 'a.npy')
+    (tmp_path / 'a.yml').write_text(yaml.safe_dump({k: v for k, v in values.items() if k != 'valid'}))
+    with pytest.raises(InputError, match='NaN'):
+        read_scan(tmp_path / 'a.npy')
+
+
+def test_filtered_backprojection_needs_every_pixel(scan):
+    with pytest.raises(InputError, match='needs every pixel'):
+        fdk(Scan(scan.geometry, scan.projections, patches(scan)))
+
+
+# ---- the initial cloud -------------------------------------------------------------------------------------
+
+def brute_force(frames, found, points, misses, outside):
+    """Low valid set by the definition, one point and view at a time."""
+    keep = []
+    for point in points:
+        missed = seen = 0
+        for view in range(len(frames)):
+            x, y = (q[0] for q in frames.project(point[None], view))
+            inside = 0 <= x < found.low.shape[2] and 0 <= y < found.low.shape[1]
+            if not inside:
+                missed += outside == 'invalid'
+            elif found.valid[view, int(y), int(x)]:
+                seen += 1
+                missed += not found.low[view, int(y), int(x)]
+        keep.append(missed <= misses and seen > 0)
+    return np.flatnonzero(keep)
+
+
+@pytest.mark.parametrize('outside', ['invalid', 'ignore'])
+@pytest.mark.parametrize('misses', [0, 1])
+def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
+    g, valid = scan.geometry, patches(scan)
+    found = masks(spoilt(scan, valid, 1e9) * g.scale, .1, valid)
+    expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.scale, .1)
+    assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
+    frames, grid = g.normalised_frames(), (12, 12, 12)
+    low, high = valid_voxels(frames, found, grid, g.half, misses, outside)
+    np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.half), misses, outside))
+    assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.half, misses, outside)[0])
+    # Blocks of cells are tested at once on large grids; they must not lose a cell behind an invalid pixel.
+    large = (40, 40, 40)
+    whole = valid_voxels(frames, found, large, g.half, misses, outside)[0]
+    sample = np.random.default_rng(0).choice(40 ** 3, 300, replace=False)
+    expected = sample[brute_force(frames, found, voxel_centres(large, g.half, sample), misses, outside)]
+    np.testing.assert_array_equal(np.sort(expected), np.intersect1d(whole, sample))
+
+
+def test_densities_come_from_valid_pixels(scan):
+    """Whatever stands in the others, the cloud is the same."""
+    g, valid, clouds = scan.geometry, patches(scan), []
+    for value in (0, 1e6):
+        def render(points, density, spacing, views, value=value):
+            return spoilt(scan, valid, value)[views] * g.scale
+        clouds.append(initialise(g.normalised_frames(), spoilt(scan, valid, value) * g.scale, g.nVoxel, g.half,
+                                 Settings(n_points=300), np.random.default_rng(0), render, valid=valid))
+    np.testing.assert_array_equal(clouds[0].points, clouds[1].points)
+    np.testing.assert_array_equal(clouds[0].density, clouds[1].density)
+    assert (clouds[0].density > 0).all()
+
+
+# ---- truncation --------------------------------------------------------------------------------------------
+
+def cropped(columns=14):
+    """The object is wider than the panel: only its middle columns are seen."""
+    g = geometry(6, nDetector=(32, columns))
+    return tiny_scan(g), tiny_scan(geometry(6, nDetector=(48, 48)))
+
+
+def test_truncated_views_are_found():
+    narrow, wide = cropped()
+    assert truncated(masks(narrow.projections)).all()
+    assert not truncated(masks(wide.projections)).any()
+    one = wide.projections.copy()
+    one[3, 5:9, 0] = one.max()
+    assert truncated(masks(one)).tolist() == [False, False, False, True, False, False]
+    fan = np.zeros((2, 1, 32))
+    fan[:, :, 10:20] = 1
+    assert not truncated(masks(fan)).any()
+
+
+def test_truncated_scans_keep_what_the_panel_misses():
+    narrow, wide = cropped()
+    g = narrow.geometry
+
+    def cloud(outside):
+        settings = METHODS['fast'].changed(outside=outside, n_points=400)
+        return initial_cloud(narrow, settings)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        automatic = cloud('auto')
+        literal = cloud('ignore')
+        whole = initial_cloud(wide, METHODS['fast'].changed(n_points=400))
+    with pytest.warns(UserWarning, match='edge of the panel in 6 of 6 views'):
+        strict = cloud('invalid')
+    assert automatic.info['outside'] == 'ignore' and whole.info['outside'] == 'invalid'
+    np.testing.assert_array_equal(automatic.points, literal.points)
+    # Columns of the points in the first view, from the middle of the 14. Points are drawn up to half a cell from those seen.
+    beyond = [np.mean(np.abs(g.normalised_frames().project(c.points, 0)[0] - 7) > 7.5) for c in (strict, automatic)]
+    assert beyond[0] == 0 and beyond[1] > .02
+
+
+# ---- the fit -----------------------------------------------------------------------------------------------
+
+def kernels(scan, settings, start):
+    """Hashes of the compiled kernels of a fit, in the order of their launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        run(scan, settings, start, seed=3)
+        return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]
+
+
+def test_without_a_mask_no_kernel_knows_of_masks(scan, monkeypatch):
+    settings, start = SHORT.changed(iterations=6, densify_from=100), some_points(scan.geometry)
+    masked = Scan(scan.geometry, scan.projections, patches(scan))
+    plain, with_mask = kernels(scan, settings, start), kernels(masked, settings, start)
+    with monkeypatch.context() as patch:
+        patch.setattr(Target, 'seen', lambda self, image: image)
+        bare = kernels(scan, settings, start)
+    assert plain == bare and len(plain) > 6
+    assert set(with_mask) - set(plain)
+    assert len(set(with_mask)) <= len(set(plain))  # one form for all views, whatever their masks
+
+
+def test_held_out_pixels_that_are_not_valid_do_not_count(scan):
+    from types import SimpleNamespace
+
+    from lingo_mi.results import quick_measure
+    valid = patches(scan)
+    dataset = Dataset(scan, Scan(scan.geometry, scan.projections, valid))
+
+    def measured(value):
+        views = spoilt(scan, valid, value) * np.float32(1.01)
+        return quick_measure(dataset, 9)(SimpleNamespace(render=lambda state, geometry: views), None)
+    assert measured(0) == measured(1e6) and np.isfinite(measured(0)['psnr_2d'])
+
+
+def test_fit_of_a_spoilt_scan(scan):
+    """With the mask, what is not valid leaves no trace in the fit; without it, it ruins the fit."""
+    valid, start = patches(scan), some_points(scan.geometry)
+    settings = SHORT.changed(iterations=150, densify_from=1000)
+    good = run(scan, settings, start, seed=3)
+    masked = run(Scan(scan.geometry, spoilt(scan, valid, 5 * scan.projections.max()), valid), settings, start, seed=3)
+    ruined = run(Scan(scan.geometry, spoilt(scan, valid, 0)), settings, start, seed=3)
+    errors = [error_of(fitted, scan) for fitted in (good, masked, ruined)]
+    assert errors[1] < 2 * errors[0] and errors[1] < errors[2] / 2
+
+
+def test_initial_cloud_of_a_masked_scan(scan):
+    masked = Scan(scan.geometry, scan.projections, patches(scan))
+    cloud = initial_cloud(masked, METHODS['fast'].changed(n_points=300))
+    assert len(cloud) == 300 and (cloud.density > 0).all()
+    with pytest.raises(InputError, match='needs every pixel'):
+        initial_cloud(masked, METHODS['r2'].changed(n_points=300))
+
+
+def test_views_without_one_valid_pixel():
+    scan = tiny_scan(geometry(4, angles=circular(4, 180)))
+    valid = np.ones(scan.projections.shape, bool)
+    valid[1] = False
+    blind = Scan(scan.geometry, scan.projections, valid)
+    cloud = initial_cloud(blind, METHODS['fast'].changed(n_points=200))
+    fitted = run(blind, SHORT.changed(iterations=8), cloud)
+    assert all(np.isfinite(v).all() for v in fitted.state.values.values())
