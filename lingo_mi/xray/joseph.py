@@ -73,6 +73,10 @@ class Joseph:
         self.voxels, self.pixels = int(np.prod(self.size)), int(np.prod(self.panel))
         if self.voxels >= 2 ** 32:
             raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
+        half = np.hypot(*(abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2])))
+        if geometry.mode == 'cone' and geometry.DSO <= half:
+            raise InputError(f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
+                             f'{half:.4g} mm from the axis; lower nVoxel or dVoxel')
         frames, voxel = geometry.frames(), geometry.dVoxel[2]
         first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
         self._columns = mi.Float(column_table(geometry).ravel())
