@@ -53,7 +53,7 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
     return response * WINDOWS[window](np.linspace(0, 1, len(response)))
 
 
-def _gaps(geometry: Geometry, turn: float):
+def gaps(geometry: Geometry, turn: float):
     """The order of the views around the circle, the step after each in that order, and whether the circle is open.
 
     Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
@@ -84,7 +84,7 @@ def view_weights(geometry: Geometry) -> np.ndarray:
     if n == 1:
         return np.array([np.pi])
     # A parallel beam repeats after half a turn.
-    order, gap, _ = _gaps(geometry, np.pi if geometry.mode == 'parallel' else 2 * np.pi)
+    order, gap, _ = gaps(geometry, np.pi if geometry.mode == 'parallel' else 2 * np.pi)
     weight = np.empty(n)
     weight[order] = (gap + np.roll(gap, 1)) / 2
     return weight * min(1., np.pi / gap.sum())
@@ -112,7 +112,7 @@ def ray_weights(geometry: Geometry) -> np.ndarray:
         return 1 + np.sin(np.pi / 2 * np.clip(np.sign(offset) * fan / overlap, -1, 1))[None]
     if not cone or len(geometry) == 1:
         return np.ones((1, n_u))
-    order, gap, is_open = _gaps(geometry, 2 * np.pi)
+    order, gap, is_open = gaps(geometry, 2 * np.pi)
     excess = (gap.sum() - np.pi) / 2
     if not is_open or excess <= np.abs(fan).max():
         return np.ones((1, n_u))
@@ -125,7 +125,7 @@ def ray_weights(geometry: Geometry) -> np.ndarray:
 
 def _lacking(geometry: Geometry) -> int:
     """Columns that a panel lacks on its shorter side, where the other side is seen from behind: on a closed circle."""
-    if len(geometry) == 1 or _gaps(geometry, 2 * np.pi)[2]:
+    if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
         return 0
     return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
 

@@ -90,11 +90,13 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     return Reconstruction(system.volume(x), residuals)
 
 
-def sart(scan: Scan, niter: int = 20, **options) -> Reconstruction:
-    """SART: an update after every view. Parameters as `os_sart`, but for the blocksize."""
-    return os_sart(scan, niter, 1, **options)
+def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True,
+         order: str = 'random', init=None, tol: float = 0., seed: int = 0, progress=None) -> Reconstruction:
+    """SART: an update after every view. Parameters as in `os_sart`."""
+    return os_sart(scan, niter, 1, lmbda, lmbda_red, nonneg, order, init, tol, seed, progress)
 
 
-def sirt(scan: Scan, niter: int = 100, **options) -> Reconstruction:
-    """SIRT: one update from all views. Parameters as `os_sart`, but for the blocksize; the order does not matter."""
-    return os_sart(scan, niter, len(scan), order='ordered', **options)
+def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True, init=None,
+         tol: float = 0., progress=None) -> Reconstruction:
+    """SIRT: one update from all views. Parameters as in `os_sart`."""
+    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, nonneg, 'ordered', init, tol, progress=progress)

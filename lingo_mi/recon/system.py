@@ -74,7 +74,7 @@ def scalar(x: float):
 
 def dot(a, b) -> float:
     """Inner product: sums of 4096 terms in float32, these in float64."""
-    return float(dr.block_sum(a * b, PARTIAL).numpy().sum(dtype=np.float64))
+    return float(dr.block_sum(a * b, min(PARTIAL, dr.width(a))).numpy().sum(dtype=np.float64))
 
 
 def norm(a) -> float:

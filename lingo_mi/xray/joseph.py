@@ -97,8 +97,7 @@ class Joseph:
 
     def select(self, images, views):
         """The images of the views `views` out of those of all views."""
-        chosen = mi.UInt(np.asarray(views, np.uint32))
-        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
+        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
         block = index // self.pixels
         return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen, block) - block) * self.pixels)
 
@@ -107,8 +106,7 @@ class Joseph:
 
         A 1 is the path of the ray through the box, mm.
         """
-        chosen = mi.UInt(np.asarray(views, np.uint32))
-        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
+        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
         column = index // self.panel[0]
         block = column // self.panel[1]
         row = index - column * self.panel[0]
@@ -120,9 +118,13 @@ class Joseph:
 
         images : mi.Float [block, u, v]
         """
-        chosen = mi.UInt(np.asarray(views, np.uint32))
-        return _collect(images, chosen, dr.opaque(mi.UInt, len(chosen)), self.size, self.panel, self._columns, self._rows,
-                        self._matrix)
+        return _collect(images, _numbers(views), dr.opaque(mi.UInt, len(views)), self.size, self.panel, self._columns,
+                        self._rows, self._matrix)
+
+
+def _numbers(views):
+    """View numbers on the device, and one more: an array of one would make another kernel."""
+    return mi.UInt(np.append(np.asarray(views, np.uint32), np.uint32(0)))
 
 
 def _hat(position, index, n):
