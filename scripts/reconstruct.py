@@ -33,8 +33,8 @@ def arguments():
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument('-D', dest='define', action='append', default=[], metavar='NAME=VALUE',
-                   help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of the '
-                   'scene file')
+                   help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of '
+                   'the scene file')
     return p.parse_args()
 
 

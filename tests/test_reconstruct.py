@@ -47,7 +47,8 @@ def load(path):
     ('cgls', ['niter=3', 'tol=0.01']), ('asd-pocs', ['niter=2', 'tviter=3', 'nonneg=true', 'maxl2err=5'])])
 def test_every_algorithm(scene, dataset, tmp_path, algorithm, options):
     out = tmp_path / 'new' / 'volume.nii.gz'
-    code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, '--out', out, *(a for o in options for a in ('-D', o)))
+    defined = (a for o in options for a in ('-D', o))
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, '--out', out, *defined)
     assert code == 0, err
     shown = float(re.search(r'PSNR (\S+) dB', text)[1])
     assert abs(shown - psnr_3d(load(out), dataset.volume)) < 0.006 and shown > 10
@@ -94,7 +95,8 @@ def test_missing_angles(dataset):
 
 @pytest.mark.parametrize('args, message', [
     (['--views', '99'], 'the scan has 8'), (['--views', '-1'], '--views'), (['-D', 'nitre=3'], 'nitre'),
-    (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'), (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'),
+    (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
+    (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'),
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'), (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
     (['--algorithm', 'voxelize'], '--complete'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),

@@ -34,8 +34,8 @@ def _neighbours(size):
 def tv_gradient(volume, size):
     """Derivative of the total variation, mi.Float [voxels], times voxels' own unit.
 
-    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + epsilon), with backward differences that are zero at the border
-    (Sidky and Pan, equation 3), epsilon a 1e-8th of the largest sum of squares. Voxels count as cubes.
+    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + epsilon), with backward differences that are zero at the
+    border (Sidky and Pan, equation 3), epsilon a 1e-8th of the largest sum of squares. Voxels count as cubes.
     """
     before, after = _neighbours(size)
     difference = [volume - dr.gather(mi.Float, volume, i) for i in before]

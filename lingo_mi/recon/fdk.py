@@ -75,8 +75,8 @@ def gaps(geometry: Geometry, turn: float):
 def view_weights(geometry: Geometry) -> np.ndarray:
     """The angle that every view stands for, [view] radians: half the gaps to its neighbours on the circle.
 
-    Repeated views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum to pi, as
-    they do for half a turn. An open arc above half a turn is scaled to pi as a whole; `ray_weights` then tells rays
+    Repeated views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum to
+    pi, as they do for half a turn. An open arc above half a turn is scaled to pi as a whole; `ray_weights` then tells rays
     that were measured twice from those measured once. An arc below half a turn keeps its own angle (a limited-angle
     scan lacks density).
     """
@@ -93,8 +93,9 @@ def view_weights(geometry: Geometry) -> np.ndarray:
 def ray_weights(geometry: Geometry) -> np.ndarray:
     """Share of every ray among its repetitions, times their usual number: [view, u], or [1, u] where views agree.
 
-    short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal short
-                       scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in place of
+    short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
+                       short scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in
+                       place of
                        the fan angle (Silver, Med. Phys. 27, 2000)
     offset detector    a closed circle and a panel that reaches farther on one side: Wang, "X-ray micro-CT with a displaced
                        detector array", Med. Phys. 29 (2002); the columns must then be `extended`

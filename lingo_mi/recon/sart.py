@@ -1,6 +1,7 @@
 """SART, OS-SART and SIRT: one update rule, taken a view, a block of views, or all views at a time.
 
-Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984). For the rows A_b of a block,
+Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984). For the rows A_b of a
+block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 

@@ -34,8 +34,8 @@ def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
     turn = np.exp(1j * dataset.train.geometry.angles)
     distance = np.abs(np.exp(1j * geometry.angles)[:, None] - turn)
     if len(dataset.train) < len(geometry) or distance.min(1).max() > 1e-5:
-        raise InputError(f'the cloud was fitted to {len(geometry)} views, not all of which are among the {len(dataset.train)} of '
-                         'this scan: give the scan that it was fitted to')
+        raise InputError(f'the cloud was fitted to {len(geometry)} views, not all of which are among the '
+                         f'{len(dataset.train)} of this scan: give the scan that it was fitted to')
     return dataset.train.subset(np.sort(distance.argmin(1)))
 
 
