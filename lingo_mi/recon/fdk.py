@@ -95,8 +95,7 @@ def ray_weights(geometry: Geometry) -> np.ndarray:
 
     short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
                        short scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in
-                       place of
-                       the fan angle (Silver, Med. Phys. 27, 2000)
+                       place of the fan angle (Silver, Med. Phys. 27, 2000)
     offset detector    a closed circle and a panel that reaches farther on one side: Wang, "X-ray micro-CT with a displaced
                        detector array", Med. Phys. 29 (2002); the columns must then be `extended`
     otherwise 1        also for an arc that exceeds half a turn by less than the fan angle
