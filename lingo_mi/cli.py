@@ -70,6 +70,45 @@ def between_steps():
         signal.signal(signal.SIGINT, before)
 
 
+def input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say what is scanned: scene, --projections, --volume and what goes with them."""
+    parser.add_argument('scene', help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml')
+    parser.add_argument('--projections', metavar='F', help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, '
+                        '.npy with a geometry .yml beside it, or a folder of EXR images')
+    parser.add_argument('--volume', metavar='F', help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, "
+                        'NPY/NPZ, raw, a TIFF stack or a DICOM folder')
+    parser.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
+    parser.add_argument('--dtype', help='type of a raw --volume, such as uint8')
+    parser.add_argument('--mu-water', type=float, metavar='MU', help='a --volume in HU becomes MU (1 + HU / 1000) per mm '
+                        '(default: HU are mapped to densities in [0, 1])')
+
+
+def check_input(args) -> None:
+    """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
+    if args.views < 0:
+        raise InputError(f'--views must be at least 1, not {args.views}')
+    if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
+        raise InputError('--shape, --dtype and --mu-water go with --volume')
+    if args.projections and args.volume:
+        raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
+
+
+def read_input(args, scene, views: int):
+    """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
+
+    scene   the `LoadedScene` of args.scene
+    views   how many evenly spaced views to use (0: all)
+    """
+    from .files.scans import read_scan
+    from .files.volumes import read_volume
+    from .scanning import check_memory, choose_views, take_scan
+    if args.projections:
+        dataset = choose_views(read_scan(args.projections), views)
+        check_memory(dataset.train.geometry)
+        return dataset
+    return take_scan(scene, views, read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None)
+
+
 def definitions(pairs) -> dict[str, str]:
     """The NAME=VALUE arguments of -D as a dictionary."""
     out = {}

@@ -125,7 +125,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
     if views and test is not None:  # unused views are needed only where nothing else is held out
         geometry = geometry.subset(spread(len(geometry), views))
     every = geometry if test is None else geometry.joined(test)
-    everything = Scan(every, _render(objects, every))
+    everything = Scan(every, render_objects(objects, every))
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
     meshes = [s for s in loaded.scene.shapes() if s.is_mesh() and s.interior_medium() is not None]
@@ -152,7 +152,7 @@ class _Volume:
         return grid.project(self.data, geometry, progress)
 
 
-def _render(objects, geometry) -> np.ndarray:
+def render_objects(objects, geometry) -> np.ndarray:
     """Line integrals of all objects in all views, float32 [view, v, u]."""
     total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
     with Progress('Scan', len(geometry) * len(objects)) as bar:
@@ -198,12 +198,7 @@ def _truth(objects, meshes, geometry) -> np.ndarray | None:
         elif isinstance(thing, GridInCube) and _on_grid(thing, geometry):
             total += _values(thing)
         elif isinstance(thing, Ellipsoids):
-            from .xray.frame import vector64
-            from .xray.voxelize import Grid, voxelize
-            corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
-            cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
-            flat = voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, 6.).numpy()
-            total += flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0)
+            total += voxelize_cloud(thing, geometry)
         elif isinstance(thing, HomogeneousMesh):
             from .phantoms.mesh import voxelise
             params = mi.traverse(next(homogeneous))
@@ -214,6 +209,16 @@ def _truth(objects, meshes, geometry) -> np.ndarray | None:
         else:
             return None
     return total
+
+
+def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
+    """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm."""
+    from .xray.frame import vector64
+    from .xray.voxelize import Grid, voxelize
+    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+    cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
+    flat = voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, 6.).numpy()
+    return np.ascontiguousarray(flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0))
 
 
 def _warn_if_truncated(geometry: Geometry):

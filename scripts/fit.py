@@ -16,7 +16,7 @@ import shlex
 import sys
 from pathlib import Path
 
-from lingo_mi.cli import Parser, between_steps, definitions, guard, writable_folder
+from lingo_mi.cli import Parser, between_steps, check_input, definitions, guard, input_arguments, read_input, writable_folder
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.runtime import use_variant
@@ -24,20 +24,12 @@ from lingo_mi.runtime import use_variant
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('scene', help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml')
+    input_arguments(p)
     p.add_argument('--method', choices=METHODS, default='fast',
                    help='recipe: fast (default), or the published lingo and r2')
     p.add_argument('--views', type=int, default=0, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
     p.add_argument('--init', choices=('lingo', 'r2'), help='initial cloud: Otsu masks (lingo) or an FDK volume (r2)')
-    p.add_argument('--projections', metavar='F', help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, '
-                   '.npy with a geometry .yml beside it, or a folder of EXR images')
-    p.add_argument('--volume', metavar='F', help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, "
-                   'NPY/NPZ, raw, a TIFF stack or a DICOM folder')
-    p.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
-    p.add_argument('--dtype', help='type of a raw --volume, such as uint8')
-    p.add_argument('--mu-water', type=float, metavar='MU', help='a --volume in HU becomes MU (1 + HU / 1000) per mm '
-                   '(default: HU are mapped to densities in [0, 1])')
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
     p.add_argument('--force', action='store_true', help='replace an earlier result')
@@ -51,22 +43,15 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.files.scans import read_scan
-    from lingo_mi.files.volumes import read_volume
     from lingo_mi.fit.initial import initial_cloud
     from lingo_mi.fit.loop import run
     from lingo_mi.progress import Progress
     from lingo_mi.results import CHECKPOINT, METRICS, quick_measure, summary, write_results
-    from lingo_mi.scanning import check_memory, choose_views, defaults, load_scene, take_scan
+    from lingo_mi.scanning import defaults, load_scene
 
-    if args.views < 0:
-        raise InputError(f'--views must be at least 1, not {args.views}')
+    check_input(args)
     if args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
-    if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
-        raise InputError('--shape, --dtype and --mu-water go with --volume')
-    if args.projections and args.volume:
-        raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
     defined = definitions(args.define)
     own = defaults(args.scene)  # a name of the scene goes before a setting's
     given = {k: v for k, v in defined.items() if k not in own}
@@ -80,12 +65,7 @@ def main():
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
-    if args.projections:
-        scan = choose_views(read_scan(args.projections), args.views)
-        check_memory(scan.train.geometry)
-    else:
-        volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
-        scan = take_scan(scene, args.views, volume)
+    scan = read_input(args, scene, args.views)
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
     with Progress('Fit', settings.iterations) as bar, between_steps() as check:
         def progress(iteration, **fields):

@@ -43,12 +43,17 @@ def fit(*args, report=False):
 
     report   whether to draw the report too, which takes longer than such a fit
     """
+    return run(FIT, *args, report=report)
+
+
+def run(script, *args, report=False):
+    """Exit code, standard output and standard error of `script ARGS`, run in this process; see `fit`."""
     out, err = io.StringIO(), io.StringIO()
-    argv = [str(FIT), *map(str, args), *([] if '--variant' in args else ['--variant', mi.variant()])]
+    argv = [str(script), *map(str, args), *([] if '--variant' in args else ['--variant', mi.variant()])]
     drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.results.write_report')
     with drawn, mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            runpy.run_path(str(FIT), run_name='__main__')
+            runpy.run_path(str(script), run_name='__main__')
             code = 0
         except SystemExit as stop:
             code = stop.code

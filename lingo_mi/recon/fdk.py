@@ -10,6 +10,8 @@ where the view weights dbeta sum to pi (`view_weights`). A parallel beam has w =
 """
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -19,6 +21,7 @@ from ..errors import InputError
 from ..geometry import Geometry
 from ..lingo.camera import camera_matrices
 from ..scan import Scan
+from .circle import require_circle
 
 # Apodisation of the ramp over |frequency| in units of the Nyquist frequency, f in [0, 1].
 WINDOWS = {
@@ -51,29 +54,97 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
     return response * WINDOWS[window](np.linspace(0, 1, len(response)))
 
 
+def gaps(geometry: Geometry, turn: float):
+    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
+
+    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
+    step.
+    """
+    angle = np.mod(geometry.angles, turn)
+    order = np.argsort(angle, kind='stable')
+    gap = np.diff(angle[order], append=angle[order[0]] + turn)
+    distinct = np.sort(gap[gap > 1e-6])
+    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
+    is_open = bool(distinct[-1] > 1.5 * typical)
+    if is_open:
+        widest = np.argmax(gap)
+        gap[widest] = typical
+        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
+    return order, gap, is_open
+
+
 def view_weights(geometry: Geometry) -> np.ndarray:
     """The angle that every view stands for, [view] radians: half the gaps to its neighbours on the circle.
 
-    Angles are taken modulo a full turn (parallel: half a turn, after which a parallel beam repeats). Repeated
-    views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum
-    to pi, as they do for half a turn. An open span above half a turn is scaled to pi as a whole: there is no
-    Parker weighting, rays that were measured twice count twice. A span below half a turn keeps its own angle
-    (a limited-angle scan lacks density).
+    Repeated views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum to
+    pi, as they do for half a turn. An open arc above half a turn is scaled to pi as a whole; `ray_weights` then tells rays
+    that were measured twice from those measured once. An arc below half a turn keeps its own angle (a limited-angle
+    scan lacks density).
     """
-    turn = np.pi if geometry.mode == 'parallel' else 2 * np.pi
-    angle = np.mod(geometry.angles, turn)
-    order = np.argsort(angle, kind='stable')
-    n = len(angle)
+    n = len(geometry)
     if n == 1:
         return np.array([np.pi])
-    gap = np.diff(angle[order], append=angle[order[0]] + turn)  # gap after each view
-    distinct = np.sort(gap[gap > 1e-6])
-    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
-    if distinct[-1] > 1.5 * typical:  # an open span: the views at its ends stand for a typical step
-        gap[np.argmax(gap)] = typical
+    # A parallel beam repeats after half a turn.
+    order, gap, _ = gaps(geometry, np.pi if geometry.mode == 'parallel' else 2 * np.pi)
     weight = np.empty(n)
     weight[order] = (gap + np.roll(gap, 1)) / 2
     return weight * min(1., np.pi / gap.sum())
+
+
+def ray_weights(geometry: Geometry) -> np.ndarray:
+    """Share of every ray among its repetitions, times their usual number: [view, u], or [1, u] where views agree.
+
+    short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
+                       short scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in
+                       place of the fan angle (Silver, Med. Phys. 27, 2000)
+    offset detector    a closed circle and a panel that reaches farther on one side: Wang, "X-ray micro-CT with a displaced
+                       detector array", Med. Phys. 29 (2002); the columns must then be `extended`
+    otherwise 1        also for an arc that exceeds half a turn by less than the fan angle
+    """
+    n_u, d_u, offset = geometry.nDetector[1], geometry.dDetector[1], geometry.offDetector[1]
+    u = (np.arange(n_u) - (n_u - 1) / 2) * d_u + offset
+    cone = geometry.mode == 'cone'
+    fan = np.arctan(u / geometry.DSD) if cone else u
+    if _lacking(geometry):
+        edge = n_u / 2 * d_u - abs(offset)
+        if edge <= 0:  # the axis is not seen: nothing is measured twice
+            return np.full((1, n_u), 2.)
+        overlap = np.arctan(edge / geometry.DSD) if cone else edge
+        return 1 + np.sin(np.pi / 2 * np.clip(np.sign(offset) * fan / overlap, -1, 1))[None]
+    if not cone or len(geometry) == 1:
+        return np.ones((1, n_u))
+    order, gap, is_open = gaps(geometry, 2 * np.pi)
+    excess = (gap.sum() - np.pi) / 2
+    if not is_open or excess <= np.abs(fan).max():
+        return np.ones((1, n_u))
+    beta = np.empty((len(geometry), 1))
+    beta[order, 0] = np.cumsum(gap) - gap / 2
+    # The same line is seen from beta + pi - 2 fan.
+    rise, fall = beta / (excess + fan), (np.pi + 2 * excess - beta) / (excess - fan)
+    return np.sin(np.pi / 4 * np.clip(np.minimum(rise, fall), 0, 2)) ** 2 * gap.sum() / np.pi
+
+
+def _lacking(geometry: Geometry) -> int:
+    """Columns that a panel lacks on its shorter side, where the other side is seen from behind: on a closed circle."""
+    if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
+        return 0
+    return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
+
+
+def extended(scan: Scan) -> Scan:
+    """A scan of a closed circle with columns of zeros on the panel's shorter side, so that it reaches as far on both.
+
+    Filtering spreads what was measured there. Any other scan is returned as it is.
+    """
+    geometry = scan.geometry
+    lacking = _lacking(geometry)
+    if lacking == 0:
+        return scan
+    (n_v, n_u), (off_v, off_u), side = geometry.nDetector, geometry.offDetector, np.sign(geometry.offDetector[1])
+    wider = replace(geometry, nDetector=(n_v, n_u + lacking),
+                    offDetector=(off_v, off_u - side * lacking * geometry.dDetector[1] / 2))
+    columns = (lacking, 0) if side > 0 else (0, lacking)
+    return Scan(wider, np.pad(scan.projections, ((0, 0), (0, 0), columns)))
 
 
 def voxel_matrices(geometry: Geometry) -> np.ndarray:
@@ -134,24 +205,22 @@ def _add_views(volume, views, geometry):
 def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
     """Reconstruct a volume by filtered backprojection: float32 [x, y, z], density per mm.
 
-    scan       cone (one detector row: fan) or parallel, detector offsets included; the panel must see the
+    scan       cone (one detector row: fan) or parallel, detector offsets included; the views together must see the
                whole width of the object, otherwise the truncated rows are filtered as they are
     filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'
     progress   called as progress(views done, views) after every few views
 
-    A voxel outside a view's panel gets nothing from that view. With one detector row only the slice in the
-    plane of the fan is meaningful. One compiled kernel serves all views.
+    Short scans and offset detectors are weighted, see `ray_weights`. A voxel outside a view's panel gets nothing from that
+    view. With one detector row only the slice in the plane of the fan is meaningful. One compiled kernel serves all
+    views.
 
-    Raises InputError for an unknown filter, a scan that is no circle about z, or one with pixels
-    that are not valid.
+    Raises InputError for an unknown filter, a scan that is no circle about z, or one with pixels that are not valid.
     """
+    ramp(scan.geometry.nDetector[1], 1., filter)  # an unknown name must fail before the work
+    require_circle(scan, 'filtered backprojection')
+    rays = ray_weights(scan.geometry)[:, None].astype(np.float32)
+    scan = extended(Scan(scan.geometry, scan.projections * rays))
     geometry = scan.geometry
-    if geometry.poses is not None:
-        raise InputError('filtered backprojection needs a source on a circle about z and an upright panel; this scan has '
-                         'other poses')
-    if scan.valid is not None:
-        raise InputError('filtered backprojection needs every pixel, and some of this scan are not valid: fill them first')
-    ramp(geometry.nDetector[1], 1., filter)  # an unknown name must fail before the work
     volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
     dr.make_opaque(volume)
     matrices, weights = voxel_matrices(geometry), view_weights(geometry)

@@ -1,0 +1,121 @@
+"""ASD-POCS: SART steps towards the data, then steepest descent on total variation, in balance.
+
+Sidky and Pan, "Image reconstruction in circular cone-beam computed tomography by constrained, total-variation
+minimization", Phys. Med. Biol. 53 (2008), algorithm of section 2.3; names and defaults are TIGRE's.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..scan import Scan
+from .fdk import fdk
+from .sart import blocks, sweep
+from .system import Reconstruction, System, check_counts, check_range, dot, evaluated, norm, scalar
+
+EPSILON = 1e-8   # added to the squared gradient, relative to its largest value in the volume: TV is not smooth at zero
+LMBDA_MIN = 0.005
+
+
+def _neighbours(size):
+    """Flat indices of the voxels before and after every voxel along x, y, z; at the border the voxel itself."""
+    nx, ny, nz = size
+    index = dr.arange(mi.UInt, nx * ny * nz)
+    line = index // nz
+    x = line // ny
+    position = x, line - x * ny, index - line * nz
+    stride = ny * nz, nz, 1
+    before = [index - dr.select(p > 0, mi.UInt(s), 0) for p, s in zip(position, stride)]
+    after = [index + dr.select(p < n - 1, mi.UInt(s), 0) for p, n, s in zip(position, size, stride)]
+    return before, after
+
+
+def tv_gradient(volume, size):
+    """Derivative of the total variation, mi.Float [voxels], times voxels' own unit.
+
+    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + epsilon), with backward differences that are zero at the
+    border (Sidky and Pan, equation 3), epsilon a 1e-8th of the largest sum of squares. Voxels count as cubes.
+    """
+    before, after = _neighbours(size)
+    difference = [volume - dr.gather(mi.Float, volume, i) for i in before]
+    square = evaluated(difference[0] ** 2 + difference[1] ** 2 + difference[2] ** 2)
+    floor = dr.maximum(EPSILON * dr.max(square), 1e-30)
+    inverse = evaluated(dr.rsqrt(square + floor))
+    total = (difference[0] + difference[1] + difference[2]) * inverse
+    for i in after:  # at the border the difference is zero
+        total -= (dr.gather(mi.Float, volume, i) - volume) * dr.gather(mi.Float, inverse, i)
+    return evaluated(total)
+
+
+def minimise_tv(volume, size, step: float, tviter: int):
+    """`tviter` steps of length `step` (a norm of the change) down the total variation."""
+    for _ in range(tviter):
+        gradient = tv_gradient(volume, size)
+        length = norm(gradient)
+        if length == 0:
+            break
+        volume = evaluated(dr.fma(scalar(-step / length), gradient, volume))
+    return volume
+
+
+def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1., lmbda_red: float = 0.99, tviter: int = 20,
+             alpha: float = 0.002, alpha_red: float = 0.95, rmax: float = 0.95, maxl2err: float | None = None,
+             nonneg: bool = True, order: str = 'random', init=None, seed: int = 0, progress=None) -> Reconstruction:
+    """Adaptive steepest descent, projection onto convex sets.
+
+    scan         projections and geometry
+    niter        passes over all views, at most
+    blocksize    views an update of the data step (1: SART, else OS-SART)
+    lmbda        relaxation of the data step, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
+    tviter       steepest-descent steps on total variation a pass
+    alpha        length of these steps over the change of the first data step
+    alpha_red    factor on the step length where total variation changed more than `rmax` times what the data changed,
+                 while the data are not met
+    rmax         see `alpha_red`
+    maxl2err     |A x - b| at which the data count as met, density times mm (default: 0.2 |A fdk(b) - b|)
+    nonneg       whether negative densities are set to zero by the data step
+    order        of the blocks, see `os_sart`
+    init         start volume [x, y, z], density per mm (default: zero)
+    seed         of the random order
+    progress     called as progress(passes done, niter, residual)
+
+    Stops where the data are met and both steps undo each other (cosine below -0.99), or lmbda falls below 0.005. The
+    volume is the one after descent, as TIGRE's; the residuals are those of the data steps before it.
+
+    Raises InputError for a parameter out of its range and a start volume that does not fit.
+    """
+    check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
+    for name, value, high in (('lmbda', lmbda, 2), ('lmbda_red', lmbda_red, 1), ('alpha', alpha, np.inf),
+                              ('alpha_red', alpha_red, 1), ('rmax', rmax, np.inf)):
+        check_range(name, value, 0, high)
+    system, rng = System(scan), np.random.default_rng(seed)
+    angles, size = scan.geometry.angles, scan.geometry.nVoxel
+    blocks(angles, blocksize, order, rng)
+    x = system.start(init)
+    if maxl2err is None:
+        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b
+    residuals = [system.residual(x)[1]]
+    step = None
+    for k in range(niter):
+        start = x
+        x = sweep(system, x, lmbda, blocks(angles, blocksize, order, rng), nonneg)
+        residuals.append(system.residual(x)[1])
+        error = residuals[-1] * system.size_b
+        data_change = evaluated(x - start)
+        data_length = norm(data_change)
+        if step is None:
+            step = alpha * data_length
+        start = x
+        x = minimise_tv(x, size, step, tviter)
+        tv_change = evaluated(x - start)
+        tv_length = norm(tv_change)
+        if tv_length > rmax * data_length and error > maxl2err:
+            step *= alpha_red
+        lmbda *= lmbda_red
+        if progress:
+            progress(k + 1, niter, residuals[-1])
+        cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
+        if (cosine < -0.99 and error <= maxl2err) or lmbda < LMBDA_MIN:
+            break
+    return Reconstruction(system.volume(x), residuals)

@@ -1,0 +1,103 @@
+"""SART, OS-SART and SIRT: one update rule, taken a view, a block of views, or all views at a time.
+
+Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984). For the rows A_b of a
+block,
+
+    x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
+
+where division is by voxel and by pixel, and what no ray meets is left alone. Names and defaults are TIGRE's.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from ..errors import InputError
+from ..scan import Scan
+from .system import Reconstruction, System, check_counts, check_range, evaluated, scalar
+
+ORDERS = ('ordered', 'random', 'angularDistance')
+
+
+def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
+    """The views [block][views of it] of one pass: blocks of consecutive views, in one of three orders.
+
+    order   'ordered'; 'random'; or 'angularDistance', which takes next the block that is farthest from all before (the most
+            distant on the circle, by the blocks' middle views)
+
+    Raises InputError for an unknown order.
+    """
+    parts = [np.arange(i, min(i + blocksize, len(angles))) for i in range(0, len(angles), blocksize)]
+    if order == 'ordered':
+        return parts
+    if order == 'random':
+        return [parts[i] for i in rng.permutation(len(parts))]
+    if order != 'angularDistance':
+        raise InputError(f'order {order!r} is unknown: use one of {", ".join(ORDERS)}')
+    middle = np.array([angles[p[len(p) // 2]] for p in parts])
+    nearest, out = np.full(len(parts), np.inf), [0]
+    while len(out) < len(parts):
+        nearest = np.minimum(nearest, 1 - np.cos(middle - middle[out[-1]]))
+        nearest[out[-1]] = -1
+        out.append(int(np.argmax(nearest)))
+    return [parts[i] for i in out]
+
+
+def sweep(system: System, x, lmbda: float, parts, nonneg: bool):
+    """One pass over all blocks: the new volume, on the device."""
+    A, step = system.A, scalar(lmbda)
+    for views in parts:
+        ax, path = A.forward(x, views)
+        error = A.select(system.b, views) - ax
+        error = evaluated(dr.select(path > 0, error * dr.rcp(dr.maximum(path, 1e-30)), 0))
+        change, weight = A.adjoint(error, views)
+        x = dr.fma(step, dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0), x)
+        x = evaluated(dr.maximum(x, 0) if nonneg else x)
+    return x
+
+
+def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1., lmbda_red: float = 0.99,
+            nonneg: bool = True, order: str = 'random', init=None, tol: float = 0., seed: int = 0,
+            progress=None) -> Reconstruction:
+    """Ordered-subset SART.
+
+    scan        projections and geometry
+    niter       passes over all views
+    blocksize   views an update
+    lmbda       relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
+    nonneg      whether negative densities are set to zero after every update
+    order       of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance'
+    init        start volume [x, y, z], density per mm (default: zero)
+    tol         stop when |A x - b| / |b| is no larger
+    seed        of the random order
+    progress    called as progress(passes done, niter, residual)
+
+    Raises InputError for a parameter out of its range and a start volume that does not fit.
+    """
+    check_counts(niter=niter, blocksize=blocksize)
+    check_range('lmbda', lmbda, 0, 2)
+    check_range('lmbda_red', lmbda_red, 0, 1)
+    system, rng = System(scan), np.random.default_rng(seed)
+    blocks(scan.geometry.angles, blocksize, order, rng)  # an unknown order must fail before the work
+    x = system.start(init)
+    residuals = [system.residual(x)[1]]
+    for k in range(niter):
+        if residuals[-1] <= tol:
+            break
+        x = sweep(system, x, lmbda * lmbda_red ** k, blocks(scan.geometry.angles, blocksize, order, rng), nonneg)
+        residuals.append(system.residual(x)[1])
+        if progress:
+            progress(k + 1, niter, residuals[-1])
+    return Reconstruction(system.volume(x), residuals)
+
+
+def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True,
+         order: str = 'random', init=None, tol: float = 0., seed: int = 0, progress=None) -> Reconstruction:
+    """SART: an update after every view. Parameters as in `os_sart`."""
+    return os_sart(scan, niter, 1, lmbda, lmbda_red, nonneg, order, init, tol, seed, progress)
+
+
+def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True, init=None,
+         tol: float = 0., progress=None) -> Reconstruction:
+    """SIRT: one update from all views. Parameters as in `os_sart`."""
+    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, nonneg, 'ordered', init, tol, progress=progress)

@@ -1,0 +1,99 @@
+"""What the iterative algorithms share: the linear system A x = b of a scan on the device, and what they return."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from ..scan import Scan
+from ..xray.joseph import Joseph
+from .circle import require_circle
+
+PARTIAL = 4096  # terms of a sum that are added in float32
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A volume and how it was reached.
+
+    volume      float32 [x, y, z], density per mm
+    residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|)
+    """
+
+    volume: np.ndarray
+    residuals: list[float]
+
+
+class System:
+    """A x = b of a scan: Joseph's projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm.
+
+    Raises InputError for a scan that is no circle about z, or one with pixels that are not valid.
+    """
+
+    def __init__(self, scan: Scan):
+        require_circle(scan, 'an iterative algorithm')
+        self.geometry, self.A = scan.geometry, Joseph(scan.geometry)
+        self.views = np.arange(len(scan))
+        self.b = self.A.images(scan.projections)
+        self.size_b = norm(self.b) or 1.
+
+    def start(self, init):
+        """The start volume on the device: zero, or `init` [x, y, z], density per mm.
+
+        Raises InputError where `init` does not fit the geometry or is not finite.
+        """
+        if init is None:
+            x = dr.zeros(mi.Float, self.A.voxels)
+            dr.make_opaque(x)
+            return x
+        init = np.ascontiguousarray(init, np.float32)
+        if init.shape != self.geometry.nVoxel:
+            raise InputError(f'the start volume has the shape {init.shape}, but the geometry says '
+                             f'nVoxel = {self.geometry.nVoxel}')
+        if not np.isfinite(init).all():
+            raise InputError('the start volume contains NaN or infinity')
+        return evaluated(mi.Float(init.ravel()) + scalar(0))  # a copy: the algorithms write into theirs
+
+    def residual(self, x):
+        """b - A x of all views, and its norm over that of b."""
+        r = evaluated(self.b - self.A.forward(x, self.views)[0])
+        return r, norm(r) / self.size_b
+
+    def volume(self, x) -> np.ndarray:
+        """A device volume as float32 [x, y, z]."""
+        return x.numpy().reshape(self.geometry.nVoxel)
+
+
+def evaluated(x):
+    dr.eval(x)
+    return x
+
+
+def scalar(x: float):
+    """A number that changes between iterations: a literal would be compiled into the kernel."""
+    return dr.opaque(mi.Float, float(x))
+
+
+def dot(a, b) -> float:
+    """Inner product: sums of 4096 terms in float32, these in float64."""
+    return float(dr.block_sum(a * b, min(PARTIAL, dr.width(a))).numpy().sum(dtype=np.float64))
+
+
+def norm(a) -> float:
+    return dot(a, a) ** 0.5
+
+
+def check_counts(**counts):
+    """Raises InputError for a count that is not a positive integer."""
+    for name, value in counts.items():
+        if value != int(value) or value < 1:
+            raise InputError(f'{name} must be a positive integer, not {value}')
+
+
+def check_range(name: str, value: float, low: float, high: float):
+    """Raises InputError for a parameter outside low < value <= high."""
+    if not low < value <= high:
+        raise InputError(f'{name} must be above {low:g} and at most {high:g}, not {value}')

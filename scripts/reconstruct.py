@@ -1,0 +1,130 @@
+#!/usr/bin/env python3
+"""Reconstruct a CT volume from projections, measured or simulated, or completed from a fitted cloud.
+
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm fdk
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm asd-pocs --views 25 -D niter=20 --out foot.nii.gz
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --complete out/x3d_foot/result.xml --views 100
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm voxelize --complete out/x3d_foot/result.xml
+
+The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
+are rendered from it, and the volume is made of both. Where the true volume is known, PSNR and SSIM are printed.
+"""
+import argparse
+import inspect
+import os
+import time
+from pathlib import Path
+
+from lingo_mi.cli import Parser, check_input, definitions, guard, input_arguments, read_input
+from lingo_mi.errors import InputError
+from lingo_mi.runtime import use_variant
+
+ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'voxelize')
+
+
+def arguments():
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    input_arguments(p)
+    p.add_argument('--algorithm', choices=ALGORITHMS, default='fdk', help='(default: fdk)')
+    p.add_argument('--views', type=int, default=0, metavar='N', help='use N evenly spaced views (default: all); with '
+                   '--complete: measured and rendered ones together')
+    p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered')
+    p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
+    p.add_argument('--force', action='store_true', help='replace an earlier volume')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    p.add_argument('-D', dest='define', action='append', default=[], metavar='NAME=VALUE',
+                   help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of '
+                   'the scene file')
+    return p.parse_args()
+
+
+def output(path: Path, force: bool) -> Path:
+    """The output file, if it can be written without spoiling one."""
+    if not path.name.endswith(('.nii', '.nii.gz')):
+        raise InputError(f'{path}: volumes are written as NIfTI; give an --out that ends in .nii or .nii.gz')
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder; choose another --out')
+    if path.exists() and not force:
+        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
+    nearest = next(p for p in path.absolute().parents if p.exists())
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+        raise InputError(f'{path}: cannot write there; choose another --out')
+    return path
+
+
+def options(function, given: dict[str, str]) -> dict:
+    """The -D values of an algorithm's own parameters, with the types of their defaults."""
+    known = {name: p.default for name, p in inspect.signature(function).parameters.items()
+             if p.default is not p.empty and name not in ('init', 'progress')}
+    out = {}
+    for name, text in given.items():
+        if name not in known:
+            raise InputError(f'-D {name}: neither a parameter of the scene nor of {function.__name__} '
+                             f'({", ".join(known) or "it has none"})')
+        kind = float if known[name] is None else type(known[name])
+        try:
+            out[name] = {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
+        except (KeyError, ValueError):
+            raise InputError(f'-D {name}={text}: must be {"true or false" if kind is bool else "a number"}') from None
+    return out
+
+
+def main():
+    args = arguments()
+    use_variant(args.variant)
+    from lingo_mi import metrics
+    from lingo_mi.files.volumes import first_voxel, write_volume
+    from lingo_mi.progress import Progress
+    from lingo_mi.recon.asd_pocs import asd_pocs
+    from lingo_mi.recon.cgls import cgls
+    from lingo_mi.recon.fdk import fdk
+    from lingo_mi.recon.sart import os_sart, sart, sirt
+    from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud
+    from lingo_mi.scanning import defaults, load_scene, voxelize_cloud
+
+    check_input(args)
+    if args.algorithm == 'voxelize' and not args.complete:
+        raise InputError('--algorithm voxelize samples a fitted cloud: name its result.xml with --complete')
+    if args.complete and not args.views and args.algorithm != 'voxelize':
+        raise InputError('--complete needs --views, the number of measured and rendered views together')
+    run = {'fdk': fdk, 'sart': sart, 'os-sart': os_sart, 'sirt': sirt, 'cgls': cgls, 'asd-pocs': asd_pocs,
+           'voxelize': voxelize_cloud}[args.algorithm]
+    defined, own = definitions(args.define), defaults(args.scene)
+    given = options(run, {k: v for k, v in defined.items() if k not in own})
+    out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
+    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
+    cloud, fitted = load_cloud(args.complete) if args.complete else (None, None)
+    dataset = read_input(args, scene, 0 if args.complete else args.views)
+    scan = dataset.train
+    began = time.monotonic()
+    if args.algorithm == 'voxelize':
+        volume, residuals = voxelize_cloud(cloud, scan.geometry), []
+    else:
+        if args.complete:
+            scan = complete(fitted_views(dataset, fitted), cloud, args.views)
+        began = time.monotonic()
+        volume, residuals = reconstruct(run, scan, given, Progress)
+    seconds = time.monotonic() - began
+    geometry = scan.geometry
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_volume(out, volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+    print(f'{args.algorithm} of {len(scan)} views: {seconds:.1f} s'
+          + (f', |A x - b| / |b| = {residuals[-1]:.4g} after {len(residuals) - 1} iterations' if residuals else ''))
+    if dataset.volume is not None:
+        print(f'volume          PSNR {metrics.psnr_3d(volume, dataset.volume):.2f} dB, '
+              f'SSIM {metrics.ssim_3d(volume, dataset.volume):.4f}')
+    print(out)
+
+
+def reconstruct(run, scan, given, Progress):
+    """Volume and residual history of an algorithm, with a progress bar."""
+    total = len(scan) if run.__name__ == 'fdk' else given.get('niter', inspect.signature(run).parameters['niter'].default)
+    with Progress(run.__name__, total) as bar:
+        def progress(done, _, residual=None):
+            bar.update(done, residual=residual)
+        result = run(scan, **given, progress=progress)
+    return (result, []) if run.__name__ == 'fdk' else (result.volume, result.residuals)
+
+
+if __name__ == '__main__':
+    guard(main)

@@ -1,0 +1,240 @@
+"""SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, the analytic ball, bad input."""
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.sparse.linalg import lsqr
+from test_fdk import BALL, centres, ellipsoids, geometry
+from test_grid_projector import scan as small
+from test_joseph import matrix
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.recon.asd_pocs import asd_pocs, tv_gradient
+from lingo_mi.recon.cgls import cgls
+from lingo_mi.recon.fdk import fdk
+from lingo_mi.recon.sart import blocks, os_sart, sart, sirt
+from lingo_mi.recon.two_stage import complete
+from lingo_mi.scan import Scan
+from lingo_mi.xray.joseph import Joseph
+
+ALGORITHMS = dict(sart=sart, os_sart=os_sart, sirt=sirt, cgls=cgls, asd_pocs=asd_pocs)
+
+
+@pytest.fixture(scope='module')
+def system():
+    """A scan with noise, its matrix [view, pixels, voxels] and its projections [view, pixels], float64."""
+    geo = small(n=5)
+    A, rng = matrix(geo), np.random.default_rng(0)
+    truth = np.maximum(rng.normal(0.3, 1, A.shape[1]), 0)
+    b = A @ truth + rng.normal(0, 2, A.shape[0])
+    scan = Scan(geo, b.reshape(5, *geo.nDetector))
+    return scan, A.reshape(5, -1, A.shape[1]), scan.projections.reshape(5, -1).astype(float)
+
+
+def divide(a, b):
+    return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
+
+
+def sart_pass(x, A, b, lmbda, parts, nonneg=True):
+    """One pass of SART as Andersen and Kak write it."""
+    for part in parts:
+        rows, data = np.concatenate(A[part]), np.concatenate(b[part])
+        x = x + lmbda * divide(rows.T @ divide(data - rows @ x, rows.sum(1)), rows.sum(0))
+        x = np.maximum(x, 0) if nonneg else x
+    return x
+
+
+def close(result, expected):
+    np.testing.assert_allclose(result.volume.ravel(), expected, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('blocksize, nonneg', [(1, True), (2, True), (2, False), (5, True)])
+def test_sart_is_the_transcription(system, blocksize, nonneg):
+    scan, A, b = system
+    start = np.random.default_rng(1).random(scan.geometry.nVoxel)
+    result = os_sart(scan, 3, blocksize, 0.8, 0.9, nonneg, 'ordered', start)
+    x = start.ravel()
+    expected = [np.linalg.norm(A @ x - b) / np.linalg.norm(b)]
+    for k in range(3):
+        x = sart_pass(x, A, b, 0.8 * 0.9 ** k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], nonneg)
+        expected.append(np.linalg.norm(A @ x - b) / np.linalg.norm(b))
+    close(result, x)
+    np.testing.assert_allclose(result.residuals, expected, rtol=1e-4)
+    assert (result.volume.min() < 0) != nonneg
+
+
+def test_names_of_the_family(system):
+    scan, _, _ = system
+    np.testing.assert_array_equal(sirt(scan, 2).volume, os_sart(scan, 2, 5, order='ordered').volume)
+    np.testing.assert_array_equal(sart(scan, 2).volume, os_sart(scan, 2, 1).volume)
+    assert np.abs(sart(scan, 1).volume - sart(scan, 1, seed=1).volume).max() > 0
+
+
+def test_orders():
+    angles, rng = circular(10), np.random.default_rng(0)
+    assert [list(p) for p in blocks(angles, 4, 'ordered', rng)] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    drawn = blocks(angles, 1, 'random', rng)
+    assert sorted(np.concatenate(drawn)) == list(range(10)) and np.any(np.diff(np.concatenate(drawn)) != 1)
+    spread = np.concatenate(blocks(circular(8), 1, 'angularDistance', rng))
+    assert list(spread[:2]) == [0, 4] and set(spread[2:4]) == {2, 6} and sorted(spread) == list(range(8))
+
+
+def test_cgls_is_lsqr_and_its_residual_falls(system):
+    scan, A, b = system
+    result = cgls(scan, 12)
+    expected = lsqr(A.reshape(-1, A.shape[2]), b.ravel(), iter_lim=12, atol=0, btol=0, conlim=0)[0]
+    np.testing.assert_allclose(result.volume.ravel(), expected, atol=2e-3 * np.abs(expected).max())
+    assert len(result.residuals) == 13 and np.all(np.diff(result.residuals) < 0)
+    np.testing.assert_allclose(result.residuals[-1], np.linalg.norm(A @ expected - b) / np.linalg.norm(b), rtol=1e-4)
+    start = np.random.default_rng(2).random(scan.geometry.nVoxel)
+    shifted = Scan(scan.geometry, (b - A @ start.ravel()).reshape(scan.projections.shape))
+    close(cgls(scan, 4, start), start.ravel() + cgls(shifted, 4).volume.ravel())
+
+
+def total_variation(x, epsilon):
+    """Sidky and Pan, equation 3, with backward differences that are zero at the border."""
+    square = sum(np.diff(x, axis=a, prepend=x.take([0], a)) ** 2 for a in range(3))
+    return np.sqrt(square + epsilon * square.max() if epsilon < 1e-3 else square + epsilon).sum()
+
+
+def tv_slope(x):
+    """The derivative of `total_variation`, term by term."""
+    d = [np.diff(x, axis=a, prepend=x.take([0], a)) for a in range(3)]
+    square = sum(v ** 2 for v in d)
+    w = [v / np.sqrt(square + 1e-8 * square.max()) for v in d]
+    return sum(v - np.append(v, np.zeros_like(v.take([0], a)), a).take(np.arange(1, v.shape[a] + 1), a)
+               for a, v in enumerate(w))
+
+
+def test_tv_gradient():
+    x = np.random.default_rng(0).random((5, 4, 6))
+    expected = tv_slope(x)
+    result = tv_gradient(mi.Float(np.float32(x).ravel()), x.shape).numpy()
+    np.testing.assert_allclose(result, expected.ravel(), atol=2e-5)
+    rng = np.random.default_rng(1)
+    direction = 1e-5 * rng.normal(size=x.shape)
+    change = total_variation(x + direction, 1e-8) - total_variation(x - direction, 1e-8)
+    assert abs(change / 2 - (expected * direction).sum()) < 1e-4 * abs(change)
+    assert not tv_gradient(dr.full(mi.Float, 3., 120), x.shape).numpy().any()
+
+
+def test_asd_pocs_is_the_transcription(system):
+    scan, A, b = system
+    shape, maxl2err = scan.geometry.nVoxel, 0.05 * np.linalg.norm(b)
+    result = asd_pocs(scan, 4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, order='ordered')
+    x, lmbda, step, errors = np.zeros(A.shape[2]), 0.9, None, []
+    for _ in range(4):
+        start = x
+        x = sart_pass(x, A, b, lmbda, [np.arange(0, 2), np.arange(2, 4), np.arange(4, 5)])
+        errors.append(np.linalg.norm(A @ x - b))
+        data = np.linalg.norm(x - start)
+        step = 0.2 * data if step is None else step
+        start = x
+        for _ in range(5):
+            slope = tv_slope(x.reshape(shape)).ravel()
+            x = x - step * slope / np.linalg.norm(slope)
+        if np.linalg.norm(x - start) > 0.6 * data and errors[-1] > maxl2err:
+            step *= 0.5
+        lmbda *= 0.95
+    np.testing.assert_allclose(result.residuals[1:], np.array(errors) / np.linalg.norm(b), rtol=1e-3)
+    np.testing.assert_allclose(result.volume.ravel(), x, atol=2e-3 * np.abs(x).max())
+
+
+def test_asd_pocs_stops(system):
+    scan, _, _ = system
+    assert len(asd_pocs(scan, 50, 5, 0.01, 0.8, maxl2err=1.).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
+    met = dict(tviter=5, alpha=0.02, lmbda_red=1., alpha_red=1., maxl2err=1e9, order='ordered')
+    assert len(asd_pocs(scan, 100, 5, **met).residuals) < 100  # the data are met at once: the steps come to undo each other
+    assert len(asd_pocs(scan, 100, 5, **{**met, 'maxl2err': 1e-9}).residuals) == 101
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('name, options', [('sart', dict(niter=3)), ('cgls', dict(niter=12))])
+def test_ball_density_and_position(mode, name, options):
+    geo = geometry(mode, circular(40 if name == 'sart' else 120, start=3))
+    volume, x = ALGORITHMS[name](ellipsoids(geo, BALL), **options).volume, centres(geo)
+    near = np.linalg.norm(x - BALL[0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005
+    for axis in range(3):
+        inside = near < 35
+        position = np.average(x[inside][:, axis], weights=volume[inside])
+        assert abs(position - BALL[0][axis]) < 0.1 * geo.dVoxel[axis]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('name', ['sart', 'os_sart', 'asd_pocs'])
+def test_ball_from_360_views(mode, name):
+    geo = geometry(mode)
+    options = {} if name == 'asd_pocs' else dict(tol=1e-3)
+    volume, x = ALGORITHMS[name](ellipsoids(geo, BALL), niter=5, **options).volume, centres(geo)
+    near = np.linalg.norm(x - BALL[0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+@pytest.mark.parametrize('value', [0., 1., -1.])
+def test_constant_projections(name, value):
+    geo = small(n=2)
+    result = ALGORITHMS[name](Scan(geo, np.full((2, *geo.nDetector), value)), niter=2)
+    assert np.isfinite(result.volume).all() and np.isfinite(result.residuals).all()
+    assert result.volume.dtype == np.float32 and result.volume.shape == geo.nVoxel
+    if name != 'cgls' and value <= 0 and name != 'asd_pocs':
+        assert not result.volume.any()
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+def test_bad_input(name):
+    scan = Scan(small(n=2), np.ones((2, 17, 21)))
+    run = ALGORITHMS[name]
+    with pytest.raises(InputError, match='niter'):
+        run(scan, niter=0)
+    with pytest.raises(InputError, match='nVoxel'):
+        run(scan, init=np.zeros((3, 3, 3)))
+    with pytest.raises(InputError, match='NaN'):
+        run(scan, init=np.full((9, 11, 7), np.nan))
+    if name != 'cgls':
+        with pytest.raises(InputError, match='lmbda'):
+            run(scan, lmbda=3.)
+    if name in ('os_sart', 'asd_pocs'):
+        with pytest.raises(InputError, match='order'):
+            run(scan, order='sorted')
+    calls = []
+    run(scan, niter=2, progress=lambda *a: calls.append(a))
+    assert [c[:2] for c in calls] == [(1, 2), (2, 2)] and all(np.isfinite(c[2]) for c in calls)
+
+
+def test_no_kernel_is_compiled_after_the_first_iterations(system):
+    scan, _, _ = system
+    runs = [lambda: sart(scan, 3), lambda: cgls(scan, 3), lambda: asd_pocs(scan, 3, 2)]
+    for run in runs:
+        run()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for run in runs:
+            run()
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert history and all(k['cache_hit'] for k in history)
+    assert len({k['hash'] for k in history}) < 40
+
+
+@pytest.mark.parametrize('algorithm', [*ALGORITHMS.values(), fdk, lambda scan: complete(scan, None, 9)])
+def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
+    geo = small(n=5)
+    moved = Geometry.posed(geo.frames().moved(shift=np.array([0, 0, 1.]) * np.arange(5)[:, None]), geo.nDetector, geo.nVoxel,
+                           geo.dVoxel)
+    ones = np.ones((5, *geo.nDetector), np.float32)
+    with pytest.raises(InputError, match='other poses'):
+        algorithm(Scan(moved, ones))
+    valid = ones > 0
+    valid[0, 0, 0] = False
+    with pytest.raises(InputError, match='not valid'):
+        algorithm(Scan(geo, ones, valid))
+
+
+def test_the_projector_refuses_other_poses():
+    geo = small(n=2)
+    with pytest.raises(InputError, match='circle'):
+        Joseph(Geometry.posed(geo.frames().moved(shift=np.array([[0, 0, 0], [0, 0, 1.]])), geo.nDetector, geo.nVoxel,
+                              geo.dVoxel))
