@@ -85,7 +85,7 @@ def main():
         check_memory(scan.train.geometry)
     else:
         volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
-        scan = take_scan(scene, args.views, volume)
+        scan = take_scan(scene, args.views, volume, args.seed)
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
     with Progress('Fit', settings.iterations) as bar, between_steps() as check:
         def progress(iteration, **fields):
