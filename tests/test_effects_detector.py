@@ -93,7 +93,8 @@ def test_all_dead():
 
 
 @pytest.mark.parametrize('change, match', [
-    (dict(photons=-1.), 'photons must be a number from 0'), (dict(photons=np.nan), 'photons'), (dict(photons='many'), 'photons'),
+    (dict(photons=-1.), 'photons must be a number from 0'), (dict(photons=np.nan), 'photons'),
+    (dict(photons='many'), 'photons'),
     (dict(photons=1., electronic_noise=-1.), 'electronic_noise'), (dict(electronic_noise=1.), 'needs photons'),
     (dict(bits=25), 'bits must be a whole number'), (dict(bits=2.5), 'bits'), (dict(dead=1.1), 'dead'),
     (dict(aperture=2.), 'aperture'), (dict(aperture_order=0), 'aperture_order'), (dict(response='colour'), 'response'),

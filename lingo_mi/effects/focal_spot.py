@@ -71,7 +71,8 @@ def square(order: int, wide: bool = True, high: bool = True) -> list:
     """(weight, x, y) of the Gauss-Legendre rule on [-1/2, 1/2]^2, or along one of its axes; the weights sum to 1."""
     x, w = np.polynomial.legendre.leggauss(order)
     line, point = list(zip(w / 2, x / 2)), [(1., 0.)]
-    return [(float(wx * wy), float(x), float(y)) for wy, y in (line if high else point) for wx, x in (line if wide else point)]
+    across, down = line if wide else point, line if high else point
+    return [(float(wx * wy), float(x), float(y)) for wy, y in down for wx, x in across]
 
 
 def checked_order(order, name: str) -> int:
