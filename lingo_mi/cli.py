@@ -93,11 +93,12 @@ def check_input(args) -> None:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
 
 
-def read_input(args, scene, views: int):
+def read_input(args, scene, views: int, seed: int = 0):
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
     scene   the `LoadedScene` of args.scene
     views   how many evenly spaced views to use (0: all)
+    seed    of the noise, where the scene's detector has any
     """
     from .files.scans import read_scan
     from .files.volumes import read_volume
@@ -106,7 +107,8 @@ def read_input(args, scene, views: int):
         dataset = choose_views(read_scan(args.projections), views)
         check_memory(dataset.train.geometry)
         return dataset
-    return take_scan(scene, views, read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None)
+    volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
+    return take_scan(scene, views, volume, seed)
 
 
 def definitions(pairs) -> dict[str, str]:

@@ -5,12 +5,13 @@ import math
 import os
 import re
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from .effects.forward import Effects, find_effects
 from .errors import InputError
 from .geometry import Geometry, spread
 from .progress import Progress
@@ -18,6 +19,7 @@ from .scan import Dataset, Scan
 from .xray import grid
 from .xray.frame import View
 from .xray.objects import Ellipsoids, GridInCube, HomogeneousMesh, find_objects
+from .xray.quality import Quality
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,10 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     if scanner is None:
         raise InputError(f'{path}: the scene has no scanner; add <sensor type="ct_scanner">')
     check_memory(scanner.geometry, scanner.test_geometry)
+    try:
+        find_effects(scene, scanner)
+    except InputError as error:
+        raise InputError(f'{path}: {error}') from None
     return LoadedScene(scene, scanner, path)
 
 
@@ -86,21 +92,24 @@ def defaults(path) -> set[str]:
 
 
 def plain(error: Exception) -> str:
-    """The one line of an error that a user needs: ours if a plugin raised it, else the gist of Mitsuba's."""
+    """The one line of an error that a user needs: ours if a plugin raised it, with the element's line, else the gist of
+    Mitsuba's."""
     text = str(error)
     ours = re.findall(r'InputError: (.*)', text)
     if ours:
-        return ours[-1].strip()
+        lines = re.findall(r'\(line (\d+), col \d+\)', text)
+        return (f'line {lines[-1]}: ' if lines else '') + ours[-1].strip()
     text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]
     return ' '.join(lines)[:400] or type(error).__name__
 
 
-def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
+def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -> Dataset:
     """The scan of a scene: measured projections if the scanner has them, else every view rendered, with a progress bar.
 
     views    how many to fit, evenly spaced among the scanner's (0: all of them)
     volume   `files.volumes.Volume` to scan instead of the scene's objects
+    seed     of the detector's noise, where the scene has one with noise
 
     The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given
     where it is known on the scanner's grid.
@@ -111,6 +120,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
     geometry, test = scanner.geometry, scanner.test_geometry
     if views:  # before the work, not after
         spread(len(geometry), views)
+    effects = find_effects(loaded.scene, scanner)
     if volume is not None:
         geometry = geometry.with_volume(volume.data.shape, volume.spacing)
         check_memory(geometry, test)
@@ -122,10 +132,19 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None) -> Dataset:
         except InputError as error:
             raise InputError(f'{loaded.path}: {error}') from None
     _warn_if_truncated(geometry)
+    keys = np.arange(len(geometry) + (len(test) if test is not None else 0))
     if views and test is not None:  # unused views are needed only where nothing else is held out
-        geometry = geometry.subset(spread(len(geometry), views))
+        chosen = spread(len(geometry), views)
+        keys = np.concatenate([chosen, keys[len(geometry):]])
+        geometry = geometry.subset(chosen)
     every = geometry if test is None else geometry.joined(test)
-    everything = Scan(every, render_objects(objects, every))
+    if effects is None:
+        everything = Scan(every, render_objects(objects, every))
+    else:
+        try:
+            everything = Scan(every, _render_with(effects, objects, every, keys, seed))
+        except InputError as error:
+            raise InputError(f'{loaded.path}: {error}') from None
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
     meshes = [s for s in loaded.scene.shapes() if s.is_mesh() and s.interior_medium() is not None]
@@ -151,6 +170,11 @@ class _Volume:
     def project(self, geometry, progress):
         return grid.project(self.data, geometry, progress)
 
+    def in_box(self) -> GridInCube:
+        """The same as an object of a scene."""
+        centre, half = np.array(self.box.offOrigin), np.array(self.box.sVoxel) / 2
+        return GridInCube.of(self.data, centre - half, centre + half, 'volume')
+
 
 def render_objects(objects, geometry) -> np.ndarray:
     """Line integrals of all objects in all views, float32 [view, v, u]."""
@@ -171,6 +195,20 @@ def render_objects(objects, geometry) -> np.ndarray:
                     total[i] += thing.line_integrals(view, 8., True).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
+
+
+def _render_with(effects: Effects, objects, geometry, keys, seed) -> np.ndarray:
+    """Measured line integrals of all objects in all views, float32 [view, v, u]; keys are those of the views' noise."""
+    objects = [thing.in_box() if isinstance(thing, _Volume) else thing for thing in objects]
+    out = np.empty((len(geometry), *geometry.nDetector), np.float32)
+    frames = geometry.frames()
+    with Progress('Scan', len(geometry)) as bar:
+        for i in range(len(geometry)):
+            view = View.of(frames, i, *geometry.nDetector)
+            expected = effects.line_integrals(objects, view, Quality(extent=8.))
+            out[i] = replace(effects, index=int(keys[i])).measured(expected, view, seed).numpy().reshape(out.shape[1:])
+            bar.update(i + 1)
+    return out
 
 
 def _values(thing: GridInCube) -> np.ndarray:

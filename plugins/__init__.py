@@ -12,6 +12,8 @@ PLUGINS = {
     'lingo_xray': ('lingo_xray', 'register_integrator'),
     'ct_scanner': ('ct_scanner', 'register_sensor'),
     'ct_volume': ('ct_volume', 'register_medium'),
+    'xray_tube': ('xray_tube', 'register_emitter'),
+    'ct_detector': ('ct_detector', 'register_film'),
 }
 
 

@@ -75,6 +75,8 @@ class CTScanner(mi.Sensor):
        - |int|
        - The view that this sensor renders. (Default: 0)
 
+    A nested film `ct_detector` says what the panel makes of the light: noise, blur, saturation and more.
+
     The source runs on a circle in the plane z = 0 unless told otherwise; `lingo_mi.geometry` states the frame, and
     `lingo_mi.frames.scanner_frames` what moves it. One view of a scanner is a
     sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scanning.scan` renders them all.
@@ -83,8 +85,11 @@ class CTScanner(mi.Sensor):
     def __init__(self, props):
         self.dataset = None
         try:
-            if any(isinstance(thing, mi.Film) for _, thing in props.objects()):
-                raise InputError('the scanner makes its own film, of nDetector pixels; leave yours out')
+            films = {name: thing for name, thing in props.objects() if isinstance(thing, mi.Film)}
+            self.detector = next((f.detector for f in films.values() if hasattr(f, 'detector')), None)
+            if len(films) > (self.detector is not None):
+                raise InputError('the scanner makes its own film, of nDetector pixels: leave yours out, unless it is one '
+                                 'ct_detector')
             projections = _one(props, 'projections', '')
             if projections:
                 self.dataset = read_scan(data_file(projections, 'projections'))
@@ -100,6 +105,8 @@ class CTScanner(mi.Sensor):
         for name in _NAMES:  # a file of projections overrides the numbers in the scene
             if name in props:
                 props[name]
+        for name in films:
+            del props[name]
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
         frames = self.geometry.frames()
@@ -109,8 +116,10 @@ class CTScanner(mi.Sensor):
                               + np.linalg.norm(self.geometry.sVoxel))
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
-        """The sensor of one view, of this scan or of another geometry."""
-        return mi.load_dict(describe(geometry or self.geometry, index))
+        """The sensor of one view, of this scan or of another geometry, with the same detector."""
+        sensor = mi.load_dict(describe(geometry or self.geometry, index))
+        sensor.detector = self.detector
+        return sensor
 
     def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active=True):
         f = self.frame

@@ -2,6 +2,7 @@
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
 from lingo_mi.xray.objects import find_objects
 from lingo_mi.xray.quality import Quality
@@ -58,6 +59,10 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation;
     - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
 
+    An emitter `xray_tube` (spectrum, focal spot) and a film `ct_detector` (blur, noise and more) make the image what a
+    detector sees, -ln of the detected signal; docs/effects.md says how. Without them, nothing of their code is compiled.
+    The seed of `mi.render` is that of the noise, and derivatives are those of the expected signal.
+
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
     centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
     `perspective` and `orthographic`. A scanner's integrals through Gaussians end at its panel, a camera's do not.
@@ -78,7 +83,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         if not develop:
             raise InputError('lingo_xray renders with develop=True only: there are no samples to accumulate')
         with dr.suspend_grad():
-            image = self._image(scene, sensor)
+            image = self._image(scene, sensor, seed=seed)
             if evaluate:
                 dr.eval(image)
             return image
@@ -93,23 +98,35 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         image = self._image(scene, sensor, primal=self.output == 'transmission')
         dr.backward_from(image * grad_in)
 
-    def _image(self, scene, sensor, primal=True):
-        """The image as a tensor [height, width, channels of the film]."""
+    def _image(self, scene, sensor, primal=True, seed=None):
+        """The image as a tensor [height, width, channels of the film]; with a seed, as measured."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         view = view_of(sensor)
-        rays = self.quality.subdivided(view)
-        total = dr.zeros(mi.Float, rays.height * rays.width)
-        for thing in find_objects(scene):
-            total += self.quality.line_integrals(thing, rays, primal)
-        if self.output == 'transmission':
-            total = dr.exp(-total)
-        total = self.quality.averaged(total, view)
+        effects = find_effects(scene, sensor)
+        if effects is None:
+            total = self._ideal(find_objects(scene), view, primal)
+        else:
+            total = effects.line_integrals(find_objects(scene), view, self.quality)
+            if seed is not None:
+                total = effects.measured(total, view, seed)
+            if self.output == 'transmission':
+                total = dr.exp(-total)
         film = sensor.film()
         film.prepare([])
         channels = film.develop().shape[2]
         if channels > 1:
             total = dr.repeat(total, channels)
         return mi.TensorXf(total, shape=(view.height, view.width, channels))
+
+    def _ideal(self, objects, view, primal):
+        """Line integrals, or transmissions, of every pixel of a scene without effects."""
+        rays = self.quality.subdivided(view)
+        total = dr.zeros(mi.Float, rays.height * rays.width)
+        for thing in objects:
+            total += self.quality.line_integrals(thing, rays, primal)
+        if self.output == 'transmission':
+            total = dr.exp(-total)
+        return self.quality.averaged(total, view)
 
     def to_string(self):
         q = self.quality

@@ -65,7 +65,7 @@ def main():
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
-    scan = read_input(args, scene, args.views)
+    scan = read_input(args, scene, args.views, args.seed)
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
     with Progress('Fit', settings.iterations) as bar, between_steps() as check:
         def progress(iteration, **fields):

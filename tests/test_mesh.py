@@ -256,3 +256,15 @@ def test_one_kernel_for_all_views_and_meshes():
             drawn(box, frames)
         kernels = [k for k in dr.kernel_history() if k['type'] == dr.KernelType.JIT]
     assert kernels and all(k['cache_hit'] for k in kernels)
+
+
+def test_rows_past_a_triangle_write_nothing():
+    """Teams walk eight rows at a time; those past a triangle's end, and maybe the image's, must have no packets."""
+    from lingo_mi.xray import mesh
+    Float64 = dr.value_t(mi.Vector3d)
+    edge = Float64(5.5), Float64(0), Float64(0), Float64(0), Float64(0)
+    other = Float64(9.5), *edge[1:]
+    row = mi.Int32(0, 1, 7)
+    first, last, *_ = mesh._row(edge, (*other[:1], Float64(-1), *other[2:]), other, mi.Int32(1), row, mi.Int32(1), mi.Int32(20))
+    packets = np.maximum(-(-last.numpy() // mesh.PACKET) - first.numpy() // mesh.PACKET, 0)
+    np.testing.assert_array_equal(packets, [2, 0, 0])

@@ -51,10 +51,11 @@ class Ellipsoids:
     """The built-in `ellipsoids` shape with an attribute `density` [N, 1], as a cloud of Gaussians."""
 
     def __init__(self, shape):
-        params = mi.traverse(shape)
+        params, self.name = mi.traverse(shape), shape.id()
         if 'density' not in params:
             raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
         data, self.density = params['data'], params['density']
+        self.second = params['second'] if 'second' in params else None  # share of a second material
         count = dr.width(self.density)
         i = dr.arange(mi.UInt32, count) * 10
 
@@ -94,7 +95,7 @@ class GridInCube:
     """An axis-aligned `cube` with a heterogeneous medium whose extinction is a scalar `gridvolume`."""
 
     def __init__(self, shape, medium):
-        where = f'the medium of the shape {shape.id()!r}'
+        self.name, where = shape.id(), f'the medium of the shape {shape.id()!r}'
         params = mi.traverse(medium)
         tensor = next((v for k, v in params.items() if k.endswith('sigma_t.data')), None)
         if tensor is None or len(tensor.shape) not in (3, 4) or (len(tensor.shape) == 4 and tensor.shape[3] != 1):
@@ -109,6 +110,15 @@ class GridInCube:
         self.scale = params['scale'] if 'scale' in params else 1.
         self.data, self.size = tensor.array, tensor.shape[2::-1]
         self.low, self.high = box.min, box.max
+
+    @classmethod
+    def of(cls, values, low, high, name: str) -> GridInCube:
+        """Densities [x, y, z] that fill the box from `low` to `high`, without a shape of Mitsuba's."""
+        self = cls.__new__(cls)
+        self.name, self.scale, self.size = name, 1., values.shape
+        self.data = mi.Float(np.ascontiguousarray(values.transpose(2, 1, 0), np.float32).ravel())
+        self.low, self.high = mi.ScalarPoint3f(low), mi.ScalarPoint3f(high)
+        return self
 
     def line_integrals(self, view, extent, primal, affine=False, area=False):
         _no_area(area)
@@ -145,6 +155,7 @@ class HomogeneousMesh:
 
     def __init__(self, shape, medium):
         from .mesh import from_mitsuba
+        self.name = shape.id()
         if not shape.is_mesh():
             raise InputError(f'the shape {shape.id()!r} has a homogeneous medium, but is no mesh: use ply, obj or cube')
         params = mi.traverse(medium)

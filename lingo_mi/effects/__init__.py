@@ -1,0 +1,1 @@
+"""Effects of real projections, one a file, each used only where its element is in the scene."""

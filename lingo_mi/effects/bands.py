@@ -1,0 +1,135 @@
+r"""A spectrum in a few energy bands: beam hardening as a short sum of exponentials, and its inverse (NumPy).
+
+A beam passes M materials whose line integrals at a reference energy E0 are p_m. With s(E) the detected spectrum and
+r_m(E) = mu_m(E) / mu_m(E0), what a detector measures is (Alvarez and Macovski, Phys. Med. Biol. 21, 1976, eq. 4)
+
+    h(p) = -ln \int s(E) exp(-sum_m r_m(E) p_m) dE   ~   -ln sum_k w_k exp(-sum_m R_mk p_m)
+
+K terms with positive weights that sum to 1. They start as K intervals of energy, and are then moved, weights and ratios
+together, to where the mean square error of h over a range of p is least.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import logsumexp, softmax
+from scipy.stats import qmc
+
+from ..errors import InputError
+
+MOST_BANDS = 6
+MOST_STEPS = 1000  # of the search; the error it leaves is stated whatever it is
+
+
+@dataclass(frozen=True)
+class Bands:
+    """A spectrum for a given choice of materials.
+
+    weights   [K] shares of the signal; they sum to 1
+    ratios    [M, K] attenuation over that at the reference energy
+    error     largest error of h over the range that the bands were made for, against the full spectrum
+    """
+
+    weights: np.ndarray
+    ratios: np.ndarray
+    error: float = 0.
+
+    def hardened(self, *integrals) -> np.ndarray:
+        """h: what a detector measures of line integrals at the reference energy, M arrays of one shape, float64."""
+        return _hardened(np.stack([np.asarray(p, float) for p in integrals], -1), self.weights, self.ratios)
+
+    def precorrected(self, measured) -> np.ndarray:
+        """The line integrals at the reference energy that h takes to `measured`, float64 (water precorrection, M = 1).
+
+        measured   an array of any shape; values below zero, which noise makes, are continued linearly
+
+        h rises and is concave, so Newton's method converges from any start.
+        """
+        if len(self.ratios) != 1:
+            raise InputError(f'precorrection is for one material, not {len(self.ratios)}')
+        target, ratios = np.asarray(measured, float), self.ratios[0]
+        slope = self.weights @ ratios
+        p = target / slope
+        for _ in range(100):
+            exponent = np.log(self.weights) - np.maximum(p, 0)[..., None] * ratios
+            share = softmax(exponent, -1)
+            value = -logsumexp(exponent, axis=-1) + slope * np.minimum(p, 0)
+            step = (target - value) / (share @ ratios)
+            p = p + step
+            if not np.any(np.abs(step) > 1e-12 * (1 + np.abs(p))):
+                break
+        return p
+
+
+def band(signal, ratios, count: int, largest: float) -> Bands:
+    """The best `count` bands for a spectrum.
+
+    signal    [E] shares of the detected signal; they sum to 1
+    ratios    [M, E] attenuation of every material over that at the reference energy
+    count     bands, 1 to 6
+    largest   sum of the line integrals up to which they are to be good
+
+    Raises InputError for a count out of range.
+    """
+    if not 1 <= count <= MOST_BANDS:
+        raise InputError(f'bands must be from 1 to {MOST_BANDS}, not {count}')
+    signal, ratios = np.asarray(signal, float), np.asarray(ratios, float)
+    used = signal > 0
+    return _band(signal[used].tobytes(), ratios[:, used].tobytes(), len(ratios), count, float(largest))
+
+
+@lru_cache(maxsize=16)
+def _band(signal, ratios, materials, count, largest):
+    signal = np.frombuffer(signal)
+    ratios = np.frombuffer(ratios).reshape(materials, -1)
+    if len(signal) <= count:
+        return Bands(signal, ratios)
+    points = _points(materials, largest, 7)
+    exact = _hardened(points, signal, ratios)
+    # Low energies are few, but what hardens the beam: narrow bands there.
+    edges = np.searchsorted(np.cumsum(signal), (np.arange(1, count) / count) ** 2.5)
+    parts = [i for i in np.split(np.arange(len(signal)), edges) if len(i)]
+    count = len(parts)
+    weights = np.array([signal[i].sum() for i in parts])
+    start = np.stack([ratios[:, i] @ signal[i] for i in parts], 1) / weights
+
+    def unpacked(x):
+        return softmax(x[:count]), np.exp(x[count:]).reshape(materials, count)
+
+    def error(x):
+        return _hardened(points, *unpacked(x)) - exact
+
+    def jacobian(x):
+        w, r = unpacked(x)
+        share = softmax(np.log(w) - points @ r, -1)
+        return np.concatenate([w - share] + [share * points[:, m, None] * r[m] for m in range(materials)], 1)
+    x = least_squares(error, np.concatenate([np.log(weights), np.log(start).ravel()]), jacobian, xtol=1e-10, ftol=1e-10,
+                      gtol=1e-14, max_nfev=MOST_STEPS).x
+    weights, found = unpacked(x)
+    fine = _points(materials, largest, 11)
+    worst = np.abs(_hardened(fine, weights, found) - _hardened(fine, signal, ratios)).max()
+    return Bands(weights, found, float(worst))
+
+
+def _hardened(points, weights, ratios):
+    """h at points [..., M]."""
+    return -logsumexp(-points @ ratios, b=weights, axis=-1)
+
+
+def _points(materials, largest, power):
+    """Line integrals [n, M] with sums up to `largest`: each material alone, and 2^power mixtures."""
+    n = 2 ** power
+    alone = np.concatenate([np.linspace(0, largest, n)[:, None] * axis for axis in np.eye(materials)])
+    if materials == 1:
+        return alone
+    u = qmc.Sobol(materials, scramble=False).random(n)
+    total, rest = largest * u[:, 0], np.ones(n)
+    mixed = np.empty((n, materials))
+    for m in range(materials - 1):  # breaks a stick of length 1
+        mixed[:, m] = rest * u[:, m + 1]
+        rest = rest - mixed[:, m]
+    mixed[:, -1] = rest
+    return np.concatenate([alone, mixed * total[:, None]])

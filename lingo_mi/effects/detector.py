@@ -1,0 +1,177 @@
+r"""What a flat panel makes of the intensity that reaches it, and back to line integrals (NumPy; the blur in Dr.Jit).
+
+For the transmission T of a pixel, its gain g and the counts of its open beam I0,
+
+    N = Poisson(I0 g T) + Normal(0, s_e)          counts (Barrett and Myers, "Foundations of Image Science", 2004, ch. 11)
+    S = round(min(N / I0, top) / step) step       signal, step = top / (2^bits - 1)
+    p = -ln(max(S / g, floor))                    line integral
+
+The floor is half of the least signal but zero, half a count or half a step, so that p is finite in any shadow. An
+energy-integrating panel's noise is a little larger than that of as many photons of one energy (its Swank factor, about
+0.9); `photons` is therefore the number of noise-equivalent quanta.
+
+Random numbers are those of Philox4x64 (Salmon et al., SC 2011), a counter-based generator, keyed by seed and view: a view
+has the same noise whichever others are rendered, and in any order.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.ndimage import convolve
+
+from ..errors import InputError
+from .focal_spot import checked_order
+
+RESPONSES = 'energy', 'count'
+MOST_PHOTONS = 1e15
+FULL_SCALE = 1.25  # of a converter, where no saturation is given: the open beam with its noise stays below
+DARKEST = 1e-30    # least transmission without noise; float32 holds 1e-38
+_MAPS = 2 ** 63    # added to a seed: the maps of gains and dead pixels share no numbers with the noise
+
+
+@dataclass(frozen=True)
+class Detector:
+    """See the film `ct_detector`, whose parameters these are."""
+
+    DEFAULTS = dict(photons=0., electronic_noise=0., response='energy', psf=0., aperture=0., aperture_order=3,
+                    saturation=0., bits=0, dead=0., gain=0., seed=0, corrected=True)
+
+    photons: float = 0.
+    electronic_noise: float = 0.
+    response: str = 'energy'
+    psf: float = 0.
+    aperture: float = 0.
+    aperture_order: int = 3
+    saturation: float = 0.
+    bits: int = 0
+    dead: float = 0.
+    gain: float = 0.
+    seed: int = 0
+    corrected: bool = True
+
+    @staticmethod
+    def of(**given) -> Detector:
+        """Checked parameters. Raises InputError."""
+        ranges = dict(photons=MOST_PHOTONS, electronic_noise=MOST_PHOTONS, psf=1e6, aperture=1., saturation=1e6, dead=1.,
+                      gain=1.)
+        for name, most in ranges.items():
+            value = given[name]
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
+                raise InputError(f'{name} must be a number from 0 to {most:g}, not {value!r}')
+        for name, most in dict(bits=24, seed=2 ** 62).items():
+            value = given[name]
+            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+                raise InputError(f'{name} must be a whole number from 0 to {most}, not {value!r}')
+        if given['response'] not in RESPONSES:
+            raise InputError(f"response must be 'energy' or 'count', not {given['response']!r}")
+        if not isinstance(given['corrected'], bool):
+            raise InputError(f"corrected must be true or false, not {given['corrected']!r}")
+        if given['electronic_noise'] and not given['photons']:
+            raise InputError('electronic_noise, in photons, needs photons')
+        checked_order(given['aperture_order'], 'aperture_order')
+        return Detector(**given)
+
+    @property
+    def measures(self) -> bool:
+        """Whether anything happens to the signal after the light: noise, gains, saturation, digits, dead pixels."""
+        return any((self.photons, self.saturation, self.bits, self.dead, self.gain))
+
+    @property
+    def floor(self) -> float:
+        """The least transmission that is told from none."""
+        return max(.5 / self.photons if self.photons else DARKEST, .5 * self._step)
+
+    @property
+    def _top(self) -> float:
+        return self.saturation or FULL_SCALE
+
+    @property
+    def _step(self) -> float:
+        return self._top / (2 ** self.bits - 1) if self.bits else 0.
+
+    def signal(self, transmission, view: int, seed: int = 0) -> np.ndarray:
+        """The signal of a view, in units of the open beam's, float64 [v, u], gains and dead pixels as they are.
+
+        transmission   expected I / I0, [v, u], finite and not negative
+        view, seed     key of the noise, whole numbers from 0
+        """
+        light = np.asarray(transmission, float)
+        gains, dead = self.maps(light.shape)
+        light = light * gains
+        if self.photons:
+            rng = np.random.Generator(np.random.Philox(key=[seed, view]))
+            light = rng.poisson(self.photons * light) / self.photons
+            if self.electronic_noise:
+                light = light + rng.normal(0, self.electronic_noise / self.photons, light.shape)
+        if self.saturation or self.bits:
+            light = np.minimum(light, self._top)
+        if self.bits:
+            light = np.round(np.maximum(light, 0) / self._step) * self._step
+        return np.where(dead, 0, light)
+
+    def measure(self, transmission, view: int, seed: int = 0) -> np.ndarray:
+        """Line integrals -ln(I / I0) as a scanner reports them, float32 [v, u], finite; arguments as of `signal`."""
+        light = self.signal(transmission, view, seed)
+        if self.corrected:
+            gains, dead = self.maps(light.shape)
+            light = _filled(light / gains, dead)
+        return -np.log(np.maximum(light, self.floor)).astype(np.float32)
+
+    def maps(self, shape):
+        """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""
+        return _maps(self.seed, self.gain, self.dead, tuple(shape))
+
+    def blurred(self, image, view):
+        """The intensity, Float [height * width], spread by the scintillator; differentiable.
+
+        A Gaussian, sampled at the pixels: right for widths from one pixel on. Beyond the panel the light is that of its
+        edge.
+        """
+        import drjit as dr
+        import mitsuba as mi
+        if not view.panel:
+            raise InputError('psf, in mm on the panel, needs a ct_scanner')
+        image = mi.TensorXf(image, shape=(view.height, view.width))
+        for axis, step in ((0, view.v), (1, view.u)):
+            # Rounded, because the taps are compiled into the kernel: no two views may differ in their last digit.
+            sigma = round(self.psf / FWHM / float(dr.norm(step)[0]), 6)
+            image = dr.convolve(image, taps(sigma), axis=axis, boundary='nearest')
+        return image.array
+
+    def __str__(self):
+        changed = [f'{k} = {getattr(self, k)}' for k, v in self.DEFAULTS.items() if getattr(self, k) != v]
+        return ', '.join(changed) or 'ideal'
+
+
+FWHM = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian, in standard deviations
+
+
+def taps(sigma: float) -> list[float]:
+    """Weights of a Gaussian of `sigma` pixels at whole pixels, out to five sigma; they sum to 1."""
+    reach = max(1, int(np.ceil(5 * sigma)))
+    weights = np.exp(-.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (weights / weights.sum()).tolist()
+
+
+@lru_cache(maxsize=4)
+def _maps(seed, gain, dead, shape):
+    rng = np.random.Generator(np.random.Philox(key=[_MAPS + seed, 0]))
+    gains = np.maximum(1 + gain * rng.standard_normal(shape), .01)  # no pixel is quite blind by its gain
+    return gains, rng.random(shape) < dead
+
+
+def _filled(light, dead):
+    """Dead pixels replaced by the mean of their live neighbours, from the edges of a cluster inwards."""
+    light = np.where(dead, 0, light)
+    if dead.all():
+        return light
+    around = np.array([[1, 2, 1], [2, 0, 2], [1, 2, 1]], float)
+    while dead.any():
+        live = convolve((~dead).astype(float), around, mode='constant')
+        total = convolve(light, around, mode='constant')
+        reached = dead & (live > 0)
+        light = np.where(reached, total / np.maximum(live, 1), light)
+        dead = dead & ~reached
+    return light

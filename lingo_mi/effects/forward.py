@@ -1,0 +1,105 @@
+"""The effects that a scene calls for, and what its detector then sees (Dr.Jit)."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from .detector import DARKEST, Detector
+from .focal_spot import FocalSpot, aperture_views
+from .hardening import Tube, by_material, hardened
+
+
+@dataclass(frozen=True)
+class Effects:
+    """The effects of a scene; None for an element that it lacks.
+
+    tube, spot   spectrum and focal spot of its `xray_tube`
+    detector     of the sensor's `ct_detector`
+    index        the sensor's view: with the seed, the key of its noise
+    """
+
+    tube: Tube | None = None
+    spot: FocalSpot | None = None
+    detector: Detector | None = None
+    index: int = 0
+
+    @property
+    def response(self) -> str:
+        return self.detector.response if self.detector else 'energy'
+
+    def views(self, view) -> list:
+        """(weight, View) of all bundles of rays whose mean intensity a view's pixels see."""
+        views = self.spot.views(view) if self.spot else [(1., view)]
+        if self.detector:
+            d = self.detector
+            views = [(w * share, v) for w, one in views for share, v in aperture_views(one, d.aperture, d.aperture_order)]
+        return views
+
+    def line_integrals(self, objects, view, quality):
+        """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
+
+        objects   of `xray.objects.find_objects`
+        quality   `xray.quality.Quality`; its n x n rays a pixel are averaged as intensities
+        """
+        groups, bands = {'': objects}, None
+        if self.tube and self.tube.hardens:
+            groups = by_material(objects, self.tube)
+            bands = self.tube.signal(groups, self.response)
+
+        def seen(view):
+            rays = quality.subdivided(view)
+            integrals = []
+            for things in groups.values():
+                total = dr.zeros(mi.Float, rays.height * rays.width)
+                for thing in things:
+                    total += quality.line_integrals(thing, rays)
+                integrals.append(total)
+            return hardened(integrals, bands) if bands else integrals[0]
+        return self.averaged(seen, view, quality)
+
+    def averaged(self, seen, view, quality):
+        """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
+
+        seen   gives -ln of the intensity along the rays of a View, Float
+        """
+        views = self.views(view)
+        psf = self.detector.psf if self.detector else 0
+        if len(views) == 1 and quality.pixel == 1 and not psf:
+            return seen(view)
+        light = mi.Float(0)
+        for weight, one in views:
+            light += dr.opaque(mi.Float, weight) * quality.averaged(dr.exp(-seen(one)), view)
+            if len(views) > 1:  # one small kernel for all of them, instead of a large one that takes long to compile
+                dr.eval(light)
+        if psf:
+            light = self.detector.blurred(light, view)
+        return -dr.log(dr.maximum(light, DARKEST))
+
+    def measured(self, integrals, view, seed: int):
+        """Line integrals as the detector reports them, with its noise, from the expected ones; not differentiable."""
+        if not (self.detector and self.detector.measures):
+            return integrals
+        light = np.exp(-integrals.numpy().astype(float)).reshape(view.height, view.width)
+        return mi.Float(self.detector.measure(light, self.index, seed).ravel())
+
+
+def find_effects(scene, sensor) -> Effects | None:
+    """The effects of a scene seen by a sensor, None without any. Raises InputError for ones that cannot be."""
+    tubes = [e for e in scene.emitters() if hasattr(e, 'tube')]
+    detector = getattr(sensor, 'detector', None) or getattr(sensor.film(), 'detector', None)
+    if not tubes and detector is None:
+        return None
+    if len(tubes) > 1:
+        raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
+    tube, spot = (tubes[0].tube, tubes[0].spot) if tubes else (None, None)
+    geometry = getattr(sensor, 'geometry', None)
+    if spot is not None and geometry is not None:
+        try:
+            spot.check(None if geometry.mode == 'parallel' else geometry.DSO)
+        except InputError as error:
+            raise InputError(f'xray_tube {tubes[0].id()!r}: {error}') from None
+    return Effects(tube, spot, detector, getattr(sensor, 'index', 0))

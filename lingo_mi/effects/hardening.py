@@ -1,0 +1,157 @@
+"""Beam hardening: objects of one or two materials under a spectrum (Dr.Jit), and its correction in volumes (NumPy).
+
+The density of an object is its attenuation at the tube's reference energy E0. A material m of it attenuates like
+mu_m(E) / mu_m(E0) at another energy, so the line integrals of the densities, one a material, are all that is needed of the
+objects; `bands` turns them into what a detector measures.
+"""
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import InputError
+from . import bands as energy_bands
+from .spectrum import Spectrum, attenuation, monochromatic, tube_spectrum
+
+REFERENCE = 60.  # keV; water attenuates .0206 per mm
+LARGEST = 10.    # sum of line integrals up to which bands are fitted: behind it, 5e-5 of the photons are left
+
+
+@dataclass(frozen=True)
+class Tube:
+    """A spectrum, and the materials of the objects it passes.
+
+    reference   energy at which densities are attenuation in 1/mm, keV
+    material    names of one or two materials, as `spectrum.attenuation` takes them; none if a scene does not say
+    materials   the same for shapes by name, where they differ
+    split       densities between which a grid of two materials goes from the first to the second, 1/mm
+    bands       terms that stand for the spectrum
+    """
+
+    spectrum: Spectrum
+    reference: float
+    material: tuple[str, ...] = ()
+    materials: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    split: tuple[float, float] | None = None
+    bands: int = 4
+
+    @staticmethod
+    def of(energy, kvp, angle, filtration, reference, material, split, bands, materials) -> Tube:
+        """From the parameters of `xray_tube`. Raises InputError."""
+        for name, value in dict(energy=energy, kvp=kvp, angle=angle, reference=reference).items():
+            if not (value is None or isinstance(value, (int, float)) and not isinstance(value, bool)):
+                raise InputError(f'{name} must be a number, not {value!r}')
+        if (energy is None) == (kvp is None):
+            raise InputError('a tube needs either an energy or a kvp')
+        spectrum = monochromatic(energy) if kvp is None else tube_spectrum(kvp, angle, filtration)
+        if reference is None:
+            reference = REFERENCE if energy is None else energy
+        if not 1 <= reference <= 1000:
+            raise InputError(f'reference must be from 1 to 1000 keV, not {reference:g}')
+        if isinstance(bands, bool) or not isinstance(bands, int) or not 1 <= bands <= energy_bands.MOST_BANDS:
+            raise InputError(f'bands must be a whole number from 1 to {energy_bands.MOST_BANDS}, not {bands!r}')
+        named = {name: _names(text) for name, text in materials.items()}
+        tube = Tube(spectrum, float(reference), _names(material) if material else (), named, _split(split), bands)
+        for names in (tube.material, *named.values()):
+            for name in names:
+                attenuation(name, [tube.reference])
+            if len(names) == 2 and tube.split is None:
+                raise InputError(f'the two materials {" + ".join(names)!r} need a split, the densities in 1/mm that '
+                                 "tell them apart: '0.024, 0.040'")
+        return tube
+
+    @property
+    def hardens(self) -> bool:
+        """Whether anything changes: photons of the reference energy alone leave line integrals as they are."""
+        return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
+
+    def made_of(self, name: str) -> tuple[str, ...]:
+        """The materials of a shape. Raises InputError where the scene does not say."""
+        names = self.materials.get(name, self.material)
+        if not names:
+            raise InputError(f'xray_tube: the shape {name!r} has no material, without which a spectrum says nothing: add '
+                             f'<string name="material_{name}" value="water"/>')
+        return names
+
+    def signal(self, names, response: str = 'energy') -> energy_bands.Bands:
+        """The bands of materials (names), for a detector that integrates energy or counts."""
+        ratios = [attenuation(n, self.spectrum.energies) / attenuation(n, [self.reference]) for n in names]
+        return energy_bands.band(self.spectrum.detected(response), ratios, self.bands, LARGEST)
+
+    def __str__(self):
+        e = self.spectrum.energies
+        light = f'{e[0]:g} keV' if len(e) == 1 else f'up to {e[-1]:g} keV, mean {self.spectrum.mean:.1f} keV'
+        return f'{light}, reference = {self.reference:g} keV, material = {" + ".join(self.material) or "none"}'
+
+
+def hardened(integrals, bands: energy_bands.Bands):
+    """What a detector measures of line integrals at the reference energy, one Float [pixels] a material.
+
+    Differentiable, in float32 to 1e-6 whatever the integrals.
+    """
+    exponents = [sum(float(r) * p for r, p in zip(ratios, integrals)) for ratios in bands.ratios.T]
+    if len(exponents) == 1:
+        return exponents[0]
+    least = exponents[0]
+    for e in exponents[1:]:
+        least = dr.minimum(least, e)
+    least = dr.detach(least)  # any constant will do; this one keeps the largest term at its weight
+    total = sum(float(w) * dr.exp(least - e) for w, e in zip(bands.weights, exponents))
+    return least - dr.log(total)
+
+
+def by_material(objects, tube: Tube) -> dict:
+    """The objects of a scene (`xray.objects`), or the parts of them, that are made of each material."""
+    out = {}
+    for thing in objects:
+        names = tube.made_of(thing.name)
+        parts = [thing] if len(names) == 1 else _parts(thing, tube.split)
+        for name, part in zip(names, parts):
+            out.setdefault(name, []).append(part)
+    return out
+
+
+def second_share(density, split):
+    """The share of the second of two materials where the density is `density` (Dr.Jit or NumPy array)."""
+    low, high = split
+    share = (density - low) * (1 / (high - low))
+    return np.clip(share, 0, 1) if isinstance(share, np.ndarray) else dr.clip(share, 0, 1)
+
+
+def _parts(thing, split):
+    """Two copies of an object, each with the density that one of its two materials has."""
+    first, second = copy.copy(thing), copy.copy(thing)
+    if hasattr(thing, 'data'):
+        share = second_share(thing.data * thing.scale, split)
+        first.data, second.data = thing.data * (1 - share), thing.data * share
+    elif hasattr(thing, 'density'):
+        if thing.second is None:
+            raise InputError(f'the ellipsoids {thing.name!r} are of two materials, but have no attribute "second": give '
+                             "it the second one's share in the density of every Gaussian, 0 to 1")
+        first.density, second.density = thing.density * (1 - thing.second), thing.density * thing.second
+    else:
+        raise InputError(f'the mesh {thing.name!r} is homogeneous and cannot be of two materials')
+    return first, second
+
+
+def _names(text) -> tuple[str, ...]:
+    names = tuple(part.strip() for part in text.split('+')) if isinstance(text, str) else ()
+    if len(names) not in (1, 2) or not all(names):
+        raise InputError(f"material must be one or two names, 'soft tissue + bone', not {text!r}")
+    return names
+
+
+def _split(text) -> tuple[float, float] | None:
+    if text == '':
+        return None
+    try:
+        low, high = (float(x) for x in str(text).replace(',', ' ').split())
+    except ValueError:
+        low, high = np.nan, np.nan
+    if not (np.isfinite(high) and 0 <= low < high):
+        raise InputError(f"split must be two rising densities in 1/mm, '0.024, 0.040', not {text!r}")
+    return low, high

@@ -1,0 +1,91 @@
+"""The emitter `xray_tube`: the photons of a scan, by energy, and the focal spot that they come from."""
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.effects.focal_spot import FocalSpot
+from lingo_mi.effects.hardening import Tube
+from lingo_mi.errors import InputError
+
+
+class XRayTube(mi.Emitter):
+    r"""
+    .. _emitter-xray_tube:
+
+    X-ray tube (:monosp:`xray_tube`)
+    --------------------------------
+
+    .. pluginparameters::
+
+     * - energy
+       - |float|
+       - Photons of one energy, keV. Either this or `kvp`.
+     * - kvp, angle, filtration
+       - |float|, |float|, |string|
+       - The spectrum of a tube with a tungsten anode (spekpy): peak voltage from 20 to 300 kV, anode angle in degrees,
+         and filters with their thickness in mm, "Al 2.5, Cu 0.1". (Default: none, 12, "Al 2.5")
+     * - reference
+       - |float|
+       - The energy, keV, at which the densities in the scene are attenuation in 1/mm.
+         (Default: `energy`, which then changes nothing; 60 for a spectrum)
+     * - material
+       - |string|
+       - What the objects are made of: `water`, `soft tissue`, `bone`, `pmma`, a compound of the NIST database as xraylib
+         spells it, an element's symbol, or a formula with its density in g/cm3, "CsI @ 4.51". Two of them, "soft tissue
+         + bone", are told apart by `split` in a grid, by the attribute `second` [N, 1] in ellipsoids: the second
+         one's share in the density of every Gaussian, 0 to 1.
+     * - material_NAME
+       - |string|
+       - The material of the shape whose id is NAME, where it is another.
+     * - split
+       - |string|
+       - "0.024, 0.040": densities, 1/mm, up to which a voxel is the first of two materials, and from which it is the
+         second; its share rises linearly between.
+     * - bands
+       - |int|
+       - Terms of the sum that stands for the spectrum, 1 to 6. With 4, line integrals up to 10 are right to 1e-4 for one
+         material, to 1e-3 for two. (Default: 4)
+     * - focal_spot
+       - |string|
+       - Width and height of the focal spot in mm, along the panel's u and v; one number stands for both. A uniform
+         rectangle parallel to the panel. (Default: 0, a point)
+     * - focal_order
+       - |int|
+       - n of n x n Gauss-Legendre points on it, 1 to 16, each of which is a projection. (Default: 3)
+
+    It is read by `lingo_xray`, which then gives -ln of the detected signal, and by `scanning.take_scan`. To Mitsuba's own
+    integrators it is dark.
+    """
+
+    def __init__(self, props):
+        try:
+            spot = FocalSpot.of(props.get('focal_spot', '0'), props.get('focal_order', 3))
+            materials = {k.removeprefix('material_'): props[k] for k in props.keys() if k.startswith('material_')}
+            tube = Tube.of(*(props.get(k, d) for k, d in _DEFAULTS.items()), materials)
+        except InputError as error:
+            raise InputError(f'xray_tube {props.id()!r}: {error}') from None
+        super().__init__(props)
+        self.tube, self.spot = tube, spot
+        self.m_flags = mi.EmitterFlags.DeltaPosition
+
+    def eval(self, si, active=True):
+        return mi.Spectrum(0)
+
+    def sample_direction(self, it, sample, active=True):
+        return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+
+    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+        return dr.zeros(mi.Ray3f), mi.Spectrum(0)
+
+    def pdf_direction(self, it, ds, active=True):
+        return mi.Float(0)
+
+    def traverse(self, callback):
+        pass
+
+    def to_string(self):
+        return f'XRayTube[\n  {self.tube},\n  {self.spot}\n]'
+
+
+create = XRayTube
+
+_DEFAULTS = dict(energy=None, kvp=None, angle=12., filtration='Al 2.5', reference=None, material='', split='', bands=4)

@@ -1,0 +1,273 @@
+"""Effects in scenes: what they cost, which is nothing where they are absent; images, derivatives, scans and errors."""
+from functools import partial
+from importlib.util import find_spec
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from test_integrator import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
+
+from lingo_mi.effects.bands import band
+from lingo_mi.effects.hardening import hardened
+from lingo_mi.effects.spectrum import attenuation, tube_spectrum
+from lingo_mi.errors import InputError
+from lingo_mi.scanning import load_scene, take_scan
+from lingo_mi.xray.objects import find_objects
+from lingo_mi.xray.sensors import view_of
+
+physics = pytest.mark.skipif(any(find_spec(m) is None for m in ('spekpy', 'xraylib')),
+                             reason="needs pip install 'lingo_mi[physics]'")
+TUBE = dict(type='xray_tube', kvp=120., material='soft tissue', bands=5)
+
+
+def detector(**changes):
+    return dict(type='ct_detector', **changes)
+
+
+def scene_of(objects=None, tube=None, film=None, **settings):
+    objects = objects or dict(cloud=ellipsoids(cloud_of()))
+    return load(objects | (dict(tube=tube) if tube else {}), SCANNER | (dict(film=film) if film else {}), **settings)
+
+
+def integrals(thing):
+    return render(load(dict(thing=thing))).ravel()
+
+
+def kernels(function):
+    """The hashes of the kernels that a function launches, once compiled."""
+    function()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        function()
+        return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]
+
+
+# ---- absent costs nothing --------------------------------------------------------------------------------------------
+
+def direct(scene):
+    """The image by the projectors alone: no code of the integrator's or of an effect's."""
+    view = view_of(scene.sensors()[0])
+    total = dr.zeros(mi.Float, view.height * view.width)
+    for thing in find_objects(scene):
+        total += thing.line_integrals(view, 6., True)
+    dr.eval(mi.TensorXf(total, shape=(view.height, view.width, 1)))
+
+
+def through_mitsuba(scene):
+    scene.integrator().render(scene, scene.sensors()[0])
+
+
+@pytest.mark.parametrize('name', ['cloud', 'grid', 'block'])
+def test_absent_costs_nothing(name):
+    """A scene without effects launches the projectors' kernels and no others, in their order."""
+    scene = load({name: dict(cloud=ellipsoids(cloud_of()), grid=grid(values_of()), block=block())[name]})
+    expected = kernels(partial(direct, scene))
+    assert expected and kernels(partial(through_mitsuba, scene)) == expected
+
+
+@pytest.mark.parametrize('tube, film', [
+    (dict(TUBE, bands=2), None), (dict(type='xray_tube', energy=60., focal_spot='.2', focal_order=2), None),
+    (None, detector(psf=.3)), (None, detector(aperture=1., aperture_order=2))])
+@physics
+def test_present_adds_kernels(tube, film):
+    ideal, found = (kernels(partial(through_mitsuba, s)) for s in (scene_of(), scene_of(None, tube, film)))
+    assert set(found) - set(ideal)
+
+
+def test_one_energy_changes_nothing():
+    """Photons of the energy that densities are attenuation at, and a point to come from."""
+    objects = dict(cloud=ellipsoids(cloud_of()))  # one buffer, since a buffer's alignment is compiled into its kernels
+    found, ideal = (scene_of(objects, tube) for tube in (dict(type='xray_tube', energy=60.), None))
+    assert kernels(partial(through_mitsuba, found)) == kernels(partial(through_mitsuba, ideal))
+
+
+# ---- hardening -------------------------------------------------------------------------------------------------------
+
+def full(*pairs):
+    """-ln of the detected signal by the full spectrum, of (line integrals, material)."""
+    spectrum = tube_spectrum(120.)
+    ratios = (attenuation(m, spectrum.energies) / attenuation(m, [60.]) for _, m in pairs)
+    exponent = sum(np.asarray(p, float)[:, None] * r for (p, _), r in zip(pairs, ratios))
+    return -np.log(np.exp(-exponent) @ spectrum.detected('energy'))
+
+
+@physics
+def test_gaussians_grids_and_meshes_harden():
+    objects = dict(cloud=ellipsoids(cloud_of()), grid=grid(values_of()), bolt=block(3.))
+    p = {k: integrals(v) for k, v in objects.items()}
+    found = render(scene_of(objects, dict(TUBE, material_bolt='Fe'))).ravel()
+    np.testing.assert_allclose(found, full((p['cloud'] + p['grid'], 'soft tissue'), (p['bolt'], 'Fe')), atol=2e-3)
+    assert np.abs(found - sum(p.values())).max() > .1
+
+
+@physics
+def test_two_materials():
+    """A grid is split by its values, Gaussians by an attribute."""
+    values = values_of()
+    share = np.clip((values - .3) / .4, 0, 1)
+    two = dict(TUBE, material='soft tissue + bone', split='0.3, 0.7')
+    expected = full((integrals(grid(values * (1 - share))), 'soft tissue'), (integrals(grid(values * share)), 'bone'))
+    np.testing.assert_allclose(render(scene_of(dict(grid=grid(values)), two)).ravel(), expected, atol=5e-4)
+
+    cloud, share = cloud_of(), np.linspace(0, 1, 6)
+    thing = ellipsoids(cloud) | dict(second=mi.TensorXf(np.float32(share)[:, None]))
+    parts = (integrals(ellipsoids(cloud.changed(density=cloud.density * s))) for s in (1 - share, share))
+    expected = full(*zip(parts, ('soft tissue', 'bone')))
+    np.testing.assert_allclose(render(scene_of(dict(cloud=thing), two)).ravel(), expected, atol=5e-4)
+
+
+@physics
+@pytest.mark.parametrize('materials', [('water',), ('soft tissue', 'bone')])
+def test_derivative_of_hardening(materials):
+    """By every material's line integral, against differences of the float64 form."""
+    spectrum = tube_spectrum(120.)
+    ratios = [attenuation(m, spectrum.energies) / attenuation(m, [60.]) for m in materials]
+    bands = band(spectrum.detected('energy'), ratios, 4, 10.)
+    p = np.random.default_rng(0).uniform(0, 12, (len(materials), 200)).astype(np.float32)
+    arrays = [mi.Float(x) for x in p]
+    dr.enable_grad(arrays)
+    image = hardened(arrays, bands)
+    dr.backward(image)
+    np.testing.assert_allclose(image.numpy(), bands.hardened(*p.astype(float)), rtol=2e-6, atol=1e-6)
+    for m, step in enumerate(np.eye(len(materials)) * 1e-4):
+        ahead, behind = (bands.hardened(*(p.astype(float) + s * step[:, None])) for s in (1, -1))
+        np.testing.assert_allclose(dr.grad(arrays[m]).numpy(), (ahead - behind) / 2e-4, rtol=1e-5)
+
+
+@physics
+def test_derivative_through_a_scene():
+    """Spectrum, focal spot, aperture and blur at once: the derivative by a density against differences of images."""
+    tube = dict(TUBE, focal_spot='.3, .2', focal_order=2)
+    film = detector(psf=.3, aperture=1., aperture_order=2, photons=1e5)
+    weights = np.random.default_rng(2).normal(size=(23, 30, 1))
+    cloud, step = cloud_of(), .05
+
+    def loss(density):
+        still = dict(film)
+        del still['photons']
+        return (render(scene_of(dict(cloud=ellipsoids(cloud.changed(density=density))), tube, still)) * weights).sum()
+    scene = scene_of(dict(cloud=ellipsoids(cloud)), tube, film)
+    params = mi.traverse(scene)
+    dr.enable_grad(params['cloud.density'])
+    params.update()
+    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(np.float32(weights)), axis=None))
+    found = dr.grad(params['cloud.density']).numpy()
+    expected = (loss(cloud.density + step * np.eye(6)[2]) - loss(cloud.density - step * np.eye(6)[2])) / (2 * step)
+    assert abs(found[2] - expected) < 1e-3 * np.abs(found).max()
+
+
+# ---- focal spot and aperture -----------------------------------------------------------------------------------------
+
+def edge_moments(tube, film, size=.0025, columns=1600):
+    """Mean and variance of the edge spread, in mm on the panel, of a dense plate half way from source to panel."""
+    sensor = dict(SCANNER, DSO=5., DSD=10., offDetector='0, 0', angles='0', nDetector=f'1, {columns}',
+                  dDetector=f'{size}, {size}')
+    where = mi.ScalarTransform4f().translate([0, 2, 0]).scale([.01, 2, 1])
+    plate = dict(type='cube', to_world=where, bsdf=dict(type='null'),
+                 interior=dict(type='homogeneous', sigma_t=2000., albedo=0.))
+    objects = dict(plate=plate) | (dict(tube=tube) if tube else {})
+    light = render(load(objects, sensor | (dict(film=film) if film else {}), output='transmission')).ravel()
+    spread, at = -np.diff(light), (np.arange(1, columns) - columns / 2) * size
+    assert abs(spread.sum() - 1) < 1e-5
+    mean = (spread * at).sum()
+    return mean, (spread * (at - mean) ** 2).sum()
+
+
+@pytest.mark.parametrize('tube, film, variance', [
+    (dict(type='xray_tube', energy=60., focal_spot='.6, .1', focal_order=8), None, .6 ** 2 / 12),
+    (None, detector(psf=.3), .3 ** 2 / (8 * np.log(2))),
+    (dict(type='xray_tube', energy=60., focal_spot='.6', focal_order=8), detector(psf=.3), .03 + .09 / (8 * np.log(2)))])
+def test_edge_responses(tube, film, variance):
+    """Magnified twice, a uniform spot of width w is a box of width w (DSD - DSO) / DSO = w at the panel; variances add."""
+    mean, found = edge_moments(tube, film) if film is None else edge_moments(tube, film, .01, 400)
+    assert abs(mean) < .003 and abs(found / variance - 1) < .01
+
+
+def test_aperture_is_the_mean_over_a_pixel():
+    soft = scene_of(None, None, detector(aperture=1., aperture_order=8))
+    fine = scene_of(pixel=16, output='transmission')
+    np.testing.assert_allclose(render(soft), -np.log(render(fine)), atol=2e-4)
+
+
+# ---- noise and scans -------------------------------------------------------------------------------------------------
+
+def test_noise_follows_seed_and_view():
+    scene = scene_of(None, None, detector(photons=1e3))
+    first, again, other = (np.array(mi.render(scene, seed=s)) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > .01
+    p = render(scene_of()).ravel()
+    assert abs(np.mean((first.ravel() - p) ** 2 * 1e3 * np.exp(-p)) - 1) < 4 * np.sqrt(2 / len(p)) + .02
+
+
+XML = '''<scene version="3.0.0">
+    <integrator type="lingo_xray"/>
+    <shape type="cube" id="foot">
+        <transform name="to_world"><scale value="12"/></transform>
+        <medium type="ct_volume" name="interior">
+            <string name="phantom" value="foot"/> <integer name="size" value="24"/> <float name="scale" value="0.2"/>
+            <transform name="to_world"><translate value="-0.5, -0.5, -0.5"/><scale value="24"/></transform>
+        </medium>
+        <bsdf type="null"/>
+    </shape>
+    <sensor type="ct_scanner" id="scanner">
+        <float name="DSO" value="100"/> <float name="DSD" value="150"/>
+        <string name="nDetector" value="12, 16"/> <string name="dDetector" value="3.6"/>
+        <string name="nVoxel" value="24"/> <string name="dVoxel" value="1"/>
+        <integer name="views" value="6"/> <integer name="test_views" value="2"/>
+        <film type="ct_detector"><float name="photons" value="1e4"/></film>
+    </sensor>
+    <emitter type="xray_tube" id="tube">
+        <float name="kvp" value="120"/> <string name="material" value="soft tissue"/>
+    </emitter>
+</scene>'''
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    def written(text=XML):
+        (tmp_path / 'scene.xml').write_text(text)
+        return tmp_path / 'scene.xml'
+    return written
+
+
+@physics
+def test_scan_of_a_scene(scene_file):
+    """Every view is what `mi.render` gives, and the same whichever views are chosen."""
+    loaded = load_scene(scene_file())
+    every, some = take_scan(loaded, seed=3), take_scan(loaded, 3, seed=3)
+    np.testing.assert_array_equal(some.train.projections, every.train.projections[::2])
+    np.testing.assert_array_equal(some.test.projections, every.test.projections)
+    for i in (0, 3):
+        image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(i), seed=3))[..., 0]
+        np.testing.assert_allclose(every.train.projections[i], image, atol=1e-6)
+
+
+# ---- errors ----------------------------------------------------------------------------------------------------------
+
+@physics
+@pytest.mark.parametrize('old, new, match', [
+    ('value="120"', 'value="0"', "line 18: xray_tube 'tube': kvp must be from 20 to 300 kV, not 0"),
+    ('value="1e4"', 'value="-5"', 'line 16: ct_detector .*photons must be a number from 0'),
+    ('<string name="material" value="soft tissue"/>', '', "scene.xml: xray_tube: the shape 'foot' has no material"),
+    ('value="soft tissue"', 'value="stone"', "line 18: xray_tube 'tube': the material 'stone' is unknown"),
+    ('value="soft tissue"', 'value="soft tissue + bone"', 'need a split'),
+    ('name="kvp"', 'name="angle"', 'either an energy or a kvp'),
+    ('<string name="material"', '<string name="focal_spot" value="100"/><string name="material"',
+     "xray_tube 'tube': focal_spot of 100 mm is not smaller than the distance of the source, 100 mm"),
+    ('name="photons"', 'name="photon"', 'photon')])
+def test_one_line_that_names_element_and_place(scene_file, old, new, match):
+    assert XML.count(old) == 1
+    with pytest.raises(InputError, match=match) as caught:
+        take_scan(load_scene(scene_file(XML.replace(old, new))))
+    assert '\n' not in str(caught.value) and 'scene.xml' in str(caught.value)
+
+
+@physics
+def test_second_material_of_a_mesh():
+    tube = dict(TUBE, material='soft tissue + bone', split='0.3, 0.7')
+    for thing, match in ((block(), 'homogeneous and cannot'), (ellipsoids(cloud_of()), 'no attribute "second"')):
+        scene = scene_of(dict(thing=thing), tube)
+        with pytest.raises(InputError, match=match):
+            through_mitsuba(scene)
