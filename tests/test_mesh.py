@@ -258,13 +258,16 @@ def test_one_kernel_for_all_views_and_meshes():
     assert kernels and all(k['cache_hit'] for k in kernels)
 
 
-def test_rows_past_a_triangle_write_nothing():
+@pytest.mark.parametrize('level', [False, True])
+def test_rows_past_a_triangle_write_nothing(level):
     """Teams walk eight rows at a time; those past a triangle's end, and maybe the image's, must have no packets."""
     from lingo_mi.xray import mesh
     Float64 = dr.value_t(mi.Vector3d)
-    edge = Float64(5.5), Float64(0), Float64(0), Float64(0), Float64(0)
-    other = Float64(9.5), *edge[1:]
-    row = mi.Int32(0, 1, 7)
-    first, last, *_ = mesh._row(edge, (*other[:1], Float64(-1), *other[2:]), other, mi.Int32(1), row, mi.Int32(1), mi.Int32(20))
-    packets = np.maximum(-(-last.numpy() // mesh.PACKET) - first.numpy() // mesh.PACKET, 0)
-    np.testing.assert_array_equal(packets, [2, 0, 0])
+    zero, nan = Float64(0), Float64(np.nan)
+    long, upper = (Float64(5.5), zero, zero, zero, zero), (Float64(9.5), zero, zero, zero, zero)
+    lower = Float64(9.5), Float64(-1), zero, zero, zero
+    if level:  # an upper edge along a row has no slope
+        upper = *upper[:3], nan, nan
+    first, last, *_ = mesh._row(long, lower, upper, mi.Int32(1), mi.Int32(0, 1, 7), mi.Int32(1), mi.Int32(20))
+    packets = -(-last.numpy().astype(int) // mesh.PACKET) - first.numpy().astype(int) // mesh.PACKET
+    assert np.all(packets[1:] <= 0) and (level or packets[0] == 2)

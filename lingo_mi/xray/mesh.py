@@ -232,7 +232,9 @@ def _row(long, lower, upper, parity, row, row_end, width):
     swap = x0 > x1
     sign = mi.Float(dr.select(swap, -parity, parity))
     first, last = _first_centre(dr.minimum(x0, x1), width), _first_centre(dr.maximum(x0, x1), width)
-    last = dr.select(row < row_end, last, 0)  # not even the packet of `first`: the row may lie outside the image
+    # Not even the packet of `first`, which may be no number there: the row may lie outside the image.
+    inside = row < row_end
+    first, last = dr.select(inside, first, 0), dr.select(inside, last, 0)
     slope = (q1 - q0) / (x1 - x0)
     anchor = dr.select(slope > 0, last - 1, first)
     # From the nearer crossing: one far outside the image has no digits to spare.
