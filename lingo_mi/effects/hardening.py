@@ -10,7 +10,6 @@ import copy
 from dataclasses import dataclass, field
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
