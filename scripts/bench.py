@@ -6,7 +6,8 @@
 
 Renders a random cloud through mi.render and differentiates it through dr.backward, Python and set-up included, and runs
 scripts/limit.cpp (AVX2, two threads, nothing but the arithmetic of a pixel in a fixed box) on as many pairs, in turn, so
-that both see the same machine; the best of five counts for both, and the median of all turns is printed. A pair is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
+that both see the same machine; the best of five counts for both, and the median of all turns is printed. A pair is a pixel
+in the bounding box of a Gaussian's footprint. The limit needs g++.
 
 Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
 against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out.

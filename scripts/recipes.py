@@ -3,7 +3,7 @@
 
     python scripts/recipes.py scenes/x3d_foot.xml scenes/chest.xml scenes/x3d_engine.xml
     python scripts/recipes.py scenes/x3d_foot.xml --methods fast r2 --views 25 --iterations 5000
-    python scripts/recipes.py scenes/x3d_foot.xml --methods lingo r2 lingo:init=r2 lingo:loss_scale=none -D pixels=256 -D pixel_size=2
+    python scripts/recipes.py scenes/x3d_foot.xml --methods lingo r2 lingo:init=r2 r2:init=lingo -D pixels=256 -D pixel_size=2
 
 A method may be followed by settings that differ (`METHOD:name=value,name=value`): so each part of a recipe can be
 exchanged alone.

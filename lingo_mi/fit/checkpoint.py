@@ -21,7 +21,8 @@ def save(path, state: State, extra: dict, arrays: dict | None = None):
     columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
     temporary = path.with_name(path.name + '.partial')
     with open(temporary, 'wb') as file:
-        np.savez(file, gradient=state.gradient, seen=state.seen, born=state.born, extra=np.array(json.dumps(extra, default=np.generic.item)),
+        np.savez(file, gradient=state.gradient, seen=state.seen, born=state.born,
+                 extra=np.array(json.dumps(extra, default=np.generic.item)),
                  **columns, **{f'array.{k}': v for k, v in (arrays or {}).items()})
         file.flush()
         os.fsync(file.fileno())

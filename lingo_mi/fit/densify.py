@@ -3,8 +3,8 @@
 R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one split in
 two. A clone and its original take half the density each, which keeps the mass. The halves of a split are smaller by 1.6;
 R2 gives them half the density too, so that three quarters of the mass vanish; with `split_keeps_mass` they get what
-keeps it. Afterwards faint and stray Gaussians are removed. Where there is not room for all, the strongest go first (R2-Gaussian stops). Adam's moments travel with their Gaussian; new ones start at
-zero.
+keeps it. Where there is not room for all, the strongest go first (R2-Gaussian stops). Afterwards faint and stray Gaussians
+are removed. Adam's moments travel with their Gaussian; new ones start at zero.
 """
 from __future__ import annotations
 

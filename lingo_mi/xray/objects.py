@@ -105,8 +105,8 @@ class GridInCube:
         if not (str(shape).startswith('Cube') and _upright(shape, volume)
                 and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
                 and np.allclose(box.max, cube.max, atol=1e-4 * np.abs(cube.max - cube.min))):
-            raise InputError(f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, and '
-                             'the gridvolume, [0, 1]^3 in its own, transforms onto the same box')
+            raise InputError(f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, '
+                             'and the gridvolume, [0, 1]^3 in its own, transforms onto the same box')
         self.scale = params['scale'] if 'scale' in params else 1.
         self.data, self.size = tensor.array, tensor.shape[2::-1]
         self.low, self.high = box.min, box.max
