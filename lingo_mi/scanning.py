@@ -255,8 +255,7 @@ def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
     from .xray.voxelize import Grid, voxelize
     corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
     cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
-    flat = voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, 6.).numpy()
-    return np.ascontiguousarray(flat.reshape(geometry.nVoxel[::-1]).transpose(2, 1, 0))
+    return cells.volume(voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, 6.))
 
 
 def _warn_if_truncated(geometry: Geometry):

@@ -34,3 +34,12 @@ def data() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip('LINGO_MI_DATA names no folder of test volumes')
     return Path(folder)
+
+
+@pytest.fixture(scope='module')
+def scene(tmp_path_factory) -> Path:
+    """A file of a scene that fits in a second."""
+    from script import SCENE
+    path = tmp_path_factory.mktemp('scene') / 'tiny.xml'
+    path.write_text(SCENE)
+    return path

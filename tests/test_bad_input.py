@@ -17,13 +17,6 @@ QUICK = '--iterations', '2', '-D', 'n_points=100'
 
 
 @pytest.fixture(scope='module')
-def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp('scene') / 'tiny.xml'
-    path.write_text(SCENE)
-    return path
-
-
-@pytest.fixture(scope='module')
 def scan():
     """Measured projections of nothing in particular."""
     geometry = Geometry(DSO=100, DSD=150, nDetector=(8, 10), dDetector=4, nVoxel=16, dVoxel=1, angles=np.arange(6.))

@@ -13,7 +13,7 @@ import mitsuba as mi
 import nibabel
 import numpy as np
 import pytest
-from script import FIT, SCENE, fit, fit_process
+from script import FIT, fit, fit_process
 
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.ply import read_ply
@@ -29,13 +29,6 @@ SMALL = '-D', 'n_points=300', '-D', 'densify_from=10', '-D', 'densify_every=10',
 QUICK = '--iterations', '2', '-D', 'n_points=100'
 KEYS = ('psnr_2d_r2 psnr_2d ssim_2d psnr_3d ssim_3d ipsd ipsd_targets gaussians iterations seconds_init seconds_fit '
         'ms_per_iteration variant method seed views versions history').split()
-
-
-@pytest.fixture(scope='module')
-def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp('scene') / 'tiny.xml'
-    path.write_text(SCENE)
-    return path
 
 
 @pytest.fixture(scope='module')

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from hard_cases import adversarial, check, errors, fit_to, host, on_device, run, scanner, weights_of
+from hard_cases import adversarial, check, errors, fit_to, host, run, scanner, weights_of
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from oracle import Cloud, Pose, random_cloud

@@ -4,7 +4,7 @@ import re
 import nibabel
 import numpy as np
 import pytest
-from script import FIT, SCENE, fit, run
+from script import FIT, fit, run
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import circular
@@ -15,13 +15,6 @@ from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing
 from lingo_mi.scanning import load_scene, take_scan
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
-
-
-@pytest.fixture(scope='module')
-def scene(tmp_path_factory):
-    path = tmp_path_factory.mktemp('scene') / 'tiny.xml'
-    path.write_text(SCENE)
-    return path
 
 
 @pytest.fixture(scope='module')

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
+from hard_cases import host, on_device
 from oracle import Cloud, Pose, random_cloud, relative
 
 from lingo_mi.geometry import Frames, Geometry
@@ -47,22 +48,6 @@ VIEWS = {
     'parallel, tilted': tilted(True),
 }
 SIZES = [(1, 1), (1, 37), (37, 1), (8, 4), (5, 3), (17, 65)]
-
-
-def on_device(cloud):
-    # From lists, because Dr.Jit compiles the alignment of a NumPy buffer into its kernels; that takes seconds a test.
-    def column(values):
-        return mi.Float(values.tolist())
-    arrays = (mi.Point3f(*map(column, cloud.centre.T)), mi.Vector3f(*map(column, cloud.scale.T)),
-              mi.Vector4f(*map(column, cloud.rotation.T)), column(cloud.density))
-    dr.make_opaque(arrays)
-    return arrays
-
-
-def host(value):
-    """A Dr.Jit array as NumPy [N, ...]."""
-    array = np.array(value, float)
-    return array.T if array.ndim > 1 else array
 
 
 def run(cloud, frames, shape, weights, panel=True, pose=False):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..lingo import initialise as lingo
 from ..lingo.initialise import InitialCloud
+from ..recon.circle import on_circle
 from ..recon.fdk import fdk
 from ..scan import Scan
 from .device import DeviceState
@@ -37,9 +38,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings, unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
-        # FDK knows the circle alone, and whole images.
-        possible = g.poses is None and scan.valid is None
-        density = settings.init_density if possible or settings.init_density != 'fdk' else 'lsq'
+        density = 'lsq' if settings.init_density == 'fdk' and not on_circle(scan) else settings.init_density
         chosen = lingo.Settings(
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
             resolution=settings.occupancy_voxels, V_S=settings.V_S, density=density,

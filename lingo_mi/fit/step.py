@@ -120,8 +120,7 @@ class Stepper:
         """The cloud's density at the voxel centres of the scan's grid, float32 [x, y, z]."""
         g = self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        flat = voxelize(*state.gaussians(self.settings), grid, self.settings.extent).numpy() * np.float32(self.unit)
-        return np.ascontiguousarray(flat.reshape(g.nVoxel[::-1]).transpose(2, 1, 0))
+        return grid.volume(voxelize(*state.gaussians(self.settings), grid, self.settings.extent)) * np.float32(self.unit)
 
     def _view(self, state, gaussians, target, batch):
         """Add one view's gradient to the parameters', and its part to the densification statistic."""

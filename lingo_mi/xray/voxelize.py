@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, high_low, load, pack, position, span,
                       times, whole)
@@ -32,6 +33,10 @@ class Grid:
     corner: object
     step: object
     shape: tuple[int, int, int]
+
+    def volume(self, values):
+        """Float [nz * ny * nx] as a host volume, float32 [x, y, z]."""
+        return np.ascontiguousarray(values.numpy().reshape(self.shape[::-1]).transpose(2, 1, 0))
 
 
 def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
