@@ -17,11 +17,14 @@ class Scan:
     projections   float32 [view, v, u]: line integrals ln(I0 / I), density times mm
     valid         bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are
                   valid. What the projections hold in the others, NaN included, is forgotten: they become 0
+    effects       what a detector saw besides line integrals (`effects.forward.Effects`); None: nothing. The projections are
+                  then -ln of its signal, and densities attenuation at the tube's reference energy
     """
 
     geometry: Geometry
     projections: np.ndarray
     valid: np.ndarray | None = None
+    effects: object = None
 
     def __post_init__(self):
         p = np.asarray(self.projections, np.float32)
@@ -48,7 +51,8 @@ class Scan:
 
     def subset(self, index) -> Scan:
         """The views `index` only."""
-        return Scan(self.geometry.subset(index), self.projections[index], None if self.valid is None else self.valid[index])
+        return replace(self, geometry=self.geometry.subset(index), projections=self.projections[index],
+                       valid=None if self.valid is None else self.valid[index])
 
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
@@ -66,11 +70,13 @@ class Scan:
         step = tuple(d * f for d, f in zip(g.dDetector, by))
         if g.poses is not None:
             poses = replace(g.poses, u=g.poses.u * by[1], v=g.poses.v * by[0])
-            return Scan(replace(g, nDetector=(rows, columns), dDetector=step, poses=poses), p, valid)
+            return replace(self, geometry=replace(g, nDetector=(rows, columns), dDetector=step, poses=poses), projections=p,
+                           valid=valid)
         # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
         lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
         offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
-        return Scan(replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset), p, valid)
+        return replace(self, geometry=replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset),
+                       projections=p, valid=valid)
 
     @property
     def normalised(self) -> np.ndarray:

@@ -131,12 +131,10 @@ class Detector:
         """
         import drjit as dr
         import mitsuba as mi
-        if not view.panel:
-            raise InputError('psf, in mm on the panel, needs a ct_scanner')
         image = mi.TensorXf(image, shape=(view.height, view.width))
         for axis, step in ((0, view.v), (1, view.u)):
             # Rounded, because the taps are compiled into the kernel: no two views may differ in their last digit.
-            sigma = round(self.psf / FWHM / float(dr.norm(step)[0]), 6)
+            sigma = round(self.psf / FWHM / float(dr.detach(dr.norm(step))[0]), 6)
             image = dr.convolve(image, taps(sigma), axis=axis, boundary='nearest')
         return image.array
 

@@ -47,6 +47,10 @@ class FocalSpot:
         return [(weight, replace(view, source=view.source + _opaque(x * self.size[0]) * u + _opaque(y * self.size[1]) * v))
                 for weight, x, y in square(self.order, *(s > 0 for s in self.size))]
 
+    def scaled(self, factor: float) -> FocalSpot:
+        """The same spot where lengths are multiplied by `factor`."""
+        return replace(self, size=(factor * self.size[0], factor * self.size[1]))
+
     def check(self, distance: float | None):
         """Raises InputError unless the spot is smaller than its distance to the axis, mm; None is a parallel beam."""
         if max(self.size) > 0 and distance is None:

@@ -1,13 +1,14 @@
 """The effects that a scene calls for, and what its detector then sees (Dr.Jit)."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
+from ..scan import Scan
 from .detector import DARKEST, Detector
 from .focal_spot import FocalSpot, aperture_views
 from .hardening import Tube, by_material, hardened
@@ -26,6 +27,17 @@ class Effects:
     spot: FocalSpot | None = None
     detector: Detector | None = None
     index: int = 0
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the expected signal is exp(-line integral) along the ray through a pixel's centre."""
+        return not (self.tube and self.tube.hardens or self.spot and max(self.spot.size)
+                    or self.detector and (self.detector.aperture or self.detector.psf))
+
+    def scaled(self, factor: float) -> Effects:
+        """The same for views whose lengths are mm times `factor`."""
+        return replace(self, spot=self.spot and self.spot.scaled(factor),
+                       detector=self.detector and replace(self.detector, psf=factor * self.detector.psf))
 
     @property
     def response(self) -> str:
@@ -79,6 +91,25 @@ class Effects:
             light = self.detector.blurred(light, view)
         return -dr.log(dr.maximum(light, DARKEST))
 
+    def masked(self, scan: Scan) -> Scan:
+        """A scan without the pixels that are dead."""
+        if not (self.detector and self.detector.dead):
+            return scan
+        alive = ~self.detector.maps(scan.geometry.nDetector)[1]
+        return replace(scan, valid=np.broadcast_to(alive, scan.projections.shape) & (True if scan.valid is None else scan.valid))
+
+    def linearised(self, scan: Scan) -> Scan:
+        """A scan's line integrals at the reference energy, as far as single pixels tell them; it has no effects left.
+
+        Beam hardening is inverted as if all were of one material, the first of two (water precorrection, Kachelriess et
+        al., Med. Phys. 33, 2006). Blur stays.
+        """
+        projections = scan.projections
+        if self.tube and self.tube.hardens:
+            bands = self.tube.signal(self.tube.fitted()[:1], self.response)
+            projections = np.stack([bands.precorrected(view) for view in projections])  # one by one, for memory
+        return replace(scan, projections=projections, effects=None)
+
     def measured(self, integrals, view, seed: int):
         """Line integrals as the detector reports them, with its noise, from the expected ones; not differentiable."""
         if not (self.detector and self.detector.measures):
@@ -97,6 +128,8 @@ def find_effects(scene, sensor) -> Effects | None:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
     tube, spot = (tubes[0].tube, tubes[0].spot) if tubes else (None, None)
     geometry = getattr(sensor, 'geometry', None)
+    if detector is not None and detector.psf and geometry is None:
+        raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')
     if spot is not None and geometry is not None:
         try:
             spot.check(None if geometry.mode == 'parallel' else geometry.DSO)

@@ -29,6 +29,7 @@ class Tube:
     materials   the same for shapes by name, where they differ
     split       densities between which a grid of two materials goes from the first to the second, 1/mm
     bands       terms that stand for the spectrum
+    given       the parameters that `of` made it from, by name; those of shapes as material_NAME
     """
 
     spectrum: Spectrum
@@ -37,6 +38,7 @@ class Tube:
     materials: dict[str, tuple[str, ...]] = field(default_factory=dict)
     split: tuple[float, float] | None = None
     bands: int = 4
+    given: dict = field(default_factory=dict, compare=False)
 
     @staticmethod
     def of(energy, kvp, angle, filtration, reference, material, split, bands, materials) -> Tube:
@@ -54,7 +56,9 @@ class Tube:
         if isinstance(bands, bool) or not isinstance(bands, int) or not 1 <= bands <= energy_bands.MOST_BANDS:
             raise InputError(f'bands must be a whole number from 1 to {energy_bands.MOST_BANDS}, not {bands!r}')
         named = {name: _names(text) for name, text in materials.items()}
-        tube = Tube(spectrum, float(reference), _names(material) if material else (), named, _split(split), bands)
+        given = dict(energy=energy, kvp=kvp, angle=angle, filtration=filtration, reference=reference, material=material,
+                     split=split, bands=bands) | {f'material_{name}': text for name, text in materials.items()}
+        tube = Tube(spectrum, float(reference), _names(material) if material else (), named, _split(split), bands, given)
         for names in (tube.material, *named.values()):
             for name in names:
                 attenuation(name, [tube.reference])
@@ -74,6 +78,18 @@ class Tube:
         if not names:
             raise InputError(f'xray_tube: the shape {name!r} has no material, without which a spectrum says nothing: add '
                              f'<string name="material_{name}" value="water"/>')
+        return names
+
+    def fitted(self) -> tuple[str, ...]:
+        """The materials of all objects, one or two: what a cloud without shapes may be of. Raises InputError."""
+        names = tuple(dict.fromkeys([*self.material, *(name for shape in self.materials.values() for name in shape)]))
+        if not names:
+            raise InputError('xray_tube: without a material a spectrum says nothing: add <string name="material" '
+                             'value="water"/>, or fit with effects=ignore')
+        if len(names) > 2 or len(names) == 2 and self.split is None:
+            raise InputError(f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
+                             + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
+                             + ', or fit with effects=ignore')
         return names
 
     def signal(self, names, response: str = 'energy') -> energy_bands.Bands:

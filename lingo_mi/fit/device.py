@@ -18,16 +18,11 @@ class DeviceState:
     def __init__(self, state: State):
         types = _types()
 
-        def column(values):
-            return mi.Float(_aligned(values))
-
         def upload(columns):
-            return {k: types[k](*(column(c) for c in columns[k].T)) for k in PARAMETERS}
+            return {k: types[k](*(uploaded(c) for c in columns[k].T)) for k in PARAMETERS}
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
-        self.gradient, self.seen = column(state.gradient), column(state.seen)
+        self.gradient, self.seen = uploaded(state.gradient), uploaded(state.seen)
         self.born = state.born
-        # A single Gaussian's arrays of width one would otherwise be literals, and be compiled in.
-        dr.make_opaque(self.values, self.first, self.second, self.gradient, self.seen)
 
     def __len__(self) -> int:
         return len(self.born)
@@ -74,8 +69,8 @@ def _softplus(x):
     return dr.select(above, x, 0) + dr.select(small < .01, series, dr.log(1 + small))
 
 
-def _aligned(values):
-    """A copy that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
+def uploaded(values):
+    """A copy of NumPy's values, Float [N], that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
 
     Dr.Jit reads NumPy's memory in place and compiles its alignment into the kernels, which would then be others after every
     densification.
@@ -84,4 +79,6 @@ def _aligned(values):
     start = -room.ctypes.data % 64 // 4
     out = room[start:start + len(values)]
     out[:] = values
+    out = mi.Float(out)
+    dr.make_opaque(out)  # one value alone would otherwise be a literal, and be compiled in
     return out

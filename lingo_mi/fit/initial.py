@@ -13,6 +13,7 @@ from ..recon.fdk import fdk
 from ..scan import Scan
 from .device import DeviceState
 from .loop import bounded
+from .model import linearised
 from .r2_init import r2_initialise
 from .settings import Settings
 from .state import start
@@ -28,6 +29,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     begun = time.perf_counter()
     settings = bounded(settings, scan)
     rng = np.random.default_rng(seed)
+    scan = linearised(scan, settings)
     g, unit = scan.geometry, density_unit(scan, settings)
     if settings.init == 'r2':
         volume = fdk(scan) / unit

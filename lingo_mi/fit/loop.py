@@ -64,8 +64,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
         state = DeviceState(host)
-        if stepper.poses is not None:
-            stepper.poses.restore(arrays)
+        stepper.restore(arrays)
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0., [], dict(initial.info)
@@ -80,7 +79,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
                 seed=seed, rng=rng.bit_generator.state, iteration=iteration,
                 seconds=seconds + time.perf_counter() - clock, history=history, info=info,
                 settings=asdict(settings), views=len(scan)),
-                dict(initial=points, order=np.array(order, int)) | (stepper.poses.arrays() if stepper.poses else {}))
+                dict(initial=points, order=np.array(order, int)) | stepper.arrays())
 
     while iteration < settings.iterations:
         while len(order) < settings.batch:  # every view once before any a second time

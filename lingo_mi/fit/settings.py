@@ -32,6 +32,9 @@ class Settings:
 
     Forward model
     extent             cut-off in standard deviations (R2: 3)
+    effects            'model': where a scan has effects (spectrum, focal spot, blur, dead pixels), the cloud is seen through
+                       them, since a scene that names them says how its data came about; or 'ignore': projections are
+                       taken for line integrals whatever the scene says
 
     Loss (paper, section III-C)
     lambda_ssim        weight of 1 - SSIM (0.25)
@@ -80,6 +83,7 @@ class Settings:
     fdk_rescale: float = .15
     normalise: bool = False
     extent: float = 3.
+    effects: str = 'model'
     lambda_ssim: float = .25
     lambda_tv: float = .05
     tv_size: int = 32
@@ -127,6 +131,7 @@ class Settings:
         require(self.values_per_gaussian >= 0,
                 f'values_per_gaussian must not be negative, not {self.values_per_gaussian:g}')
         require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
+        require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
         for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'):

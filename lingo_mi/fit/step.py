@@ -1,6 +1,8 @@
 """One step of the fit: render, compare, differentiate, and move the Gaussians."""
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import replace
 
 import drjit as dr
@@ -15,8 +17,9 @@ from ..xray.frame import View, vector64
 from ..xray.splat import splat
 from ..xray.voxelize import Grid, voxelize
 from . import losses
-from .device import DeviceState
+from .device import DeviceState, uploaded
 from .loss_scale import loss_scale
+from .model import RENEWED, model_of, trusted
 from .poses import Poses, gathered, place
 from .settings import Settings
 
@@ -52,7 +55,10 @@ class Stepper:
     def __init__(self, scan: Scan, settings: Settings, unit: float | None = None):
         """unit: the density that counts as 1, where another scan than this one decides it (`density_unit`)."""
         self.settings, self.geometry = settings, scan.geometry
+        scan = trusted(scan, settings)
         self.unit = density_unit(scan, settings) if unit is None else unit
+        self.model = model_of(scan, settings, self.unit)
+        self.share = None  # of the second of two materials in every Gaussian, as the steps know it
         self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
         self.coarse_until = round(settings.coarse_share * settings.iterations)
         coarse = scan.binned(2) if self.coarse_until else scan
@@ -68,6 +74,8 @@ class Stepper:
         iteration counts from 0. rng places the total variation's cube.
         """
         s = self.settings
+        if self.share is None or iteration % RENEWED == 0 or dr.width(self.share) != len(state):
+            self.share = self.shares(state)
         for value in state.values.values():
             dr.enable_grad(value)
         gaussians = state.gaussians(s)
@@ -104,13 +112,17 @@ class Stepper:
         return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
-        """Projections of the cloud in a scan's geometry, float32 [view, v, u], density times mm."""
+        """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
+        the expected signal where the fit models effects."""
         frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
-        gaussians, extent = state.gaussians(self.settings), self.settings.extent
+        gaussians, share = state.gaussians(self.settings), self.shares(state)
+
+        def integrals(rays):
+            return self._integrals(project(*gaussians, rays, self.settings.extent), rays, share)
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
-            image = splat(project(*gaussians, view, extent), height, width, extent) * view.lengths()
+            image = integrals(view)[0] if self.model is None else self.model.image(integrals, view)
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
@@ -122,23 +134,58 @@ class Stepper:
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
         return grid.volume(voxelize(*state.gaussians(self.settings), grid, self.settings.extent)) * np.float32(self.unit)
 
+    def shares(self, state: DeviceState):
+        """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""
+        if self.model is None or self.model.split is None:
+            return None
+        return self.model.shares(self.volume(state), np.stack([c.numpy() for c in state.values['centre']], 1), self.half)
+
+    def arrays(self) -> dict:
+        """What steps keep beside the state, by name, for a checkpoint."""
+        return ({} if self.poses is None else self.poses.arrays()) | ({} if self.share is None else
+                                                                       dict(share=self.share.numpy()))
+
+    def restore(self, arrays: dict):
+        """Take over what `arrays` gave."""
+        if self.poses is not None:
+            self.poses.restore(arrays)
+        if 'share' in arrays:
+            self.share = uploaded(arrays['share'])
+
+    def _integrals(self, footprints, rays, share):
+        """Line integrals along the rays of a view, a list of Float: of the cloud, or of each of its two materials."""
+        amplitude, *others = footprints.values
+        parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
+        return [splat(replace(footprints, values=(part, *others)), rays.height, rays.width, self.settings.extent)
+                * rays.lengths() for part in parts]
+
     def _view(self, state, gaussians, target, batch):
         """Add one view's gradient to the parameters', and its part to the densification statistic."""
         s, view = self.settings, target.view
-        footprints = project(*gaussians, view, s.extent)
-        leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
-        image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
+        bundles = []  # of rays: one, or all those that the model takes a mean over
+
+        def integrals(rays):
+            footprints = project(*gaussians, rays, s.extent)
+            leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
+            bundles.append((footprints, leaf))
+            return self._integrals(replace(footprints, values=leaf), rays, self.share)
+        image = integrals(view)[0] if self.model is None else self.model.image(integrals, view)
         loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
         factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
-        dr.backward(loss * weight * (1 / batch))
-        gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])  # not while derivatives are suspended: they would read as zero
+        # Bundles share what leads to a view's pose, so its edges must outlast all but the last.
+        flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
+        dr.backward(loss * weight * (1 / batch), flags=flags)
+        # Not while derivatives are suspended: they would read as zero.
+        gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
+        footprints = bundles[len(bundles) // 2][0]
         with dr.suspend_grad():
             norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
             state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
             state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
-        _pass_on(leaf, footprints.values)
-        _evaluate(gaussians)
+        for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
+            _pass_on(leaf, footprints.values, flags)
+            _evaluate(gaussians)
         return dr.detach(loss) * (1 / batch)
 
     def _total_variation(self, gaussians, rng):
@@ -178,13 +225,13 @@ def _leaf(values):
     return copies
 
 
-def _pass_on(leaf, values):
+def _pass_on(leaf, values, flags=dr.ADFlag.Default):
     """Propagate the derivatives gathered in a leaf through the making of its values."""
     for value, copy in zip(values, leaf):
         if dr.grad_enabled(value):
             dr.set_grad(value, dr.grad(copy))
             dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward)
+    dr.traverse(dr.ADMode.Backward, flags)
 
 
 def _evaluate(values):

@@ -1,0 +1,84 @@
+"""What a scan's detector sees of a cloud: the effects of a scan inside the fit's forward model."""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from ..effects.forward import Effects
+from ..effects.hardening import hardened, second_share
+from ..scan import Scan
+from ..xray.quality import Quality
+from .device import uploaded
+
+RENEWED = 50  # steps after which the shares of two materials are looked at again
+
+
+class Model:
+    """The expected signal of a scan's detector, in the frame and the unit of a fit.
+
+    A line integral q of the fit is p = factor q at the tube's reference energy, without a unit, and pixels are compared as
+    -ln(I / I0) / factor. Two materials are told apart as in a grid, by the density at a Gaussian's centre (Joseph and
+    Spital, J. Comput. Assist. Tomogr. 2, 1978, who divide a first reconstruction so); the shares are constants to the
+    derivatives and are renewed now and then.
+
+    effects   with lengths in the fit's frame
+    bands     of the spectrum; None where nothing hardens
+    split     densities between which the second material's share rises, 1/mm; None for one material
+    """
+
+    def __init__(self, effects: Effects, scale: float, unit: float):
+        """scale: of the fit's lengths over mm; unit: the density that counts as 1, 1/mm."""
+        self.effects = effects.scaled(scale)
+        self.factor = dr.opaque(mi.Float, unit / scale)
+        self.bands, self.split = None, None
+        if effects.tube and effects.tube.hardens:
+            names = effects.tube.fitted()
+            self.bands = effects.tube.signal(names, effects.response)
+            self.split = effects.tube.split if len(names) == 2 else None
+
+    def image(self, integrals, view):
+        """What the pixels of a view are expected to be, Float [height * width]; differentiable.
+
+        integrals   gives line integrals along the rays of a View, one Float a material
+        """
+        def seen(rays):
+            parts = [self.factor * q for q in integrals(rays)]
+            return hardened(parts, self.bands) if self.bands else parts[0]
+        return self.effects.averaged(seen, view, Quality()) / self.factor
+
+    def shares(self, volume, centres, half):
+        """The second material's share in every Gaussian's density, Float [N]; None for one material.
+
+        volume    [x, y, z], the cloud's density, 1/mm
+        centres   [N, 3] and half, [3], half the volume's sides: both in the fit's frame
+        """
+        if self.split is None:
+            return None
+        place = (np.asarray(centres, float) / half + 1) / 2 * volume.shape - .5
+        density = ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
+        return uploaded(second_share(density.astype(float), self.split))
+
+
+def model_of(scan: Scan, settings, unit: float) -> Model | None:
+    """The model of a scan's effects; None where the fit compares line integrals, because it has none or they are ignored.
+
+    Raises InputError for effects that a fit cannot reproduce.
+    """
+    effects = scan.effects if settings.effects == 'model' else None
+    if effects is None or effects.ideal:
+        return None
+    return Model(effects, scan.geometry.scale, unit)
+
+
+def trusted(scan: Scan, settings) -> Scan:
+    """The scan without the pixels that its detector knows to be dead."""
+    effects = scan.effects if settings.effects == 'model' else None
+    return scan if effects is None else effects.masked(scan)
+
+
+def linearised(scan: Scan, settings) -> Scan:
+    """A scan of line integrals at the reference energy for what knows no effects: initial clouds, FDK."""
+    effects = scan.effects if settings.effects == 'model' else None
+    return scan if effects is None else effects.linearised(scan)
