@@ -102,9 +102,9 @@ def read_input(args, scene, views: int, seed: int = 0):
     """
     from .files.scans import read_scan
     from .files.volumes import read_volume
-    from .scanning import check_memory, choose_views, take_scan
+    from .scanning import check_memory, choose_views, take_scan, with_effects
     if args.projections:
-        dataset = choose_views(read_scan(args.projections), views)
+        dataset = choose_views(with_effects(read_scan(args.projections), scene), views)
         check_memory(dataset.train.geometry)
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None

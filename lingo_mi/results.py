@@ -7,6 +7,7 @@ import time
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import mitsuba as mi
 import numpy as np
@@ -64,8 +65,10 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
     volume = fitted.stepper.volume(state)
     write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
     cloud = world_cloud(fitted, geometry)
-    write_ply(folder / 'gaussians.ply', *cloud)
-    write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent)
+    share = fitted.stepper.shares(state)
+    write_ply(folder / 'gaussians.ply', *cloud, None if share is None else share.numpy())
+    effects = dataset.train.effects if fitted.stepper.model is not None else None
+    write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent, effects)
     rendered = None
     if test is not None and len(test):
         rendered = fitted.stepper.render(state, test.geometry)
@@ -119,17 +122,35 @@ def _corrections(fitted) -> dict:
                                          pose_shifts_mm=(poses.shift / fitted.stepper.geometry.scale).tolist())
 
 
-def write_scene(path: Path, geometry, extent: float):
-    """A scene that renders the fitted cloud with the scan's own scanner; needs only `import lingo_mi`."""
+def write_scene(path: Path, geometry, extent: float, effects=None):
+    """A scene that renders the fitted cloud with the scan's own scanner; needs only `import lingo_mi`.
+
+    effects   of the scan that the fit has modelled: the scene then has their tube, and a detector without noise, so that it
+              renders what the fit compared with the scan
+    """
     from .plugins.ct_scanner import describe
     lines = ['<scene version="3.0.0">', '    <integrator type="lingo_xray">',
              f'        <float name="extent" value="{extent:g}"/>', '    </integrator>',
              '    <shape type="ellipsoids" id="cloud">', '        <string name="filename" value="gaussians.ply"/>',
              '    </shape>', '    <sensor type="ct_scanner" id="scanner">']
+    lines += _parameters(describe(geometry), 8)
+    if effects is not None and effects.detector:
+        names = 'response', 'psf', 'aperture', 'aperture_order'
+        lines += ['        <film type="ct_detector">',
+                  *_parameters({k: getattr(effects.detector, k) for k in names}, 12), '        </film>']
+    lines += ['    </sensor>']
+    if effects is not None and effects.tube:
+        spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
+        given = {k: v for k, v in effects.tube.given.items() if not (v is None or v == '')}
+        lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot, 8), '    </emitter>']
+    path.write_text('\n'.join([*lines, '</scene>']) + '\n', encoding='utf-8')
+
+
+def _parameters(values: dict, indent: int) -> list[str]:
+    """Parameters of a plugin as lines of XML."""
     kinds = {str: 'string', float: 'float', int: 'integer'}
-    lines += [f'        <{kinds[type(v)]} name="{k}" value="{v!r}"/>'.replace('"\'', '"').replace('\'"', '"')
-              for k, v in describe(geometry).items() if k != 'type']
-    path.write_text('\n'.join([*lines, '    </sensor>', '</scene>']) + '\n', encoding='utf-8')
+    return [' ' * indent + f'<{kinds[type(v)]} name="{k}" value={quoteattr(v if isinstance(v, str) else repr(v))}/>'
+            for k, v in values.items() if k != 'type']
 
 
 def versions() -> dict:

@@ -116,7 +116,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:
-        return choose_views(scanner.dataset, views)
+        return choose_views(with_effects(scanner.dataset, loaded), views)
     geometry, test = scanner.geometry, scanner.test_geometry
     if views:  # before the work, not after
         spread(len(geometry), views)
@@ -142,13 +142,20 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
         everything = Scan(every, render_objects(objects, every))
     else:
         try:
-            everything = Scan(every, _render_with(effects, objects, every, keys, seed))
+            everything = Scan(every, _render_with(effects, objects, every, keys, seed), effects=effects)
         except InputError as error:
             raise InputError(f'{loaded.path}: {error}') from None
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
     meshes = [s for s in loaded.scene.shapes() if s.is_mesh() and s.interior_medium() is not None]
     return choose_views(Dataset(train, held_out, _truth(objects, meshes, geometry)), 0 if test is not None else views)
+
+
+def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
+    """Measured projections as the tube and the detector of a scene saw them."""
+    effects = find_effects(loaded.scene, loaded.scanner)
+    return replace(dataset, train=replace(dataset.train, effects=effects),
+                   test=dataset.test and replace(dataset.test, effects=effects))
 
 
 def choose_views(dataset: Dataset, views: int) -> Dataset:

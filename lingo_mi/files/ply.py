@@ -46,11 +46,12 @@ def _check(where, centres, scales, quaternions, density):
                          'a direction')
 
 
-def write_ply(path, centres, scales, quaternions, density) -> None:
+def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
     """Writes a cloud, whole or not at all.
 
     centres [N, 3] and scales [N, 3] (standard deviations, > 0) in one unit of length, quaternions [N, 4] (x,
-    y, z, w; normalised here), density [N] at the centres. Raises InputError for wrong shapes, values that are
+    y, z, w; normalised here), density [N] at the centres; second [N], if given, is a further property of that name, a
+    second material's share in the density. Raises InputError for wrong shapes, values that are
     not finite, scales that are not positive, zero quaternions, an empty cloud, or a file that cannot be
     written.
     """
@@ -65,10 +66,12 @@ def write_ply(path, centres, scales, quaternions, density) -> None:
     # logit(1 - exp(-t)) = log(exp(t) - 1), kept where viewers' sigmoid does not saturate
     opacity = np.log(np.expm1(np.clip(depth, 1e-4, 10)))
     zeros = np.zeros((len(density), 6))
-    table = np.concatenate([centres, zeros, opacity[:, None], density[:, None], np.log(scales),
+    more = [] if second is None else [np.asarray(second, float)[:, None]]
+    table = np.concatenate([centres, zeros, opacity[:, None], *more, density[:, None], np.log(scales),
                             quaternions[:, [3, 0, 1, 2]]], 1)
+    names = [p for name in _PROPERTIES for p in (['second'] if more and name == 'density' else []) + [name]]
     header = ''.join(['ply\nformat binary_little_endian 1.0\n', f'element vertex {len(table)}\n',
-                      *(f'property float {name}\n' for name in _PROPERTIES), 'end_header\n'])
+                      *(f'property float {name}\n' for name in names), 'end_header\n'])
     with replacing(path) as temporary, open(temporary, 'wb') as stream:
         stream.write(header.encode('ascii') + np.ascontiguousarray(table, '<f4').tobytes())
 

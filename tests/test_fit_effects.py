@@ -1,0 +1,252 @@
+"""Effects inside the fit: images and derivatives of its model, what it costs where there is none, checkpoints, results."""
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from script import fit
+from test_effects_render import XML
+from test_fit import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
+
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.focal_spot import FocalSpot
+from lingo_mi.effects.forward import Effects
+from lingo_mi.effects.hardening import Tube
+from lingo_mi.errors import InputError
+from lingo_mi.files.images import read_exr
+from lingo_mi.fit import losses, step
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fit.loop import run
+from lingo_mi.fit.loss_scale import loss_scale
+from lingo_mi.fit.state import start
+from lingo_mi.fit.step import Stepper
+from lingo_mi.scan import Scan
+from lingo_mi.scanning import load_scene, take_scan
+from lingo_mi.xray.footprint import project
+from lingo_mi.xray.splat import splat
+
+physics = pytest.mark.skipif(any(find_spec(m) is None for m in ('spekpy', 'xraylib')),
+                             reason="needs pip install 'lingo_mi[physics]'")
+SPOT = FocalSpot((12., 8.), 2)
+
+
+def tube(material='soft tissue', split=''):
+    return Tube.of(None, 120., 12., 'Al 2.5', None, material, split, 4, {})
+
+
+def detector(**changes):
+    return Detector.of(**{**Detector.DEFAULTS, **changes})
+
+
+def stepper_of(effects, views=3, **changes):
+    """A stepper of a scan with effects, and a cloud for it, in the fit's unit."""
+    g = geometry(views)
+    # Line integrals of order one; the measured views lie above the rendered ones everywhere, for differences of L1.
+    scan = Scan(g, tiny_scan(g).projections / 50 + 3, effects=effects)
+    settings = SHORT.changed(extent=7, **changes)
+    stepper, points = Stepper(scan, settings), some_points(g, 40)
+    return stepper, DeviceState(start(points.points, points.spacing * 2, points.density * .1, settings))
+
+
+def kernels(function):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        function()
+        return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]
+
+
+# ---- absent costs nothing --------------------------------------------------------------------------------------------
+
+def plain_view(self, state, gaussians, target, batch):
+    """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
+    s, view = self.settings, target.view
+    footprints = project(*gaussians, view, s.extent)
+    leaf = step._leaf(footprints.values)
+    image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
+    loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
+    weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
+    dr.backward(loss * weight * (1 / batch))
+    gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])
+    with dr.suspend_grad():
+        norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
+        state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
+        state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
+    step._pass_on(leaf, footprints.values)
+    step._evaluate(gaussians)
+    return dr.detach(loss) * (1 / batch)
+
+
+@pytest.mark.parametrize('effects, changes', [
+    (None, {}), (None, dict(loss_scale='dynamic')), (Effects(None, None, detector(photons=1e4)), {}),
+    (Effects(None, SPOT, None), dict(effects='ignore'))])
+def test_absent_costs_nothing(monkeypatch, effects, changes):
+    """Without effects to model, a fit launches the kernels of a step that has never heard of them, in their order."""
+    scan = replace(tiny_scan(geometry(3)), effects=effects)
+    settings = SHORT.changed(iterations=5, densify_from=100, **changes)
+    found = kernels(lambda: run(scan, settings, some_points(scan.geometry), seed=3))
+    monkeypatch.setattr(Stepper, '_view', plain_view)
+    assert found == kernels(lambda: run(scan, settings, some_points(scan.geometry), seed=3))
+
+
+@physics
+def test_a_second_view_compiles_nothing():
+    """With all effects at once, too."""
+    effects = Effects(tube('soft tissue + bone', '0.01, 0.03'), SPOT, detector(psf=15., aperture=1., aperture_order=2))
+    stepper, state = stepper_of(effects)
+    rng = np.random.default_rng(0)
+    first = kernels(lambda: [stepper.step(state, [v], i, rng) for i, v in enumerate((0, 1, 0))])
+    second = kernels(lambda: [stepper.step(state, [v], i + 3, rng) for i, v in enumerate((2, 1))])
+    assert set(second) <= set(first)
+
+
+# ---- images and derivatives ------------------------------------------------------------------------------------------
+
+EFFECTS = {
+    'spectrum': lambda: Effects(tube(), FocalSpot(), None),
+    'two materials': lambda: Effects(tube('soft tissue + bone', '0.0002, 0.0006'), FocalSpot(), None),
+    'spot': lambda: Effects(Tube.of(60., None, 12., '', None, '', '', 4, {}), SPOT, None),
+    'blur': lambda: Effects(None, None, detector(psf=15.)),
+    'all': lambda: Effects(tube(), SPOT, detector(psf=15., aperture=1., aperture_order=2))}
+
+
+@physics
+@pytest.mark.parametrize('name', EFFECTS)
+def test_the_fit_sees_what_the_integrator_renders(name, tmp_path):
+    """The cloud written as result.xml, rendered through Mitsuba, is what the fit compares with its scan."""
+    from lingo_mi.files.ply import write_ply
+    from lingo_mi.fit.state import activate
+    from lingo_mi.results import write_scene
+    effects = EFFECTS[name]()
+    stepper, state = stepper_of(effects)
+    g = stepper.geometry
+    expected = stepper.render(state, g)
+    centre, scale, rotation, density = activate(state.host(), stepper.settings)
+    share = stepper.shares(state)
+    write_ply(tmp_path / 'gaussians.ply', centre / g.scale, scale / g.scale, rotation, density * stepper.unit,
+              None if share is None else share.numpy())
+    write_scene(tmp_path / 'result.xml', g, 7, effects)
+    loaded = load_scene(tmp_path / 'result.xml')
+    for i in range(len(g)):
+        image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(i)))[..., 0]
+        np.testing.assert_allclose(image, expected[i], rtol=1e-4, atol=1e-4 * expected.max())
+    plain, _ = stepper_of(None)
+    plain.unit = stepper.unit
+    assert np.abs(plain.render(state, g) - expected).max() > 2e-3 * expected.max()
+    assert name != 'two materials' or 0 < share.numpy().mean() < 1
+
+
+@physics
+@pytest.mark.parametrize('name', EFFECTS)
+def test_derivatives_by_differences(name):
+    """Of the loss by densities, scales and centres, through the model."""
+    stepper, state = stepper_of(EFFECTS[name](), lambda_tv=0.)
+    target = stepper.targets[1]
+    stepper.share = stepper.shares(state)
+
+    def loss(values):
+        state.values = values
+        return float(stepper._view(state, step._leaf(state.gaussians(stepper.settings)), target, 1)[0])
+    values = dict(state.values)
+    for v in values.values():
+        dr.enable_grad(v)
+    state.values = values
+    gaussians = state.gaussians(stepper.settings)
+    leaf = step._leaf(gaussians)
+    stepper._view(state, leaf, target, 1)
+    step._pass_on(leaf, gaussians)
+    rng = np.random.default_rng(1)
+    for key, h in (('density', 1e-2), ('scale', 5e-3), ('centre', 5e-4)):
+        plain = dr.detach(values[key])
+        shape = np.array(plain).shape
+        way = rng.normal(size=shape).astype(np.float32)
+        found = float((np.array(dr.grad(values[key])) * way).sum())
+        move = type(plain)(way)
+        ahead, behind = (loss({k: dr.detach(v) for k, v in values.items()} | {key: plain + s * h * move}) for s in (1, -1))
+        np.testing.assert_allclose(found, (ahead - behind) / (2 * h), rtol=2e-2, err_msg=key)
+
+
+def test_derivatives_by_the_pose_through_bundles():
+    """Bundles of a focal spot move with their view: the derivative by its source is that of one ray's, for a small spot."""
+    found = []
+    for size in (0., 1e-3):
+        stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
+        target = stepper.targets[1]
+        step.place(target.view, target.frames)
+        stepper._view(state, step._leaf(state.gaussians(stepper.settings)), target, 1)
+        found.append(np.concatenate(list(step.gathered(target.view).values())))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
+
+
+# ---- initial clouds, masks, checkpoints, results ---------------------------------------------------------------------
+
+@physics
+def test_hardening_is_inverted_for_initial_clouds():
+    g = geometry(8)
+    clean = tiny_scan(g)
+    clean = replace(clean, projections=clean.projections / 50)
+    effects = Effects(tube(), None, None)
+    bands = effects.tube.signal(['soft tissue'])
+    hard = replace(clean, projections=np.stack([bands.hardened(p) for p in clean.projections]), effects=effects)
+    np.testing.assert_allclose(effects.linearised(hard).projections, clean.projections, atol=1e-5)
+    settings = SHORT.changed(init='lingo', n_points=50, init_density='fdk')
+    expected, found = (initial_cloud(scan, settings, seed=2) for scan in (clean, hard))
+    np.testing.assert_allclose(found.density, expected.density, rtol=1e-3)
+    np.testing.assert_allclose(found.points, expected.points)
+    ignored = initial_cloud(hard, settings.changed(effects='ignore'), seed=2)
+    assert not np.allclose(ignored.density, expected.density, rtol=1e-2)
+
+
+def test_dead_pixels_are_left_out():
+    scan = replace(tiny_scan(geometry(3)), effects=Effects(None, None, detector(dead=.1)))
+    masks = [Stepper(scan, SHORT.changed(effects=e)).targets[0].valid for e in ('model', 'ignore')]
+    dead = scan.effects.detector.maps(scan.geometry.nDetector)[1]
+    np.testing.assert_array_equal(masks[0].numpy(), ~dead.ravel())
+    assert masks[1] is None and 0 < dead.sum() < dead.size
+
+
+@physics
+def test_resumed_fit_is_the_same_fit(tmp_path, variant):
+    """Also between two looks at the shares of two materials."""
+    scan = tiny_scan(geometry(3))
+    scan = replace(scan, projections=scan.projections / 50, effects=EFFECTS['two materials']())
+    whole, path = run(scan, SHORT, some_points(scan.geometry), seed=3), tmp_path / 'fit.npz'
+    with pytest.raises(KeyboardInterrupt):
+        run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(15))
+    again = run(scan, SHORT, None, seed=3, path=path, resume=True)
+    if variant.startswith('llvm'):
+        assert_equal_states(again.state, whole.state)
+
+
+@physics
+def test_what_a_fit_leaves_behind(tmp_path):
+    """Held-out views are those of result.xml, and compared with measured ones; the volume is at the reference energy."""
+    (tmp_path / 'scene.xml').write_text(XML)
+    quick = '--iterations', '40', '-D', 'n_points=300', '-D', 'densify_from=100'
+    for effects in ('model', 'ignore'):
+        code, _, err = fit(tmp_path / 'scene.xml', *quick, '-D', f'effects={effects}', '--out', tmp_path / effects)
+        assert code == 0, err
+    loaded = load_scene(tmp_path / 'model' / 'result.xml')
+    test = take_scan(load_scene(tmp_path / 'scene.xml')).test
+    image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(0, test.geometry.subset([0]))))[..., 0]
+    np.testing.assert_allclose(read_exr(tmp_path / 'model' / 'views' / '0000.exr'), image, atol=2e-3 * image.max())
+    assert 'xray_tube' not in (tmp_path / 'ignore' / 'result.xml').read_text()
+    found = {e: json.loads((tmp_path / e / 'metrics.json').read_text()) for e in ('model', 'ignore')}
+    assert found['model']['settings']['effects'] == 'model'
+    assert found['model']['psnr_3d'] > found['ignore']['psnr_3d']
+
+
+@physics
+@pytest.mark.parametrize('effects, match', [
+    (lambda: Effects(tube(''), None, None), 'add <string name="material"'),
+    (lambda: Effects(Tube.of(None, 120., 12., 'Al 2.5', None, 'Al', '', 4, dict(bolts='Fe')), None, None), 'add a split'),
+    (lambda: Effects(Tube.of(None, 120., 12., '', None, 'Al', '', 4, dict(a='Fe', b='Cu')), None, None), 'leave two')])
+def test_what_cannot_be_modelled(effects, match):
+    scan = replace(tiny_scan(geometry(3)), effects=effects())
+    with pytest.raises(InputError, match=match):
+        Stepper(scan, SHORT)
+    Stepper(scan, SHORT.changed(effects='ignore'))
