@@ -96,7 +96,8 @@ class Effects:
         if not (self.detector and self.detector.dead):
             return scan
         alive = ~self.detector.maps(scan.geometry.nDetector)[1]
-        return replace(scan, valid=np.broadcast_to(alive, scan.projections.shape) & (True if scan.valid is None else scan.valid))
+        known = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
+        return replace(scan, valid=known & alive)
 
     def linearised(self, scan: Scan) -> Scan:
         """A scan's line integrals at the reference energy, as far as single pixels tell them; it has no effects left.
