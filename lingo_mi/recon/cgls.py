@@ -28,7 +28,7 @@ def cgls(scan: Scan, niter: int = 20, init=None, tol: float = 0., progress=None)
     A, views = system.A, system.views
     x = system.start(init)
     r, residual = system.residual(x)
-    p = evaluated(A.adjoint(r, views)[0])
+    p = evaluated(A.adjoint(r, views))
     gamma = first = dot(p, p)
     residuals = [residual]
     for k in range(niter):
@@ -38,7 +38,7 @@ def cgls(scan: Scan, niter: int = 20, init=None, tol: float = 0., progress=None)
         alpha = scalar(gamma / dot(q, q))
         x, r = dr.fma(alpha, p, x), dr.fma(-alpha, q, r)
         dr.eval(x, r)
-        s = evaluated(A.adjoint(r, views)[0])
+        s = evaluated(A.adjoint(r, views))
         gamma, before = dot(s, s), gamma
         p = evaluated(dr.fma(scalar(gamma / before), p, s))
         residuals.append(norm(r) / system.size_b)

@@ -10,6 +10,7 @@ where division is by voxel and by pixel, and what no ray meets is left alone. Na
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
@@ -50,9 +51,12 @@ def sweep(system: System, x, lmbda: float, parts, nonneg: bool):
         ax, path = A.forward(x, views)
         error = A.select(system.b, views) - ax
         error = evaluated(dr.select(path > 0, error * dr.rcp(dr.maximum(path, 1e-30)), 0))
-        change, weight = A.adjoint(error, views)
-        x = dr.fma(step, dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0), x)
-        x = evaluated(dr.maximum(x, 0) if nonneg else x)
+
+        def updated(voxel, change, weight, x=x):
+            change = dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0)
+            value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
+            return dr.maximum(value, 0) if nonneg else value
+        x = evaluated(A.adjoint(error, views, updated))
     return x
 
 

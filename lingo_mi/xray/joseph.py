@@ -24,6 +24,8 @@ from ..errors import InputError
 from ..geometry import Geometry
 
 COLUMN = 8  # floats a detector column
+RUN = 8     # voxels a lane of the transpose
+ROWS = 4    # most rows of the panel that its innermost loop unrolls
 
 
 def column_table(geometry: Geometry) -> np.ndarray:
@@ -63,7 +65,7 @@ def column_table(geometry: Geometry) -> np.ndarray:
 class Joseph:
     """The matrix A of a circular scan, view by view; `adjoint` is its transpose to rounding.
 
-    One compiled kernel serves all blocks of views, whatever their number.
+    The compiled kernels, one forward and two back, serve all blocks of views, whatever their number.
 
     Raises InputError where the source of a cone beam is inside the volume, or the volume has 2^32 voxels or more.
     """
@@ -87,6 +89,10 @@ class Joseph:
         # Height of the source, of the first row over it, and between rows, in voxels.
         self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, frames.v[0, 2] / voxel)]
         self._matrix = mi.Float(self._column_matrix().ravel())
+        # Rows whose hats cover a voxel, at most: where it is nearest to the source.
+        nearest = 1. if frames.parallel else (geometry.DSO - half) / geometry.DSD
+        rows = int(np.ceil(2 * voxel / (nearest * abs(frames.v[0, 2])) + 1e-3))
+        self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
 
     def _column_matrix(self):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
@@ -115,13 +121,23 @@ class Joseph:
         column += (dr.gather(mi.UInt, chosen, block) - block) * self.panel[1]
         return _integrate(volume, self.size, self._columns, self._rows, column, row)
 
-    def adjoint(self, images, views):
-        """Backprojection of images of the views `views`: (A^T y, A^T 1) summed over these views, each mi.Float [voxels].
+    def adjoint(self, images, views, rule=None):
+        """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]
+        rule   : what to store instead, a function of (voxel, A^T y, A^T 1): flat indices mi.UInt of some voxels and their
+                 sums. It is traced into the kernel, so it saves volumes in memory
         """
-        return _collect(images, _numbers(views), dr.opaque(mi.UInt, len(views)), self.size, self.panel, self._columns,
-                        self._rows, self._matrix)
+        chosen, n_views = _numbers(views), dr.opaque(mi.UInt, len(views))
+        weighted = _weighted(images, chosen, self.panel, self._columns, self._rows, self._margin, rule is not None)
+        dr.eval(weighted)
+        voxels, sums = _collect(weighted, chosen, n_views, self.size, self.panel, self._columns, self._rows, self._matrix,
+                                self._margin, rule is not None)
+        out = dr.empty(mi.Float, self.voxels)
+        for voxel, inside, value in zip(*voxels, sums):
+            value = value[0] if rule is None else rule(dr.select(inside, voxel, 0), *value)
+            dr.scatter(out, value, voxel, inside, mode=dr.ReduceMode.Permute)
+        return out
 
 
 def _numbers(views):
@@ -180,17 +196,50 @@ def _integrate(data, size, columns, rows, column, row):
     return path * total, path * count
 
 
+def _weighted(images, chosen, panel, columns, rows, margin, ones):
+    """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
+
+    With `ones`, mi.Vector2f interleaved: an image of ones, treated alike, stands beside each value.
+    """
+    n_v, n_u = panel
+    pitch = n_v + 2 * margin
+    index = dr.arange(mi.UInt, dr.width(images) // n_v * pitch)
+    column = index // pitch
+    row = mi.Int(index - column * pitch) - margin
+    inside = (row >= 0) & (row < n_v)
+    block = column // n_u
+    entry = (column + (dr.gather(mi.UInt, chosen, block) - block) * n_u) * COLUMN
+    height = dr.fma(mi.Float(row), rows[2], rows[1])
+    g, h = (dr.gather(mi.Float, columns, entry + i) for i in (4, 5))
+    path = dr.select(inside, dr.sqrt(dr.fma(h, height * height, g)), 0)
+    value = path * dr.gather(mi.Float, images, column * n_v + mi.UInt(dr.clip(row, 0, n_v - 1)))
+    return dr.ravel(mi.Vector2f(value, path)) if ones else value
+
+
 @dr.syntax
-def _collect(images, chosen, n_views, size, panel, columns, rows, matrices):
-    """(A^T y, A^T 1) of voxels, one a lane: images already hold y."""
+def _collect(weighted, chosen, n_views, size, panel, columns, rows, matrices, margin, ones):
+    """A^T y of voxels: RUN of a line along z a lane, as far apart as they can be, so that lanes and their fetches stay
+    neighbours while all that does not depend on z is shared.
+
+    weighted : see `_weighted`; the margin is at least the number of rows whose hats cover a voxel
+
+    Returns ((voxels, whether they exist), sums), lists of RUN; a sum is a list, with A^T 1 as its second entry where the
+    images have ones.
+    """
     (nx, ny, nz), (n_v, n_u) = size, panel
     source, top, step = rows
-    index = dr.arange(mi.UInt, nx * ny * nz)
-    line = index // nz
+    run = min(RUN, nz)
+    stride = -(-nz // run)
+    index = dr.arange(mi.UInt, nx * ny * stride)
+    line = index // stride
+    first_z = index - line * stride
+    voxels = [line * nz + first_z + s * stride for s in range(run)]
+    exists = [first_z + s * stride < nz for s in range(run)]
     x = mi.Float(line // ny)
-    y, z = mi.Float(line) - x * ny, mi.Float(index - line * nz)
+    y, z0 = mi.Float(line) - x * ny, mi.Float(first_z)
     inv_step = dr.rcp(step)
-    total, weights = mi.Float(0), mi.Float(0)
+    pitch, chunks = n_v + 2 * margin, -(-margin // ROWS)
+    sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
     block = mi.UInt(0)
     while block < n_views:
         view = dr.gather(mi.UInt, chosen, block)
@@ -208,23 +257,28 @@ def _collect(images, chosen, n_views, size, panel, columns, rows, matrices):
             on_y = along_y > 0
             m = dr.select(on_y, y, x)
             t = dr.fma(e, m, c)
-            other = dr.fma(b, m, a)
-            weight = _hat(other, dr.select(on_y, x, y), dr.select(on_y, mi.Float(nx), mi.Float(ny)))
-            inv = dr.rcp(dr.maximum(t, 1e-6))
-            middle, reach = ((z - source) * inv - top) * inv_step, dr.abs(inv * inv_step)
-            seen = (t > 0) & (weight > 0)
-            v = dr.ceil(dr.clip(middle - reach - 0.001, 0, n_v))
-            v_last = dr.select(seen, dr.floor(dr.clip(middle + reach + 0.001, -1, n_v - 1)), -1)
-            here = (block * n_u + mi.UInt(u)) * n_v
-            value, path = mi.Float(0), mi.Float(0)
-            while v <= v_last:
-                height = dr.fma(v, step, top)
-                w = _hat(dr.fma(t, height, source), z, nz) * dr.sqrt(dr.fma(h, height * height, g))
-                value = dr.fma(w, dr.gather(mi.Float, images, here + mi.UInt(v)), value)
-                path += w
-                v += 1
-            total = dr.fma(weight, value, total)
-            weights = dr.fma(weight, path, weights)
+            weight = _hat(dr.fma(b, m, a), dr.select(on_y, x, y), dr.select(on_y, mi.Float(nx), mi.Float(ny)))
+            weight = dr.select(t > 0, weight, 0)
+            # Heights go from row to row by `slope` voxels; z meets the panel at the row `middle`.
+            inv, slope = dr.rcp(dr.maximum(t, 1e-6)), t * step
+            middle, reach = ((z0 - source) * inv - top) * inv_step, dr.abs(inv * inv_step)
+            column = (block * n_u + mi.UInt(u)) * pitch + margin
+            for s in range(run):
+                centre = dr.fma(inv * inv_step, s * stride, middle)
+                row = dr.ceil(dr.clip(centre - reach, -margin, n_v))
+                chunk = 0 if chunks == 1 else mi.UInt(0)
+                while chunk < chunks:
+                    for i in range(ROWS if chunks > 1 else margin):
+                        offset = (row + i - centre) * slope
+                        if s == 0 or s == (nz - 1) // stride:
+                            w = weight * _hat(z0 + s * stride + offset, z0 + s * stride, nz)
+                        else:
+                            w = weight * dr.maximum(1 - dr.abs(offset), 0)
+                        here = mi.UInt(mi.Int(column) + mi.Int(row) + i)
+                        p = dr.gather(mi.Vector2f, weighted, here) if ones else [dr.gather(mi.Float, weighted, here)]
+                        sums[s] = [dr.fma(w, p[j], sums[s][j]) for j in range(2 if ones else 1)]
+                    row += 0 if chunks == 1 else ROWS
+                    chunk += 1
             u += 1
         block += 1
-    return total, weights
+    return (voxels, exists), sums
