@@ -142,7 +142,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
         everything = Scan(every, render_objects(objects, every))
     else:
         try:
-            everything = Scan(every, _render_with(effects, objects, every, keys, seed), effects=effects)
+            everything = Scan(every, render_with(effects, objects, every, keys, seed), effects=effects)
         except InputError as error:
             raise InputError(f'{loaded.path}: {error}') from None
     train = everything.subset(slice(0, len(geometry)))
@@ -183,8 +183,8 @@ class _Volume:
         return GridInCube.of(self.data, centre - half, centre + half, 'volume')
 
 
-def render_objects(objects, geometry) -> np.ndarray:
-    """Line integrals of all objects in all views, float32 [view, v, u]."""
+def render_objects(objects, geometry, extent: float = 8.) -> np.ndarray:
+    """Line integrals of all objects in all views, float32 [view, v, u]; Gaussians end at `extent` standard deviations."""
     total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
     with Progress('Scan', len(geometry) * len(objects)) as bar:
         for k, thing in enumerate(objects):
@@ -199,20 +199,20 @@ def render_objects(objects, geometry) -> np.ndarray:
                 frames = geometry.frames()
                 for i in range(len(geometry)):
                     view = View.of(frames, i, *geometry.nDetector)
-                    total[i] += thing.line_integrals(view, 8., True).numpy().reshape(geometry.nDetector)
+                    total[i] += thing.line_integrals(view, extent, True).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
 
 
-def _render_with(effects: Effects, objects, geometry, keys, seed) -> np.ndarray:
-    """Measured line integrals of all objects in all views, float32 [view, v, u]; keys are those of the views' noise."""
+def render_with(effects: Effects, objects, geometry, keys, seed, extent: float = 8.) -> np.ndarray:
+    """`render_objects` as a detector measures it; keys are those of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, _Volume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
     frames = geometry.frames()
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
             view = View.of(frames, i, *geometry.nDetector)
-            expected = effects.line_integrals(objects, view, Quality(extent=8.))
+            expected = effects.line_integrals(objects, view, Quality(extent))
             out[i] = replace(effects, index=int(keys[i])).measured(expected, view, seed).numpy().reshape(out.shape[1:])
             bar.update(i + 1)
     return out
@@ -243,7 +243,7 @@ def _truth(objects, meshes, geometry) -> np.ndarray | None:
         elif isinstance(thing, GridInCube) and _on_grid(thing, geometry):
             total += _values(thing)
         elif isinstance(thing, Ellipsoids):
-            total += voxelize_cloud(thing, geometry)
+            total += voxelize_cloud(thing, geometry, 6.)
         elif isinstance(thing, HomogeneousMesh):
             from .phantoms.mesh import voxelise
             params = mi.traverse(next(homogeneous))
@@ -256,13 +256,16 @@ def _truth(objects, meshes, geometry) -> np.ndarray | None:
     return total
 
 
-def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
-    """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm."""
+def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.ndarray:
+    """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm.
+
+    extent   cut-off in standard deviations
+    """
     from .xray.frame import vector64
     from .xray.voxelize import Grid, voxelize
     corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
     cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
-    return cells.volume(voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, 6.))
+    return cells.volume(voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, extent))
 
 
 def _warn_if_truncated(geometry: Geometry):

@@ -8,6 +8,7 @@
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both. Where the true volume is known, PSNR and SSIM are printed.
+Beam hardening that the scene's tube names is taken out of the projections first.
 """
 import argparse
 import inspect
@@ -93,15 +94,17 @@ def main():
     given = options(run, {k: v for k, v in defined.items() if k not in own})
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
-    cloud, fitted = load_cloud(args.complete) if args.complete else (None, None)
+    cloud = load_cloud(args.complete) if args.complete else None
     dataset = read_input(args, scene, 0 if args.complete else args.views)
     scan = dataset.train
     began = time.monotonic()
     if args.algorithm == 'voxelize':
-        volume, residuals = voxelize_cloud(cloud, scan.geometry), []
+        volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), []
     else:
         if args.complete:
-            scan = complete(fitted_views(dataset, fitted), cloud, args.views)
+            scan = complete(fitted_views(dataset, cloud.geometry), cloud, args.views)
+        elif scan.effects is not None:
+            scan = scan.effects.linearised(scan)
         began = time.monotonic()
         volume, residuals = reconstruct(run, scan, given, Progress)
     seconds = time.monotonic() - began

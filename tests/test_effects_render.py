@@ -45,12 +45,12 @@ def kernels(function):
 
 # ---- absent costs nothing --------------------------------------------------------------------------------------------
 
-def direct(scene):
+def direct(scene, extent=6.):
     """The image by the projectors alone: no code of the integrator's or of an effect's."""
     view = view_of(scene.sensors()[0])
     total = dr.zeros(mi.Float, view.height * view.width)
     for thing in find_objects(scene):
-        total += thing.line_integrals(view, 6., True)
+        total += thing.line_integrals(view, extent, True)
     dr.eval(mi.TensorXf(total, shape=(view.height, view.width, 1)))
 
 

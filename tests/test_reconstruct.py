@@ -1,18 +1,26 @@
 """scripts/reconstruct.py from end to end on a tiny scene, the two-stage way, and bad input in one line."""
 import re
 
+import mitsuba as mi
 import nibabel
 import numpy as np
 import pytest
-from script import FIT, fit, run
+from script import FIT, SCENE, fit, run
+from test_effects_render import physics
+from test_fit_effects import detector, tube
+
+from lingo_mi.effects.focal_spot import FocalSpot
+from lingo_mi.effects.forward import Effects
 
 from lingo_mi.errors import InputError
+from lingo_mi.files.ply import write_ply
 from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import sart
-from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing_angles
-from lingo_mi.scanning import load_scene, take_scan
+from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing_angles, without_effects
+from lingo_mi.results import write_scene
+from lingo_mi.scanning import load_scene, render_objects, take_scan
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 
@@ -58,12 +66,15 @@ def test_the_volume_is_the_functions(scene, dataset, tmp_path):
 def test_two_stage(scene, dataset, fitted, tmp_path):
     code, text, err = run(RECONSTRUCT, scene, '--complete', fitted, '--views', '16', '--out', tmp_path / 'v.nii')
     assert code == 0 and 'of 16 views' in text, err
-    cloud, geometry = load_cloud(fitted)
-    measured = fitted_views(dataset, geometry)
+    cloud = load_cloud(fitted)
+    measured = fitted_views(dataset, cloud.geometry)
     np.testing.assert_array_equal(measured.projections, dataset.train.projections[::2])
     whole = complete(measured, cloud, 16)
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), fdk(whole))
     np.testing.assert_array_equal(whole.projections[:4], measured.projections)
+    loaded = load_scene(fitted)
+    image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(5, whole.geometry)))[..., 0]
+    np.testing.assert_allclose(whole.projections[5], image, atol=1e-5 * image.max())
     assert psnr_3d(fdk(whole), dataset.volume) > psnr_3d(fdk(measured), dataset.volume) + 0.5
     with pytest.raises(InputError, match='ask for more'):
         complete(measured, cloud, 3)
@@ -74,7 +85,54 @@ def test_voxelize(scene, dataset, fitted, tmp_path):
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'voxelize', '--complete', fitted, '--out', tmp_path / 'v.nii')
     assert code == 0, err
     result = load(fitted.with_name('volume.nii.gz'))
-    assert np.linalg.norm(load(tmp_path / 'v.nii') - result) < 0.02 * np.linalg.norm(result)
+    assert np.linalg.norm(load(tmp_path / 'v.nii') - result) < 1e-4 * np.linalg.norm(result)
+
+
+# ---- effects ---------------------------------------------------------------------------------------------------------
+
+@physics
+def test_hardening_is_taken_out_first(tmp_path):
+    clean = SCENE.replace('value="24"/>', 'value="24"/> <float name="scale" value="0.1"/>', 1)
+    tube = '<emitter type="xray_tube"><float name="kvp" value="120"/><string name="material" value="water"/></emitter>'
+    hard, out = tmp_path / 'hard.xml', tmp_path / 'v.nii'
+    (tmp_path / 'clean.xml').write_text(clean)
+    hard.write_text(clean.replace('</scene>', tube + '</scene>'))
+    code, _, err = run(RECONSTRUCT, hard, '--out', out)
+    assert code == 0, err
+    expected = fdk(take_scan(load_scene(tmp_path / 'clean.xml')).train)
+    size = np.linalg.norm(expected)
+    assert np.linalg.norm(load(out) - expected) < 1e-3 * size
+    assert np.linalg.norm(fdk(take_scan(load_scene(hard)).train) - expected) > .02 * size
+
+
+def written_cloud(folder, geometry, effects, factor=1.):
+    """The cloud of a result.xml: Gaussians of two materials; all densities times `factor`."""
+    folder.mkdir()
+    rng, n = np.random.default_rng(0), 30
+    density, turn = rng.uniform(.02, .08, n), rng.normal(size=(n, 4))
+    write_ply(folder / 'gaussians.ply', rng.uniform(-6, 6, (n, 3)), rng.uniform(1, 2.5, (n, 3)), turn, density * factor,
+              None if effects is None else (density > .05).astype(float))
+    write_scene(folder / 'result.xml', geometry, 7, effects)
+    return folder / 'result.xml'
+
+
+@physics
+def test_measured_views_become_what_is_rendered(dataset, tmp_path):
+    """Completed with line integrals, two materials seen through a blur must become such, also by a cloud that is off."""
+    effects = Effects(tube('soft tissue + bone', '0.03, 0.06'), FocalSpot(), detector(psf=3.))
+    geometry = dataset.train.geometry
+    path = written_cloud(tmp_path / 'true', geometry, effects)
+    measured, true = take_scan(load_scene(path)).train, load_cloud(path)
+    expected = render_objects([true.gaussians], geometry)
+
+    def error(projections):
+        return np.linalg.norm(projections - expected) / np.linalg.norm(expected)
+    assert error(complete(measured, true, 12).projections[:8]) < 1e-5
+    off = load_cloud(written_cloud(tmp_path / 'off', geometry, effects, .9))
+    alone = error(effects.linearised(measured).projections)
+    assert error(without_effects(measured, off).projections) < .3 * alone and alone > .02
+    ignored = load_cloud(written_cloud(tmp_path / 'ignored', geometry, None))
+    np.testing.assert_array_equal(complete(measured, ignored, 12).projections[:8], measured.projections)
 
 
 def test_missing_angles(dataset):

@@ -1,30 +1,48 @@
 """The two-stage way: views that were not measured are rendered from a fitted cloud, then a volume is made of all of them."""
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from ..effects.forward import Effects, find_effects
 from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Dataset, Scan
-from ..scanning import load_scene, render_objects
+from ..scanning import load_scene, render_objects, render_with
 from ..xray.objects import Ellipsoids, find_objects
 from .circle import require_circle
 from .fdk import gaps
 
 
-def load_cloud(path) -> tuple[Ellipsoids, Geometry]:
-    """The cloud of Gaussians of a scene such as a fit's result.xml, and the scan it was fitted to.
+@dataclass(frozen=True)
+class FittedCloud:
+    """A cloud of Gaussians as a fit left it.
+
+    gaussians   densities in 1/mm
+    geometry    of the scan that it was fitted to
+    extent      cut-off in standard deviations
+    effects     that the fit has modelled; None where it took the projections for line integrals
+    """
+
+    gaussians: Ellipsoids
+    geometry: Geometry
+    extent: float
+    effects: Effects | None
+
+
+def load_cloud(path) -> FittedCloud:
+    """The cloud of a scene such as a fit's result.xml.
 
     Raises InputError where the scene holds anything else.
     """
     loaded = load_scene(Path(path))
     objects = find_objects(loaded.scene)
-    if len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
+    quality = getattr(loaded.scene.integrator(), 'quality', None)
+    if quality is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
         raise InputError(f"{path}: is no cloud of Gaussians; give the result.xml of a fit")
-    return objects[0], loaded.scanner.geometry
+    return FittedCloud(objects[0], loaded.scanner.geometry, quality.extent, find_effects(loaded.scene, loaded.scanner))
 
 
 def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
@@ -52,8 +70,24 @@ def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
     return np.concatenate([angles[i] + g * np.arange(1, k) / k for i, g, k in zip(order, gap, parts)])
 
 
-def complete(scan: Scan, cloud: Ellipsoids, views: int) -> Scan:
-    """A scan of `views` views: the measured ones, and those between them rendered from the cloud.
+def without_effects(scan: Scan, cloud: FittedCloud) -> Scan:
+    """The line integrals of measured views, at the reference energy of the effects that the cloud's fit has modelled.
+
+    Linearised, plus what linearising leaves of the effects in the cloud's own views: blur, and the second material, corrected
+    as by Joseph and Spital (J. Comput. Assist. Tomogr. 2, 1978). Where the fit has modelled none, the projections themselves.
+    """
+    effects = cloud.effects
+    if effects is None:
+        return scan
+    clean = render_objects([cloud.gaussians], scan.geometry, cloud.extent)
+    seen = render_with(effects, [cloud.gaussians], scan.geometry, np.zeros(len(scan)), 0, cloud.extent)
+    left = effects.linearised(Scan(scan.geometry, seen)).projections - clean
+    linear = effects.linearised(scan)
+    return replace(linear, projections=linear.projections - left)
+
+
+def complete(scan: Scan, cloud: FittedCloud, views: int) -> Scan:
+    """A scan of `views` views: the measured ones, `without_effects`, and those between them rendered from the cloud.
 
     Raises InputError where fewer views are asked for than were measured, and for a scan that is no circle about z.
     """
@@ -61,8 +95,9 @@ def complete(scan: Scan, cloud: Ellipsoids, views: int) -> Scan:
     geometry = scan.geometry
     if views < len(scan):
         raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
+    scan = without_effects(scan, cloud)
     if views == len(scan):
         return scan
     rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
     both = replace(geometry, angles=np.concatenate([geometry.angles, rendered.angles]))
-    return Scan(both, np.concatenate([scan.projections, render_objects([cloud], rendered)]))
+    return Scan(both, np.concatenate([scan.projections, render_objects([cloud.gaussians], rendered, cloud.extent)]))
