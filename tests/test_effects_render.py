@@ -66,22 +66,43 @@ def test_absent_costs_nothing(name):
     assert expected and kernels(partial(through_mitsuba, scene)) == expected
 
 
-@pytest.mark.parametrize('tube, film', [
-    (dict(TUBE, bands=2), None), (dict(type='xray_tube', energy=60., focal_spot='.2', focal_order=2), None),
-    (None, detector(psf=.3)), (None, detector(aperture=1., aperture_order=2))])
+def kernels_with(*pairs):
+    """The kernels of one cloud by one scanner, for each (tube, film)."""
+    # The same arrays in all scenes: the order of a kernel's arguments, and so its hash, may follow theirs.
+    cloud, scanner = dict(cloud=mi.load_dict(ellipsoids(cloud_of()))), mi.load_dict(SCANNER)
+    return [kernels(partial(through_mitsuba, load(cloud | (dict(tube=tube) if tube else {}),
+                                                  SCANNER | dict(film=film) if film else scanner))) for tube, film in pairs]
+
+
 @physics
-def test_present_adds_kernels(tube, film):
-    ideal, found = (kernels(partial(through_mitsuba, s)) for s in (scene_of(), scene_of(None, tube, film)))
-    assert set(found) - set(ideal)
+def test_a_spectrum_changes_the_last_kernel():
+    """Hardening joins the kernel that writes the image."""
+    ideal, found = kernels_with((None, None), (dict(TUBE, bands=2), None))
+    assert found[:-1] == ideal[:-1] and len(found) == len(ideal) and found[-1] not in ideal
 
 
-def test_one_energy_changes_nothing():
-    """Photons of the energy that densities are attenuation at, and a point to come from."""
-    # The same arrays in both scenes: the order of a kernel's arguments, and so its hash, may follow theirs.
-    shared = dict(cloud=mi.load_dict(ellipsoids(cloud_of()))), mi.load_dict(SCANNER)
-    tube = mi.load_dict(dict(type='xray_tube', energy=60.))
-    scenes = load(*shared), load(shared[0] | dict(tube=tube), shared[1])
-    ideal, found = (kernels(partial(through_mitsuba, scene)) for scene in scenes)
+def test_a_blur_adds_kernels_after_the_projectors():
+    ideal, found = kernels_with((None, None), (None, detector(psf=.3)))
+    assert found[:len(ideal) - 1] == ideal[:-1] and len(found) > len(ideal)
+    assert not set(found[len(ideal) - 1:]) & set(ideal)
+
+
+@pytest.mark.parametrize('tube, film', [
+    (dict(type='xray_tube', energy=60., focal_spot='.2', focal_order=2), None),
+    (None, detector(aperture=1., aperture_order=2))])
+def test_bundles_of_rays_repeat_the_projectors(tube, film):
+    """Kernels of the splat run once for each of 2 x 2 bundles; those that move a view, sum and take the logarithm are new."""
+    ideal, found = kernels_with((None, None), (tube, film))
+    assert max(found.count(h) for h in ideal) == 4
+    assert set(found) - set(ideal) and found[-1] not in ideal
+
+
+@pytest.mark.parametrize('tube, film', [
+    (dict(type='xray_tube', energy=60.), None),
+    (None, detector(photons=1e4, electronic_noise=5., saturation=.9, bits=12, gain=.01, dead=.01))])
+def test_what_is_no_matter_of_kernels(tube, film):
+    """Photons of the energy that densities are attenuation at, from a point; and what happens after the light, in NumPy."""
+    ideal, found = kernels_with((None, None), (tube, film))
     assert found == ideal
 
 
