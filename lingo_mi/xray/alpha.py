@@ -109,17 +109,16 @@ def composite(discs: Discs, height: int, width: int):
 
 class _Composite(dr.CustomOp):
     def eval(self, values, boxes, height, width):
-        self.values, self.height, self.width = values, height, width
+        self.values = values
         self.lists = _Lists(boxes, height, width)
         self.packed = _pack(values)
-        size = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-        self.arguments = dict(lists=self.lists, packed=self.packed, width=size[0], height=size[1])
+        self.size = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
         if self.lists.length == 0:
             self.image = dr.zeros(mi.Float, height * width)
             return self.image
         image = dr.zeros(mi.Float, height * width)
         dr.make_opaque(image)
-        place = _Place(self.lists, *size)
+        place = _Place(self.lists, *self.size)
         dr.eval(_forward(place.begin, place.end, place.x, place.y, self.lists.disc, self.packed, place.inside,
                          place.pixel, image), image)
         self.image = image
@@ -131,7 +130,7 @@ class _Composite(dr.CustomOp):
             self.set_grad_in('values', tuple(dr.zeros(mi.Float, n) for _ in NAMES))
             return
         lists = self.lists
-        place = _Place(lists, self.arguments['width'], self.arguments['height'])
+        place = _Place(lists, *self.size)
         upstream = self.grad_out() + dr.zeros(mi.Float, dr.width(self.image))
         slots = [dr.zeros(mi.Float, lists.length) for _ in NAMES]
         dr.make_opaque(upstream, slots)
