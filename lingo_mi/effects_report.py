@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .accuracy_report import insert, table
 from .errors import InputError
@@ -14,13 +15,15 @@ from .fit.device import DeviceState
 from .fit.initial import initial_cloud
 from .fit.loop import run
 from .fit.settings import FAST
+from .geometry import Geometry
 from .metrics import psnr_3d
 from .scan import Scan
 from .scanning import load_scene, render_objects, take_scan
 from .xray.objects import find_objects
 
 SCENES = Path(__file__).resolve().parents[1] / 'scenes' / 'effects'
-SETTINGS = FAST.changed(iterations=250, densify_from=50, densify_until=180, values_per_gaussian=40.)  # a minute a fit at most
+# Small, so that a fit takes less than a minute.
+SETTINGS = FAST.changed(iterations=250, densify_from=50, densify_until=180, values_per_gaussian=40.)
 FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
 
 
@@ -44,6 +47,8 @@ EXPERIMENTS = dict(
     hardening=Experiment('beam hardening, 120 kVp, aluminium'),
     focal_spot=Experiment('focal spot of 2 mm, magnified 6 times'),
     psf=Experiment('point spread of 3 pixels'),
+    dead_pixels=Experiment('every tenth pixel dead'),
+    misalignment=Experiment('views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), .5, 1.),
 )
 
 
@@ -63,7 +68,11 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
     loaded = load_scene(SCENES / f'{name}.xml', parameters)
     dataset = take_scan(loaded, seed=seed)
     scan, truth = dataset.train, dataset.volume
-    clean = Scan(scan.geometry, render_objects(find_objects(loaded.scene), scan.geometry))
+    objects = find_objects(loaded.scene)
+    clean = Scan(scan.geometry, render_objects(objects, scan.geometry))
+    if experiment.turn or experiment.shift:
+        moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
+        scan = Scan(scan.geometry, render_objects(objects, moved))
     fits = {}
     for kind, (what, changes) in dict(clean=(clean, {}), ignore=(scan, dict(effects='ignore')),
                                       model=(scan, experiment.model)).items():
@@ -73,6 +82,15 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
         fits[kind] = quality(volume, truth) | dict(ms_per_iteration=pace(fitted.history), volume=volume)
     return dict(title=experiment.title, largest=float(clean.projections.max()), truth=truth,
                 spacing=list(scan.geometry.dVoxel), **fits)
+
+
+def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geometry:
+    """The geometry with every view turned about the volume's centre and shifted at random: standard deviations about and
+    along each axis, degrees and mm. The mean motion, which no projection tells from the object's, is taken off."""
+    turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
+    turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
+    frames = geometry.frames().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
+    return Geometry.posed(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
 
 
 def quality(volume, truth) -> dict:

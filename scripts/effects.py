@@ -5,8 +5,8 @@
     python scripts/effects.py --only hardening psf
 
 Simulates each scene of scenes/effects/ with its effect, fits a cloud that ignores it and one that models it, and a third to a
-scan without it. Writes effects.json to --out, where results of other effects are kept, the pictures to docs/figures/effects/, and the table into
-docs/effects.md. A run of all takes under 10 minutes on two cores.
+scan without it. Writes effects.json to --out, where results of other effects are kept, the pictures to docs/figures/effects/,
+and the table into docs/effects.md. A run of all takes under 10 minutes on two cores.
 """
 import argparse
 from pathlib import Path
