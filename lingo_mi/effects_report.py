@@ -1,0 +1,171 @@
+"""What modelling an effect is worth: scans with it, reconstructed by fits that ignore it and that model it."""
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .accuracy_report import insert, table
+from .errors import InputError
+from .figures import PADS, STYLE, plane, plane_extent, richest
+from .fit.device import DeviceState
+from .fit.initial import initial_cloud
+from .fit.loop import run
+from .fit.settings import FAST
+from .geometry import Geometry
+from .metrics import psnr_3d
+from .scan import Scan
+from .scanning import load_scene, render_objects, take_scan
+from .xray.objects import find_objects
+
+SCENES = Path(__file__).resolve().parents[1] / 'scenes' / 'effects'
+# Small, so that a fit takes less than a minute.
+SETTINGS = FAST.changed(iterations=250, densify_from=50, densify_until=180, values_per_gaussian=40.)
+FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An effect, how to simulate it and how to fit what it leaves.
+
+    title   in tables and pictures
+    model   settings of the fit that models it, besides those of the others
+    turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
+                  not told
+    """
+
+    title: str
+    model: dict = field(default_factory=dict)
+    turn: float = 0.
+    shift: float = 0.
+
+
+EXPERIMENTS = dict(
+    hardening=Experiment('beam hardening, 120 kVp, aluminium'),
+    focal_spot=Experiment('focal spot of 2 mm, magnified 6 times'),
+    psf=Experiment('point spread of 3 pixels'),
+    dead_pixels=Experiment('every tenth pixel dead'),
+    misalignment=Experiment('views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), .5, 1.),
+)
+
+
+def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: int = 0) -> dict:
+    """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
+
+    parameters   of the scene file (`<default>` names)
+
+    Returns title, the largest line integral of the clean scan, and for each of FITS: psnr_3d (the truth's maximum is full
+    scale), psnr_3d_gain (after the factor that fits the truth best, so that a wrong scale alone costs nothing),
+    ms_per_iteration (over the second half of the steps, when all is compiled), volume; also truth [x, y, z], 1/mm, and
+    spacing, mm. Raises InputError for an unknown name.
+    """
+    if name not in EXPERIMENTS:
+        raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
+    experiment = EXPERIMENTS[name]
+    loaded = load_scene(SCENES / f'{name}.xml', parameters)
+    dataset = take_scan(loaded, seed=seed)
+    scan, truth = dataset.train, dataset.volume
+    objects = find_objects(loaded.scene)
+    clean = Scan(scan.geometry, render_objects(objects, scan.geometry))
+    if experiment.turn or experiment.shift:
+        moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
+        scan = Scan(scan.geometry, render_objects(objects, moved))
+    fits = {}
+    for kind, (what, changes) in dict(clean=(clean, {}), ignore=(scan, dict(effects='ignore')),
+                                      model=(scan, experiment.model)).items():
+        chosen = settings.changed(**changes)
+        fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
+        volume = fitted.stepper.volume(DeviceState(fitted.state))
+        fits[kind] = quality(volume, truth) | dict(ms_per_iteration=pace(fitted.history), volume=volume)
+    return dict(title=experiment.title, largest=float(clean.projections.max()), truth=truth,
+                spacing=list(scan.geometry.dVoxel), **fits)
+
+
+def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geometry:
+    """The geometry with every view turned about the volume's centre and shifted at random: standard deviations about and
+    along each axis, degrees and mm. The mean motion, which no projection tells from the object's, is taken off."""
+    turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
+    turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
+    frames = geometry.frames().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
+    return Geometry.posed(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+
+
+def quality(volume, truth) -> dict:
+    """PSNR in dB of a volume [x, y, z] against the truth, whose maximum is full scale: as it is, and after the factor that
+    makes the error least."""
+    peak, gain = truth.max(), np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
+    return dict(psnr_3d=psnr_3d(volume / peak, truth / peak), psnr_3d_gain=psnr_3d(gain * volume / peak, truth / peak))
+
+
+def pace(history) -> float:
+    """Milliseconds a step, over about the second half of a fit's steps."""
+    last = history[-1]
+    first = next(h for h in history if 2 * h['iteration'] >= last['iteration'] or h is history[-2])
+    return 1e3 * (last['seconds'] - first['seconds']) / (last['iteration'] - first['iteration'])
+
+
+def write(found: dict, folder: Path, figures: Path, document: Path | None = None) -> dict:
+    """Write effects.json into `folder`, a picture of every experiment into `figures`, and the table into `document`.
+
+    found   what `measure` gave, by the experiments' names; effects.json keeps what it holds of others
+
+    Returns what effects.json holds.
+    """
+    for path in (folder, figures):
+        path.mkdir(parents=True, exist_ok=True)
+    for name, result in found.items():
+        draw(result, figures / f'{name}.png')
+    numbers = {name: {k: v for k, v in result.items() if k not in ('truth', *FITS)}
+               | {kind: {k: v for k, v in result[kind].items() if k != 'volume'} for kind in FITS}
+               for name, result in found.items()}
+    path = folder / 'effects.json'
+    known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
+    numbers = {name: known[name] for name in EXPERIMENTS if name in known}
+    path.write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
+    if document:
+        text = document.read_text(encoding='utf-8')
+        document.write_text(insert(text, dict(worth=make_table(numbers)), document), encoding='utf-8')
+    return numbers
+
+
+def make_table(numbers: dict) -> str:
+    """The Markdown table of effects.json."""
+    def cell(kind):
+        return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
+    columns = [('effect', lambda r: r['title']), ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
+               *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
+               ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS))]
+    return table(columns, numbers.values())
+
+
+def draw(result: dict, path: Path):
+    """A picture of what `measure` gave: axial slices of the truth and of both fits on one grey scale, 1/mm, and the errors
+    of all three fits below on one scale of their own."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    truth, spacing = result['truth'], np.array(result['spacing'])
+    index, extent = richest(truth, 2), plane_extent(truth.shape, spacing, np.zeros(3), 2)
+    wanted = plane(truth, 2, index)
+    slices = {kind: plane(result[kind]['volume'], 2, index) for kind in FITS}
+    limit = max(np.percentile(np.abs(slices[kind] - wanted), 99) for kind in FITS)
+    with matplotlib.rc_context(STYLE):
+        fig = Figure(figsize=(10, 6.6), layout='constrained')
+        fig.get_layout_engine().set(**PADS)
+        fig.suptitle(f'{result["title"]}: slice at z = {(index + .5 - truth.shape[2] / 2) * spacing[2]:.3g} mm')
+        grid = fig.subplots(2, 3, sharex=True, sharey=True)
+        above = [('truth', wanted), *((FITS[kind], slices[kind]) for kind in ('ignore', 'model'))]
+        for ax, (title, image) in zip(grid[0], above):
+            grey = ax.imshow(image, origin='lower', extent=extent, cmap='gray', vmin=0, vmax=1.1 * wanted.max())
+            ax.set_title(title)
+        for ax, (kind, title) in zip(grid[1], FITS.items()):
+            error = ax.imshow(slices[kind] - wanted, origin='lower', extent=extent, cmap='RdBu_r', vmin=-limit, vmax=limit)
+            ax.set(title=f'error, {title}: {result[kind]["psnr_3d"]:.2f} dB', xlabel='x [mm]')
+        for ax in grid[:, 0]:
+            ax.set_ylabel('y [mm]')
+        fig.colorbar(grey, ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=.015)
+        fig.colorbar(error, ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=.015)
+        fig.savefig(path, dpi=90)
