@@ -54,7 +54,8 @@ class XRayTube(mi.Emitter):
        - n of n x n Gauss-Legendre points on it, 1 to 16, each of which is a projection. (Default: 3)
      * - scatter
        - |int|
-       - Paths of scattered photons that are traced to every point of a coarse grid on the panel. Needs `material`.
+       - Paths of scattered photons, of each energy, that are traced to every point of a coarse grid on the panel. Needs
+         `material`.
          (Default: 0, no scatter)
      * - scatter_grid
        - |string|
@@ -64,7 +65,7 @@ class XRayTube(mi.Emitter):
        - The most times that a photon scatters; -1 is any number. (Default: -1)
      * - scatter_energies
        - |int|
-       - Energies that stand for the spectrum, 1 to 16, among which the paths are not shared: each has `scatter` of them.
+       - Energies that stand for the spectrum, 1 to 16.
          (Default: 3)
      * - scatter_voxels
        - |int|

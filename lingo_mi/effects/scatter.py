@@ -30,6 +30,7 @@ from .hardening import by_material
 from .spectrum import attenuation
 
 BATCHES = 16
+MOST_LANES = 2 ** 22  # paths at a time: a few hundred megabytes
 LEAST_GRID, MOST_GRID = 4, 256  # a bicubic spline needs four points
 MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2 ** 20, 512, 16, 1000
 _LATTICE = [int(2 ** 32 / 1.2207440846057596 ** k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
@@ -80,23 +81,22 @@ class Scatter:
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
 
     def estimate(self, objects, tube, response: str, view, index: int):
-        """The same at the centres of the coarse grid's cells: means and their standard errors, float64 [rows, columns]."""
+        """The same on the coarse grid, from edge to edge of the panel: means and their standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
-            objects = tuple(objects)
-            key = self.orders, self.voxels, self.energies, tube, response
-            if not (_LATEST and key == _LATEST[0] and len(objects) == len(_LATEST[1])
-                    and all(a is b for a, b in zip(objects, _LATEST[1]))):
-                _LATEST[:] = key, objects, _media(objects, tube, response, self.voxels, self.energies)
-            low, high, media = _LATEST[2]
+            key, made_of = (response, self.voxels, self.energies), (tube, *objects)
+            if not (_LATEST and key == _LATEST[0] and len(made_of) == len(_LATEST[1])
+                    and all(a is b for a, b in zip(made_of, _LATEST[1]))):
+                _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies)
+            low, high, beam, scenes = _LATEST[2]
+            beam.aim(view)
+            rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
             integrator = mi.load_dict(dict(type='volpath', max_depth=self.orders + 1 if self.orders > 0 else -1))
             rng = np.random.Generator(np.random.Philox(key=[self.seed, index]))
-            total = np.zeros((BATCHES, *self.grid))
-            for weight, scene, beam in media:
-                beam.aim(view)
-                rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
-                for batch in total:
-                    batch += weight * rays.means(integrator, scene, rng).reshape(self.grid)
-            return total.mean(0), total.std(0, ddof=1) / np.sqrt(BATCHES)
+            total = np.zeros((*self.grid, BATCHES))
+            for weight, scene in scenes:
+                for first in range(0, BATCHES, rays.batches):
+                    total[..., first:first + rays.batches] += weight * rays.means(integrator, scene, rng)
+            return total.mean(-1), total.std(-1, ddof=1) / np.sqrt(BATCHES)
 
 
 _LATEST: list = []  # what was last made of which objects: all views of a scan share it
@@ -105,11 +105,11 @@ _LATEST: list = []  # what was last made of which objects: all views of a scan s
 def smoothed(means, errors, height: int, width: int) -> np.ndarray:
     """A bicubic smoothing spline at the pixel centres, [height, width], not negative.
 
-    means, errors   [rows, columns], at the centres of equal cells of the panel; the spline's residuals add up to the errors'
+    means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's residuals add up to the errors'
                     squares (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
     """
-    rows, columns = ((np.arange(n) + .5) * (size / n) for n, size in zip(means.shape, (height, width)))
-    spline = RectBivariateSpline(rows, columns, means, bbox=[0, height, 0, width], s=float((errors ** 2).sum()))
+    rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
+    spline = RectBivariateSpline(rows, columns, means, s=float((errors ** 2).sum()))
     return np.maximum(spline(np.arange(height) + .5, np.arange(width) + .5), 0)
 
 
@@ -117,8 +117,8 @@ def smoothed(means, errors, height: int, width: int) -> np.ndarray:
 #  The scene
 # ----------------------------------------------------------------------------------------------------------------------
 
-def _media(objects, tube, response, voxels, energies):
-    """The box of the objects, and (weight, scene, beam) of every energy; none where nothing attenuates."""
+def _scenes(objects, tube, response, voxels, energies):
+    """The box of the objects, the beam, and (weight, scene) of every energy; none where nothing attenuates."""
     if len(objects) == 1 and isinstance(objects[0], GridInCube):
         low, high = np.array(objects[0].low, float).ravel(), np.array(objects[0].high, float).ravel()
         shape = tuple(objects[0].size)
@@ -129,14 +129,13 @@ def _media(objects, tube, response, voxels, energies):
     step = (high - low) / shape
     densities = {name: np.maximum(sum(on_grid(thing, low, step, shape) for thing in things), 0)
                  for name, things in by_material(objects, tube).items()}
+    beam = mi.load_dict(dict(type='ct_beam'))
     if not any(d.any() for d in densities.values()):
-        return low, high, []
-    out = []
-    for weight, energy in _energies(tube.spectrum.energies, tube.spectrum.detected(response), energies):
-        beam = mi.load_dict(dict(type='ct_beam'))
-        out.append((weight, mi.load_dict(dict(type='scene', beam=beam, box=_box(
-            low, high, _medium(densities, tube.reference, energy, response, low, high)))), beam))
-    return low, high, out
+        return low, high, beam, []
+    return low, high, beam, [
+        (weight, mi.load_dict(dict(type='scene', beam=beam, box=_box(
+            low, high, _medium(densities, tube.reference, energy, response, low, high)))))
+        for weight, energy in _energies(tube.spectrum.energies, tube.spectrum.detected(response), energies)]
 
 
 def _energies(energies, shares, count):
@@ -192,16 +191,19 @@ def _box(low, high, medium):
 # ----------------------------------------------------------------------------------------------------------------------
 
 class _Rays:
-    """From the points of a coarse grid on the panel to points in a box: `count` each."""
+    """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as many as memory bears."""
 
     def __init__(self, view, grid, count, low, high):
-        self.points, self.count = grid[0] * grid[1], count
+        self.grid, self.count, self.batches = grid, count, BATCHES
+        while self.batches > 1 and grid[0] * grid[1] * self.batches * count > MOST_LANES:
+            self.batches //= 2
         columns = dr.opaque(mi.UInt32, grid[1])
-        self.point = dr.arange(mi.UInt32, self.points * count) // dr.opaque(mi.UInt32, count)
+        self.shifted = dr.arange(mi.UInt32, grid[0] * grid[1] * self.batches * count) // dr.opaque(mi.UInt32, count)
+        point = self.shifted // dr.opaque(mi.UInt32, self.batches)
         self.low, self.extent = dr.opaque(mi.Point3f, low.tolist()), dr.opaque(mi.Vector3f, (high - low).tolist())
         source, corner, u, v = (mi.Vector3f(a) for a in (view.source, view.corner, view.u, view.v))
-        x = (mi.Float(self.point % columns) + .5) * dr.opaque(mi.Float, view.width / grid[1])
-        y = (mi.Float(self.point // columns) + .5) * dr.opaque(mi.Float, view.height / grid[0])
+        x = mi.Float(point % columns) * dr.opaque(mi.Float, view.width / (grid[1] - 1))
+        y = mi.Float(point // columns) * dr.opaque(mi.Float, view.height / (grid[0] - 1))
         self.origin = mi.Point3f(corner + x * u + y * v)
         beam = source if view.parallel else self.origin - source
         across = dr.normalize(dr.cross(u, v))
@@ -214,16 +216,16 @@ class _Rays:
             nearest = dr.minimum(nearest, h)
         if dr.any(nearest <= 0):
             raise InputError('scatter: the box of the objects reaches the panel; move the panel, or make the box smaller')
-        dr.eval(self.point, self.origin, self.normal, self.open)
+        dr.eval(self.shifted, self.origin, self.normal, self.open)
 
     def means(self, integrator, scene, rng) -> np.ndarray:
-        """One batch: scattered signal over the open beam's, float64 [points]."""
-        size = self.points * self.count
+        """Scattered signal over the open beam's, float64 [rows, columns, batches]."""
+        shape = *self.grid, self.batches
         sampler = mi.load_dict(dict(type='independent'))
-        sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2 ** 32))), size)
-        j = dr.arange(mi.UInt32, size) - self.point * dr.opaque(mi.UInt32, self.count)
-        shift = [mi.UInt32(s) for s in rng.integers(2 ** 32, size=(3, self.points), dtype=np.uint32)]
-        xi = mi.Vector3f(*(mi.Float((j * a + dr.gather(mi.UInt32, s, self.point)) >> 8) * 2 ** -24
+        sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2 ** 32))), dr.width(self.shifted))
+        j = dr.arange(mi.UInt32, dr.width(self.shifted)) - self.shifted * dr.opaque(mi.UInt32, self.count)
+        shift = [mi.UInt32(s) for s in rng.integers(2 ** 32, size=(3, np.prod(shape)), dtype=np.uint32)]
+        xi = mi.Vector3f(*(mi.Float((j * a + dr.gather(mi.UInt32, s, self.shifted)) >> 8) * 2 ** -24
                            for a, s in zip(_LATTICE, shift)))
         direction = dr.normalize(self.low + xi * self.extent - self.origin)
         # A uniform point of the box lies in a direction with the density of the cone's volume: (far^3 - near^3) / 3 of all.
@@ -232,4 +234,4 @@ class _Rays:
         weight = 3 * dr.prod(self.extent) / ((far - near) * (far * far + far * near + near * near))
         light, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(mi.Ray3f(self.origin, direction)))
         value = light[0] * weight * dr.dot(self.normal, direction) / self.open
-        return value.numpy().astype(float).reshape(self.points, self.count).mean(1)
+        return value.numpy().astype(float).reshape(*shape, self.count).mean(-1)
