@@ -18,8 +18,9 @@ from .progress import Progress
 from .scan import Dataset, Scan
 from .xray import grid
 from .xray.frame import View
-from .xray.objects import Ellipsoids, GridInCube, HomogeneousMesh, find_objects
+from .xray.objects import Ellipsoids, GridInCube, find_objects
 from .xray.quality import Quality
+from .xray.sampling import grid_values, on_grid
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
             raise InputError(f'{loaded.path}: {error}') from None
     train = everything.subset(slice(0, len(geometry)))
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
-    meshes = [s for s in loaded.scene.shapes() if s.is_mesh() and s.interior_medium() is not None]
-    return choose_views(Dataset(train, held_out, _truth(objects, meshes, geometry)), 0 if test is not None else views)
+    return choose_views(Dataset(train, held_out, _truth(objects, geometry)), 0 if test is not None else views)
 
 
 def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
@@ -194,7 +194,7 @@ def render_objects(objects, geometry, extent: float = 8.) -> np.ndarray:
             if isinstance(thing, _Volume):
                 total += thing.project(geometry, report)
             elif same_box:  # skips empty margins, which rendering through the scene may not
-                total += grid.project(_values(thing), geometry, report)
+                total += grid.project(grid_values(thing), geometry, report)
             else:
                 frames = geometry.frames()
                 for i in range(len(geometry)):
@@ -212,15 +212,11 @@ def render_with(effects: Effects, objects, geometry, keys, seed, extent: float =
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
             view = View.of(frames, i, *geometry.nDetector)
-            expected = effects.line_integrals(objects, view, Quality(extent))
-            out[i] = replace(effects, index=int(keys[i])).measured(expected, view, seed).numpy().reshape(out.shape[1:])
+            one = replace(effects, index=int(keys[i]))
+            expected = one.line_integrals(objects, view, Quality(extent))
+            out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])
             bar.update(i + 1)
     return out
-
-
-def _values(thing: GridInCube) -> np.ndarray:
-    """Densities of a grid, float32 [x, y, z]."""
-    return thing.data.numpy().reshape(thing.size[::-1]).transpose(2, 1, 0) * np.float32(thing.scale)
 
 
 def _on_grid(thing: GridInCube, geometry: Geometry) -> bool:
@@ -230,27 +226,15 @@ def _on_grid(thing: GridInCube, geometry: Geometry) -> bool:
             and np.allclose(thing.high, centre + half, atol=1e-4 * half.max()))
 
 
-def _truth(objects, meshes, geometry) -> np.ndarray | None:
-    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it.
-
-    meshes   the shapes of the objects that are homogeneous meshes, in their order
-    """
+def _truth(objects, geometry) -> np.ndarray | None:
+    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it."""
     total = np.zeros(geometry.nVoxel, np.float32)
-    homogeneous = iter(m for m in meshes if str(m.interior_medium()).startswith('HomogeneousMedium'))
+    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
     for thing in objects:
         if isinstance(thing, _Volume):
             total += thing.data
-        elif isinstance(thing, GridInCube) and _on_grid(thing, geometry):
-            total += _values(thing)
-        elif isinstance(thing, Ellipsoids):
-            total += voxelize_cloud(thing, geometry, 6.)
-        elif isinstance(thing, HomogeneousMesh):
-            from .phantoms.mesh import voxelise
-            params = mi.traverse(next(homogeneous))
-            vertices, faces = (np.array(params[k]).reshape(-1, 3) for k in ('vertex_positions', 'faces'))
-            corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
-            inside = voxelise(vertices[faces].astype(float), corner, geometry.dVoxel, geometry.nVoxel)
-            total += inside * np.float32(np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0])
+        elif not isinstance(thing, GridInCube) or _on_grid(thing, geometry):
+            total += on_grid(thing, corner, geometry.dVoxel, geometry.nVoxel)
         else:
             return None
     return total
@@ -261,11 +245,8 @@ def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.n
 
     extent   cut-off in standard deviations
     """
-    from .xray.frame import vector64
-    from .xray.voxelize import Grid, voxelize
     corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
-    cells = Grid(vector64(corner), vector64(geometry.dVoxel), geometry.nVoxel)
-    return cells.volume(voxelize(cloud.centre, cloud.scale, cloud.rotation, cloud.density, cells, extent))
+    return on_grid(cloud, corner, geometry.dVoxel, geometry.nVoxel, extent)
 
 
 def _warn_if_truncated(geometry: Geometry):

@@ -14,6 +14,8 @@ PLUGINS = {
     'ct_volume': ('ct_volume', 'register_medium'),
     'xray_tube': ('xray_tube', 'register_emitter'),
     'ct_detector': ('ct_detector', 'register_film'),
+    'klein_nishina': ('klein_nishina', 'register_phase'),
+    'ct_beam': ('ct_beam', 'register_emitter'),
 }
 
 

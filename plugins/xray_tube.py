@@ -1,9 +1,10 @@
-"""The emitter `xray_tube`: the photons of a scan, by energy, and the focal spot that they come from."""
+"""The emitter `xray_tube`: the photons of a scan, by energy, the focal spot that they come from, and how they scatter."""
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.scatter import Scatter
 from lingo_mi.errors import InputError
 
 
@@ -51,6 +52,28 @@ class XRayTube(mi.Emitter):
      * - focal_order
        - |int|
        - n of n x n Gauss-Legendre points on it, 1 to 16, each of which is a projection. (Default: 3)
+     * - scatter
+       - |int|
+       - Paths of scattered photons, of each energy, that are traced to every point of a coarse grid on the panel. Needs
+         `material`.
+         (Default: 0, no scatter)
+     * - scatter_grid
+       - |string|
+       - Rows and columns of that grid, 4 to 256; one number stands for both. (Default: 16)
+     * - scatter_orders
+       - |int|
+       - The most times that a photon scatters; -1 is any number. (Default: -1)
+     * - scatter_energies
+       - |int|
+       - Energies that stand for the spectrum, 1 to 16.
+         (Default: 3)
+     * - scatter_voxels
+       - |int|
+       - Voxels along the longest side of the box of all objects, on which they are sampled for it, 1 to 512. A single
+         grid is used as it is. (Default: 64)
+     * - scatter_seed
+       - |int|
+       - Of its random numbers. (Default: 0)
 
     It is read by `lingo_xray`, which then gives -ln of the detected signal, and by `scanning.take_scan`. To Mitsuba's own
     integrators it is dark.
@@ -60,11 +83,12 @@ class XRayTube(mi.Emitter):
         try:
             spot = FocalSpot.of(props.get('focal_spot', '0'), props.get('focal_order', 3))
             materials = {k.removeprefix('material_'): props[k] for k in props.keys() if k.startswith('material_')}
+            scatter = Scatter.of(*(props.get(k, d) for k, d in _SCATTER.items()))
             tube = Tube.of(*(props.get(k, d) for k, d in _DEFAULTS.items()), materials)
         except InputError as error:
             raise InputError(f'xray_tube {props.id()!r}: {error}') from None
         super().__init__(props)
-        self.tube, self.spot = tube, spot
+        self.tube, self.spot, self.scatter = tube, spot, scatter
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
     def eval(self, si, active=True):
@@ -83,9 +107,10 @@ class XRayTube(mi.Emitter):
         pass
 
     def to_string(self):
-        return f'XRayTube[\n  {self.tube},\n  {self.spot}\n]'
+        return f'XRayTube[\n  {self.tube},\n  {self.spot},\n  {self.scatter or "no scatter"}\n]'
 
 
 create = XRayTube
 
 _DEFAULTS = dict(energy=None, kvp=None, angle=12., filtration='Al 2.5', reference=None, material='', split='', bands=4)
+_SCATTER = dict(scatter=0, scatter_grid='16', scatter_orders=-1, scatter_voxels=64, scatter_energies=3, scatter_seed=0)

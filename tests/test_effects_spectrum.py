@@ -57,10 +57,10 @@ def test_filter_is_attenuation():
 def test_second_time_it_is_read(tmp_path, monkeypatch):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
     made = tube_spectrum(60.)
-    library = module._library
-    monkeypatch.setattr(module, '_library', lambda name: pytest.fail('computed again'))
+    library = module.library
+    monkeypatch.setattr(module, 'library', lambda name: pytest.fail('computed again'))
     np.testing.assert_array_equal(tube_spectrum(60.).photons, made.photons)
-    monkeypatch.setattr(module, '_library', library)
+    monkeypatch.setattr(module, 'library', library)
     file, = (tmp_path / 'lingo_mi' / 'spectra').iterdir()
     file.write_bytes(b'PK damaged')
     np.testing.assert_array_equal(tube_spectrum(60.).photons, made.photons)

@@ -12,21 +12,23 @@ from ..scan import Scan
 from .detector import DARKEST, Detector
 from .focal_spot import FocalSpot, aperture_views
 from .hardening import Tube, by_material, hardened
+from .scatter import Scatter
 
 
 @dataclass(frozen=True)
 class Effects:
     """The effects of a scene; None for an element that it lacks.
 
-    tube, spot   spectrum and focal spot of its `xray_tube`
-    detector     of the sensor's `ct_detector`
-    index        the sensor's view: with the seed, the key of its noise
+    tube, spot, scatter   spectrum, focal spot and scattered photons of its `xray_tube`
+    detector              of the sensor's `ct_detector`
+    index                 the sensor's view: with the seeds, the key of its noise
     """
 
     tube: Tube | None = None
     spot: FocalSpot | None = None
     detector: Detector | None = None
     index: int = 0
+    scatter: Scatter | None = None
 
     @property
     def ideal(self) -> bool:
@@ -71,22 +73,26 @@ class Effects:
                     total += quality.line_integrals(thing, rays)
                 integrals.append(total)
             return hardened(integrals, bands) if bands else integrals[0]
-        return self.averaged(seen, view, quality)
+        scattered = self.scatter and self.scatter.light(objects, self.tube, self.response, view, self.index)
+        return self.averaged(seen, view, quality, scattered)
 
-    def averaged(self, seen, view, quality):
+    def averaged(self, seen, view, quality, scattered=None):
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
 
-        seen   gives -ln of the intensity along the rays of a View, Float
+        seen        gives -ln of the intensity along the rays of a View, Float
+        scattered   added to the intensity, over the open beam's, Float [height * width]
         """
         views = self.views(view)
         psf = self.detector.psf if self.detector else 0
-        if len(views) == 1 and quality.pixel == 1 and not psf:
+        if len(views) == 1 and quality.pixel == 1 and not psf and scattered is None:
             return seen(view)
         light = mi.Float(0)
         for weight, one in views:
             light += dr.opaque(mi.Float, weight) * quality.averaged(dr.exp(-seen(one)), view)
             if len(views) > 1:  # one small kernel for all of them, instead of a large one that takes long to compile
                 dr.eval(light)
+        if scattered is not None:
+            light += scattered
         if psf:
             light = self.detector.blurred(light, view)
         return -dr.log(dr.maximum(light, DARKEST))
@@ -127,7 +133,7 @@ def find_effects(scene, sensor) -> Effects | None:
         return None
     if len(tubes) > 1:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
-    tube, spot = (tubes[0].tube, tubes[0].spot) if tubes else (None, None)
+    tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
     geometry = getattr(sensor, 'geometry', None)
     if detector is not None and detector.psf and geometry is None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')
@@ -136,4 +142,4 @@ def find_effects(scene, sensor) -> Effects | None:
             spot.check(None if geometry.mode == 'parallel' else geometry.DSO)
         except InputError as error:
             raise InputError(f'xray_tube {tubes[0].id()!r}: {error}') from None
-    return Effects(tube, spot, detector, getattr(sensor, 'index', 0))
+    return Effects(tube, spot, detector, getattr(sensor, 'index', 0), scatter)

@@ -79,7 +79,7 @@ def tube_spectrum(kvp: float, angle: float = 12., filtration: str = 'Al 2.5') ->
             return Spectrum(table['energies'], table['photons'])
     except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # none yet, or a damaged one
         pass
-    tube = _library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)
+    tube = library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)
     try:
         for material, thickness in filters:
             tube.filter(material, thickness)
@@ -99,7 +99,15 @@ def attenuation(material: str, energies) -> np.ndarray:
 
     Raises InputError for an unknown material or where xraylib is not installed.
     """
-    xraylib = _library('xraylib')
+    xraylib = library('xraylib')
+    formula, density = compound(material)
+    mass = [xraylib.CS_Total_CP(formula, float(e)) for e in np.atleast_1d(energies)]  # cm2/g
+    return np.array(mass) * density / 10
+
+
+def compound(material: str) -> tuple[str, float]:
+    """The name by which xraylib knows a material, and its density in g/cm3. Raises InputError as `attenuation`."""
+    xraylib = library('xraylib')
     formula, at, density = (part.strip() for part in material.partition('@'))
     formula = NAMES.get(formula.lower(), formula)
     try:
@@ -109,13 +117,13 @@ def attenuation(material: str, energies) -> np.ndarray:
             density = xraylib.GetCompoundDataNISTByName(formula)['density']
         else:
             density = xraylib.ElementDensity(xraylib.SymbolToAtomicNumber(formula))
-        mass = [xraylib.CS_Total_CP(formula, float(e)) for e in np.atleast_1d(energies)]  # cm2/g
+        xraylib.CS_Total_CP(formula, 60.)
     except ValueError:
         raise InputError(f'the material {material!r} is unknown: use {", ".join(NAMES)}, a compound of the NIST '
                          "database, an element's symbol, or a formula with its density in g/cm3: 'CsI @ 4.51'") from None
     if not (np.isfinite(density) and density > 0):
         raise InputError(f'the material {material!r} must have a positive density, in g/cm3')
-    return np.array(mass) * density / 10
+    return formula, density
 
 
 def _filters(text: str) -> list[tuple[str, float]]:
@@ -133,7 +141,7 @@ def _filters(text: str) -> list[tuple[str, float]]:
     return out
 
 
-def _library(name: str):
+def library(name: str):
     """The module spekpy or xraylib. Raises InputError where it is not installed."""
     try:
         return importlib.import_module(name)

@@ -169,7 +169,12 @@ class HomogeneousMesh:
             while len(_MESHES) >= MOST_MESHES:
                 _MESHES.pop(next(iter(_MESHES)))
             _MESHES[key] = (shape, arrays, from_mitsuba(shape))
-        self.paths = _MESHES[key][-1]
+        self.paths, self._arrays = _MESHES[key][-1], arrays
+
+    def triangles(self) -> np.ndarray:
+        """Corners, float64 [n, 3, 3]."""
+        vertices, faces = (np.array(a).reshape(-1, 3) for a in self._arrays)
+        return vertices[faces].astype(float)
 
     def line_integrals(self, view, extent, primal, affine=False, area=False):
         _no_area(area)

@@ -1,0 +1,78 @@
+r"""Into which angles photons scatter: the Klein-Nishina formula, and the bound electrons of materials (NumPy).
+
+For a photon of energy E, alpha = E / (m c^2), on a free electron at rest (Klein and Nishina, Z. Phys. 52, 1929),
+
+    d sigma / d Omega = r_e^2 / 2  P^2 (P + 1/P - sin^2 theta),    P = E' / E = 1 / (1 + alpha (1 - cos theta))
+
+The electrons of a material are bound: xraylib multiplies this by the incoherent scattering function S(q), and adds the
+coherent (Rayleigh) part r_e^2 / 2 (1 + cos^2 theta) F(q)^2, atom by atom (Schoonjans et al., Spectrochim. Acta B 66, 2011).
+The interference of neighbouring molecules, which moves the coherent peak of water to some degrees, is not in its tables.
+"""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from ..errors import InputError
+from .spectrum import compound, library
+
+ELECTRON = 510.99895  # m c^2, keV
+LEAST_ENERGY, MOST_ENERGY = 1., 800.  # keV
+CELLS = 8192          # of cos theta from -1 to 1 in a table: the free electron's is right to 1e-6, 2 degrees for the coherent peak
+_FINE = 4096          # angles at which xraylib is asked
+_LEAST_Q = 1.1e-3     # 1/Angstrom, below which its tables of S end; it is next to 0 there, and F next to its largest
+_HC = 12.398420       # keV Angstrom
+
+
+def klein_nishina(cosine, energy: float, response: str = 'count') -> np.ndarray:
+    """d sigma / d Omega of a free electron over r_e^2, 1/sr, float64, by the cosine of the scattering angle (any shape).
+
+    energy     keV
+    response   'energy' weights every photon by the share P of its energy that it keeps (the energy-scattering cross-section
+               of Evans, "The Atomic Nucleus", 1955, ch. 23), 'count' by 1
+    """
+    cosine = np.asarray(cosine, float)
+    kept = 1 / (1 + energy / ELECTRON * (1 - cosine))
+    return .5 * kept ** (3 if response == 'energy' else 2) * (kept + 1 / kept - (1 - cosine ** 2))
+
+
+@lru_cache(maxsize=64)
+def scattering(energy: float, material: str = '', response: str = 'count') -> tuple[np.ndarray, float]:
+    """A table of d mu / d Omega, and its integral over all directions.
+
+    energy     keV, 1 to 800
+    material   as `spectrum.attenuation` takes it: bound electrons with coherent scattering, in 1/mm. None: a free electron, over
+               r_e^2
+    response   as of `klein_nishina`, for the incoherent part; the coherent one keeps the energy
+
+    float64 [CELLS + 1], at equal steps of cos theta from -1 to 1, forward last; of a material, means over the cells around
+    the nodes. Raises InputError for an energy out of range and as `spectrum.attenuation` does.
+    """
+    if not LEAST_ENERGY <= energy <= MOST_ENERGY:
+        raise InputError(f'energy must be from {LEAST_ENERGY:g} to {MOST_ENERGY:g} keV, not {energy:g}')
+    if not material:
+        table = klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response)
+        return _kept(table)
+    formula, density = compound(material)
+    xraylib = library('xraylib')
+    half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), in which a forward peak is broad
+    angles = (2 * np.arcsin(np.maximum(half, min(1., _LEAST_Q * _HC / energy)))).tolist()
+    bound, coherent = (np.array([function(formula, float(energy), a) for a in angles])
+                       for function in (xraylib.DCS_Compt_CP, xraylib.DCS_Rayl_CP))
+    cosine = 1 - 2 * half ** 2
+    kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.
+    fine = (bound * kept + coherent) * density / 10  # cm2/g to 1/mm
+    # Between two fine angles the density is a line, so its integral is a parabola. A forward peak narrower than a cell keeps its
+    # integral.
+    edges = np.concatenate([[-1.], (np.arange(CELLS) + .5) * (2 / CELLS) - 1, [1.]])
+    below = np.concatenate([[0.], np.cumsum((fine[1:] + fine[:-1]) / 2 * np.diff(cosine))])
+    i = np.clip(np.searchsorted(cosine, edges, 'right') - 1, 0, _FINE - 1)
+    step = edges - cosine[i]
+    slope = (fine[i + 1] - fine[i]) / (cosine[i + 1] - cosine[i])
+    return _kept(np.diff(below[i] + step * (fine[i] + step * slope / 2)) / np.diff(edges))
+
+
+def _kept(table):
+    table.setflags(write=False)  # it is shared
+    return table, float(4 * np.pi / CELLS * (table.sum() - (table[0] + table[-1]) / 2))

@@ -1,0 +1,237 @@
+r"""Scattered photons: Mitsuba's volume path tracer on a coarse grid of the panel, smoothed (Dr.Jit and NumPy).
+
+The signal of a panel is the photons through its surface. Relative to the open beam I0 at a point x of it, those that
+scattered are
+
+    S(x) = 1 / I0(x)  \int L(x, w) cos(w, n) dw,    I0(x) = cos(x - s, n) / |x - s|^2
+
+for a source s of intensity 1; L, the radiance that arrives from w, is what `volpath` computes: in the collimated beam of the
+view (`ct_beam`), only after one or more scatterings, with the tables of `compton` as phase functions. Directions are those to
+points drawn uniformly from the box of the objects, by a lattice with a random shift in each of BATCHES batches, whose spread
+gives the error of a mean. A smoothing spline that leaves residuals of that size takes the means to the pixels.
+
+Scattered photons are attenuated at the energy at which they left the tube.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import uniform_filter
+
+from ..errors import InputError
+from ..xray.objects import GridInCube
+from ..xray.sampling import bounds, on_grid
+from .compton import scattering
+from .hardening import by_material
+from .spectrum import attenuation
+
+BATCHES = 16
+MOST_LANES = 2 ** 22  # paths at a time: a few hundred megabytes
+LEAST_GRID, MOST_GRID = 4, 256  # a bicubic spline needs four points
+MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2 ** 20, 512, 16, 1000
+_LATTICE = [int(2 ** 32 / 1.2207440846057596 ** k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """See the `scatter` parameters of the emitter `xray_tube`."""
+
+    paths: int
+    grid: tuple[int, int] = (16, 16)
+    orders: int = -1
+    voxels: int = 64
+    energies: int = 3
+    seed: int = 0
+
+    @staticmethod
+    def of(paths, grid, orders, voxels, energies, seed) -> Scatter | None:
+        """From plugin parameters, None without paths. Raises InputError."""
+        for name, value, least, most in (
+                ('scatter', paths, 0, MOST_PATHS), ('scatter_orders', orders, -1, MOST_ORDERS),
+                ('scatter_voxels', voxels, 1, MOST_VOXELS), ('scatter_energies', energies, 1, MOST_ENERGIES),
+                ('scatter_seed', seed, 0, 2 ** 62)):
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise InputError(f'{name} must be a whole number from {least} to {most}, not {value!r}')
+        if orders == 0:
+            raise InputError('scatter_orders must be positive, or -1 for any number of scatterings')
+        try:
+            numbers = [int(x) for x in str(grid).replace(',', ' ').split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (1, 2) or not all(LEAST_GRID <= x <= MOST_GRID for x in numbers):
+            raise InputError(f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and columns, '
+                             f'not {grid!r}')
+        return Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed) if paths else None
+
+    def light(self, objects, tube, response: str, view, index: int):
+        """Scattered signal over the open beam's, Float [height * width], at the pixel centres of a view; not differentiable.
+
+        objects    of `xray.objects.find_objects`
+        tube       `hardening.Tube`, whose materials the objects are of
+        response   'energy' or 'count'
+        index      with `seed` the key of the random numbers
+
+        Raises InputError where an object has no material or reaches the panel.
+        """
+        means, errors = self.estimate(objects, tube, response, view, index)
+        return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
+
+    def estimate(self, objects, tube, response: str, view, index: int):
+        """The same on the coarse grid, from edge to edge of the panel: means and their standard errors, float64 [rows, columns]."""
+        with dr.suspend_grad():
+            key, made_of = (response, self.voxels, self.energies), (tube, *objects)
+            if not (_LATEST and key == _LATEST[0] and len(made_of) == len(_LATEST[1])
+                    and all(a is b for a, b in zip(made_of, _LATEST[1]))):
+                _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies)
+            low, high, beam, scenes = _LATEST[2]
+            beam.aim(view)
+            rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
+            integrator = mi.load_dict(dict(type='volpath', max_depth=self.orders + 1 if self.orders > 0 else -1))
+            rng = np.random.Generator(np.random.Philox(key=[self.seed, index]))
+            total = np.zeros((*self.grid, BATCHES))
+            for weight, scene in scenes:
+                for first in range(0, BATCHES, rays.batches):
+                    total[..., first:first + rays.batches] += weight * rays.means(integrator, scene, rng)
+            return total.mean(-1), total.std(-1, ddof=1) / np.sqrt(BATCHES)
+
+
+_LATEST: list = []  # what was last made of which objects: all views of a scan share it
+
+
+def smoothed(means, errors, height: int, width: int) -> np.ndarray:
+    """A bicubic smoothing spline at the pixel centres, [height, width], not negative.
+
+    means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's residuals add up to the errors'
+                    squares (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
+    """
+    rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
+    spline = RectBivariateSpline(rows, columns, means, s=float((errors ** 2).sum()))
+    return np.maximum(spline(np.arange(height) + .5, np.arange(width) + .5), 0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+#  The scene
+# ----------------------------------------------------------------------------------------------------------------------
+
+def _scenes(objects, tube, response, voxels, energies):
+    """The box of the objects, the beam, and (weight, scene) of every energy; none where nothing attenuates."""
+    if len(objects) == 1 and isinstance(objects[0], GridInCube):
+        low, high = np.array(objects[0].low, float).ravel(), np.array(objects[0].high, float).ravel()
+        shape = tuple(objects[0].size)
+    else:
+        low, high = bounds(objects)
+        step = (high - low).max() / voxels
+        shape = tuple(np.maximum(1, np.ceil((high - low) / step - 1e-6)).astype(int).tolist())
+    step = (high - low) / shape
+    densities = {name: np.maximum(sum(on_grid(thing, low, step, shape) for thing in things), 0)
+                 for name, things in by_material(objects, tube).items()}
+    beam = mi.load_dict(dict(type='ct_beam'))
+    if not any(d.any() for d in densities.values()):
+        return low, high, beam, []
+    return low, high, beam, [
+        (weight, mi.load_dict(dict(type='scene', beam=beam, box=_box(
+            low, high, _medium(densities, tube.reference, energy, response, low, high)))))
+        for weight, energy in _energies(tube.spectrum.energies, tube.spectrum.detected(response), energies)]
+
+
+def _energies(energies, shares, count):
+    """(weight, energy) of a spectrum in parts of equal signal, each at its mean energy."""
+    parts = np.minimum((np.cumsum(shares) - shares / 2) * count, count - 1e-9).astype(int)
+    weights = np.bincount(parts, shares)
+    means = np.bincount(parts, shares * energies)
+    return [(float(w), float(m / w)) for w, m in zip(weights, means) if w > 0]
+
+
+def _medium(densities, reference, energy, response, low, high):
+    """The medium of materials whose densities, float32 [x, y, z], are attenuation at the reference energy."""
+    attenuating, scattered = 0., []
+    for name, density in densities.items():
+        amount = density / attenuation(name, [reference])[0]
+        attenuating = attenuating + amount * attenuation(name, [energy])[0]
+        scattered.append(amount * scattering(energy, name, response)[1])
+    names = list(densities)
+    phase, so_far = _phase(names[0], energy, response), scattered[0]
+    for name, more in zip(names[1:], scattered[1:]):
+        so_far = so_far + more
+        phase = dict(type='blendphase', weight=_volume(_ratio(more, so_far), low, high), phase_0=phase,
+                     phase_1=_phase(name, energy, response))
+    albedo = _volume(_ratio(so_far, attenuating), low, high) if len(names) > 1 else float(so_far.sum() / attenuating.sum())
+    return dict(type='heterogeneous', sigma_t=_volume(attenuating, low, high), albedo=albedo, phase=phase,
+                has_spectral_extinction=False)
+
+
+def _phase(name, energy, response):
+    return dict(type='klein_nishina', energy=energy, material=name, response=response)
+
+
+def _ratio(part, whole):
+    """part / whole; in empty voxels that of their neighbours, because between voxels it is interpolated."""
+    near, around = uniform_filter(part, 3), uniform_filter(whole, 3)
+    near = np.divide(near, around, out=np.zeros_like(near), where=around > 0)
+    return np.divide(part, whole, out=near, where=whole > 0)
+
+
+def _volume(values, low, high):
+    grid = mi.VolumeGrid(np.ascontiguousarray(values.transpose(2, 1, 0), np.float32)[..., None])
+    where = mi.ScalarTransform4f().translate(low.tolist()).scale((high - low).tolist())
+    return dict(type='gridvolume', grid=grid, to_world=where, raw=True, wrap_mode='clamp')
+
+
+def _box(low, high, medium):
+    where = mi.ScalarTransform4f().translate(((low + high) / 2).tolist()).scale(((high - low) / 2).tolist())
+    return dict(type='cube', to_world=where, bsdf=dict(type='null'), interior=medium)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+#  The rays
+# ----------------------------------------------------------------------------------------------------------------------
+
+class _Rays:
+    """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as many as memory bears."""
+
+    def __init__(self, view, grid, count, low, high):
+        self.grid, self.count, self.batches = grid, count, BATCHES
+        while self.batches > 1 and grid[0] * grid[1] * self.batches * count > MOST_LANES:
+            self.batches //= 2
+        columns = dr.opaque(mi.UInt32, grid[1])
+        self.shifted = dr.arange(mi.UInt32, grid[0] * grid[1] * self.batches * count) // dr.opaque(mi.UInt32, count)
+        point = self.shifted // dr.opaque(mi.UInt32, self.batches)
+        self.low, self.extent = dr.opaque(mi.Point3f, low.tolist()), dr.opaque(mi.Vector3f, (high - low).tolist())
+        source, corner, u, v = (mi.Vector3f(a) for a in (view.source, view.corner, view.u, view.v))
+        x = mi.Float(point % columns) * dr.opaque(mi.Float, view.width / (grid[1] - 1))
+        y = mi.Float(point // columns) * dr.opaque(mi.Float, view.height / (grid[0] - 1))
+        self.origin = mi.Point3f(corner + x * u + y * v)
+        beam = source if view.parallel else self.origin - source
+        across = dr.normalize(dr.cross(u, v))
+        self.normal = dr.select(dr.dot(across, beam) < 0, across, -across)  # towards the source
+        self.open = dr.abs(dr.dot(self.normal, beam)) / (1 if view.parallel else dr.norm(beam) ** 3)
+        corners = (mi.Point3f(self.low + self.extent * mi.Vector3f(i & 1, i >> 1 & 1, i >> 2)) for i in range(8))
+        height = [dr.dot(self.normal, p - self.origin) for p in corners]
+        nearest = height[0]
+        for h in height[1:]:
+            nearest = dr.minimum(nearest, h)
+        if dr.any(nearest <= 0):
+            raise InputError('scatter: the box of the objects reaches the panel; move the panel, or make the box smaller')
+        dr.eval(self.shifted, self.origin, self.normal, self.open)
+
+    def means(self, integrator, scene, rng) -> np.ndarray:
+        """Scattered signal over the open beam's, float64 [rows, columns, batches]."""
+        shape = *self.grid, self.batches
+        sampler = mi.load_dict(dict(type='independent'))
+        sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2 ** 32))), dr.width(self.shifted))
+        j = dr.arange(mi.UInt32, dr.width(self.shifted)) - self.shifted * dr.opaque(mi.UInt32, self.count)
+        shift = [mi.UInt32(s) for s in rng.integers(2 ** 32, size=(3, np.prod(shape)), dtype=np.uint32)]
+        xi = mi.Vector3f(*(mi.Float((j * a + dr.gather(mi.UInt32, s, self.shifted)) >> 8) * 2 ** -24
+                           for a, s in zip(_LATTICE, shift)))
+        direction = dr.normalize(self.low + xi * self.extent - self.origin)
+        # A uniform point of the box lies in a direction with the density of the cone's volume: (far^3 - near^3) / 3 of all.
+        a, b = (self.low - self.origin) / direction, (self.low + self.extent - self.origin) / direction
+        near, far = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
+        weight = 3 * dr.prod(self.extent) / ((far - near) * (far * far + far * near + near * near))
+        light, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(mi.Ray3f(self.origin, direction)))
+        value = light[0] * weight * dr.dot(self.normal, direction) / self.open
+        return value.numpy().astype(float).reshape(*shape, self.count).mean(-1)
