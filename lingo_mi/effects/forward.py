@@ -103,6 +103,8 @@ def find_effects(scene, sensor) -> Effects | None:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
     tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
     geometry = getattr(sensor, 'geometry', None)
+    if scatter is not None and geometry is None:
+        raise InputError(f'xray_tube {tubes[0].id()!r}: scatter needs a ct_scanner, whose panel it reaches')
     if spot is not None and geometry is not None:
         try:
             spot.check(None if geometry.mode == 'parallel' else geometry.DSO)
