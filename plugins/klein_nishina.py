@@ -28,7 +28,7 @@ def create(props):
     With P = 1 / (1 + E / 511 keV (1 - cos theta)), the share of its energy that a photon keeps, the distribution is that of
     P^2 (P + 1/P - sin^2 theta), for small energies Rayleigh's 3 / (16 pi) (1 + cos^2 theta).
 
-    It is handed to Mitsuba's own `tabphase`, exact at 8193 cosines and linear between them (1e-6 off, and less below 300
+    It is handed to Mitsuba's own `tabphase`, exact at 8193 cosines and linear between them (less than 2e-6 off up to 799
     keV); values, densities and samples are those of the same table. A medium does not follow a photon's energy: what follows
     attenuates it like before.
     """

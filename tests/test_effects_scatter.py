@@ -112,7 +112,8 @@ def chord(a, b):
 
 
 def pose(g):
-    return [np.asarray(a[0], float) for a in (lambda f: (f.source, f.corner, f.u, f.v))(g.frames())]
+    frames = g.frames()
+    return [np.asarray(a[0], float) for a in (frames.source, frames.corner, frames.u, frames.v)]
 
 
 def single(g, points, order=28):
@@ -156,7 +157,7 @@ def test_single_scattering(changes):
     _, corner, u, v = pose(g)
     points = [corner + 20 * i * u + 40 / 3 * j * v for j in range(4) for i in range(4)]
     # Where the collimator's edge cuts the box Gauss's rule converges slowly.
-    expected = single(g, points, 28 if not g.offDetector[1] == 130 else 80).reshape(4, 4)
+    expected = single(g, points, 80 if g.offDetector[1] == 130 else 28).reshape(4, 4)
     off = (means - expected) / errors
     assert np.sum(off ** 2) < 45 and abs(off.mean()) < 1.2  # 16 degrees of freedom with a t distribution: 1 in 1000
     assert errors.mean() / means.mean() < .04 and abs(means.sum() / expected.sum() - 1) < .015
@@ -245,7 +246,8 @@ def test_objects_on_a_grid():
     cloud, values, bolt = sorted(find_objects(scene), key=lambda thing: ('cloud', 'grid', 'bolt').index(thing.name))
     made = cloud_of()
     expected = {cloud: (made.density * np.prod(made.scale, 1)).sum() * (2 * np.pi) ** 1.5,
-                values: values_of().mean() * .8 * 1. * 1.2, bolt: 1.3 * 8 * abs(np.linalg.det(np.array(block()['to_world'].matrix)[:3, :3]))}
+                values: values_of().mean() * .8 * 1. * 1.2,
+                bolt: 1.3 * 8 * abs(np.linalg.det(np.array(block()['to_world'].matrix)[:3, :3]))}
     for thing, integral in expected.items():
         low, high = bounds([thing])
         step = (high - low) / 48
@@ -285,13 +287,14 @@ def body():
 
 
 def test_a_scene_adds_it_to_the_light():
-    ideal, scene = load(dict(body=body()), PANEL), load(dict(body=body(), tube=mi.load_dict(SCATTER)), PANEL)
+    ideal, scene = load(dict(body=body()), PANEL), load(dict(body=body(), tube=SCATTER), PANEL)
     sensor = scene.sensors()[0]
     effects = find_effects(scene, sensor)
-    scattered = effects.scatter.light(find_objects(scene), effects.tube, 'energy', view_of(sensor), 0).numpy().reshape(23, 30, 1)
+    scattered = effects.scatter.light(find_objects(scene), effects.tube, 'energy', view_of(sensor), 0).numpy()
     assert scattered.min() > .002
     image = render(scene)
-    np.testing.assert_allclose(image, -np.log(np.exp(-render(ideal)) + scattered), atol=1e-5)
+    expected = -np.log(np.exp(-render(ideal)) + scattered.reshape(23, 30, 1))
+    np.testing.assert_allclose(image, expected, atol=1e-5)
     np.testing.assert_array_equal(render(scene), image)
 
 
@@ -328,6 +331,10 @@ def test_one_line_that_names_element_and_place(scene_file, given, match):  # noq
 
 
 def test_refusals():
+    camera = dict(type='perspective', film=dict(type='hdrfilm', width=8, height=8))
+    with pytest.raises(InputError, match="xray_tube 'tube': scatter needs a ct_scanner"):
+        scene = load(dict(body=body(), tube=SCATTER), camera)
+        find_effects(scene, scene.sensors()[0])
     with pytest.raises(InputError, match='box of the objects reaches the panel'):
         g = geometry(DSD=410.)
         Scatter(16).estimate([water_box()], tube_of(), 'count', View.of(g.frames(), 0, *g.nDetector), 0)

@@ -19,7 +19,7 @@ from .spectrum import compound, library
 
 ELECTRON = 510.99895  # m c^2, keV
 LEAST_ENERGY, MOST_ENERGY = 1., 800.  # keV
-CELLS = 8192          # of cos theta from -1 to 1 in a table: the free electron's is right to 1e-6, 2 degrees for the coherent peak
+CELLS = 8192          # of cos theta from -1 to 1 in a table: the free electron's is right to 2e-6; forward, 1.3 degrees wide
 _FINE = 4096          # angles at which xraylib is asked
 _LEAST_Q = 1.1e-3     # 1/Angstrom, below which its tables of S end; it is next to 0 there, and F next to its largest
 _HC = 12.398420       # keV Angstrom
@@ -42,8 +42,8 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     """A table of d mu / d Omega, and its integral over all directions.
 
     energy     keV, 1 to 800
-    material   as `spectrum.attenuation` takes it: bound electrons with coherent scattering, in 1/mm. None: a free electron, over
-               r_e^2
+    material   as `spectrum.attenuation` takes it: bound electrons with coherent scattering, in 1/mm. None: a free electron,
+               over r_e^2
     response   as of `klein_nishina`, for the incoherent part; the coherent one keeps the energy
 
     float64 [CELLS + 1], at equal steps of cos theta from -1 to 1, forward last; of a material, means over the cells around
@@ -52,8 +52,7 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     if not LEAST_ENERGY <= energy <= MOST_ENERGY:
         raise InputError(f'energy must be from {LEAST_ENERGY:g} to {MOST_ENERGY:g} keV, not {energy:g}')
     if not material:
-        table = klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response)
-        return _kept(table)
+        return _kept(klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response))
     formula, density = compound(material)
     xraylib = library('xraylib')
     half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), in which a forward peak is broad
@@ -63,8 +62,8 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     cosine = 1 - 2 * half ** 2
     kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.
     fine = (bound * kept + coherent) * density / 10  # cm2/g to 1/mm
-    # Between two fine angles the density is a line, so its integral is a parabola. A forward peak narrower than a cell keeps its
-    # integral.
+    # Means over cells, so that a forward peak narrower than a cell keeps its integral. Between two fine angles the density is
+    # a line, so its integral is a parabola.
     edges = np.concatenate([[-1.], (np.arange(CELLS) + .5) * (2 / CELLS) - 1, [1.]])
     below = np.concatenate([[0.], np.cumsum((fine[1:] + fine[:-1]) / 2 * np.diff(cosine))])
     i = np.clip(np.searchsorted(cosine, edges, 'right') - 1, 0, _FINE - 1)

@@ -137,6 +137,8 @@ def find_effects(scene, sensor) -> Effects | None:
     geometry = getattr(sensor, 'geometry', None)
     if detector is not None and detector.psf and geometry is None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')
+    if scatter is not None and geometry is None:
+        raise InputError(f'xray_tube {tubes[0].id()!r}: scatter needs a ct_scanner, whose panel it reaches')
     if spot is not None and geometry is not None:
         try:
             spot.check(None if geometry.mode == 'parallel' else geometry.DSO)

@@ -63,8 +63,8 @@ class Scatter:
         except ValueError:
             numbers = []
         if len(numbers) not in (1, 2) or not all(LEAST_GRID <= x <= MOST_GRID for x in numbers):
-            raise InputError(f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and columns, '
-                             f'not {grid!r}')
+            raise InputError(f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and '
+                             f'columns, not {grid!r}')
         return Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed) if paths else None
 
     def light(self, objects, tube, response: str, view, index: int):
@@ -81,7 +81,7 @@ class Scatter:
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
 
     def estimate(self, objects, tube, response: str, view, index: int):
-        """The same on the coarse grid, from edge to edge of the panel: means and their standard errors, float64 [rows, columns]."""
+        """The same on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
             key, made_of = (response, self.voxels, self.energies), (tube, *objects)
             if not (_LATEST and key == _LATEST[0] and len(made_of) == len(_LATEST[1])
@@ -191,7 +191,7 @@ def _box(low, high, medium):
 # ----------------------------------------------------------------------------------------------------------------------
 
 class _Rays:
-    """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as many as memory bears."""
+    """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as memory bears."""
 
     def __init__(self, view, grid, count, low, high):
         self.grid, self.count, self.batches = grid, count, BATCHES

@@ -11,7 +11,7 @@ from .frame import vector64
 from .objects import Ellipsoids, GridInCube, HomogeneousMesh
 from .voxelize import Grid, voxelize
 
-BOUND = 4.   # where a box may cut it: 0.1 % of its mass lies outside
+BOUND = 4.  # standard deviations where a box may cut a Gaussian: 0.02 % of its mass lies outside
 
 
 def on_grid(thing, corner, step, shape, extent: float = 6.) -> np.ndarray:
@@ -29,10 +29,11 @@ def on_grid(thing, corner, step, shape, extent: float = 6.) -> np.ndarray:
         return cells.volume(voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent))
     if isinstance(thing, HomogeneousMesh):
         from ..phantoms.mesh import voxelise
-        density = np.float32(np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0])
-        return voxelise(thing.triangles(), corner, step, shape) * density
+        sigma = np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0]
+        return voxelise(thing.triangles(), corner, step, shape) * np.float32(sigma)
     values = grid_values(thing)
-    low, own = _box(thing)[0], (_box(thing)[1] - _box(thing)[0]) / values.shape
+    low, high = _box(thing)
+    own = (high - low) / values.shape
     if values.shape == tuple(shape) and np.allclose(low, corner, atol=1e-4 * own.min()) and np.allclose(own, step, rtol=1e-4):
         return values
     ratio = np.asarray(step) / own
