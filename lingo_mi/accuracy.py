@@ -26,7 +26,7 @@ from .closed_form import NAMES, image_and_gradients
 from .fit.device import DeviceState
 from .fit.initial import initial_cloud
 from .fit.loop import run
-from .fit.settings import METHODS
+from .fit.settings import METHODS, VOLUMETRIC
 from .fit.state import start
 from .fit.step import Stepper
 from .geometry import Geometry, circular
@@ -469,7 +469,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
 def fits(sizes: Sizes) -> list[dict]:
     """Quality against seconds: recipes, iterations, cut-off, Gaussians to start with, size of the phantom."""
     small, most, points = sizes.phantoms[0], sizes.iterations[-1], sizes.points[1]
-    plans = [(name, small, n, points, 3.) for name in METHODS for n in sizes.iterations]
+    plans = [(name, small, n, points, 3.) for name in VOLUMETRIC for n in sizes.iterations]
     plans += [('fast', small, sizes.iterations[-2], points, e) for e in (2., 4., EXTENT)]
     plans += [('fast', small, sizes.iterations[-2], p, 3.) for p in sizes.points if p != points]
     plans += [('fast', side, most, points, 3.) for side in sizes.phantoms[1:]]

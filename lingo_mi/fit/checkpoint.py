@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from .state import PARAMETERS, State
+from .state import State
 
 
 def save(path, state: State, extra: dict, arrays: dict | None = None):
@@ -37,7 +37,8 @@ def load(path) -> tuple[State, dict, dict]:
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {k: file[k] for k in file.files}
-        state = State(*({k: data[f'{group}.{k}'] for k in PARAMETERS} for group in ('values', 'first', 'second')),
+        names = [k[7:] for k in data if k.startswith('values.')]
+        state = State(*({k: data[f'{group}.{k}'] for k in names} for group in ('values', 'first', 'second')),
                       data['gradient'], data['seen'], data['born'])
         extra = json.loads(str(data['extra']))
     except FileNotFoundError:

@@ -5,23 +5,28 @@ two. A clone and its original take half the density each, which keeps the mass. 
 R2 gives them half the density too, so that three quarters of the mass vanish; with `split_keeps_mass` they get what
 keeps it. Where there is not room for all, the strongest go first (R2-Gaussian stops). Afterwards faint and stray Gaussians
 are removed. Adam's moments travel with their Gaussian; new ones start at zero.
+
+For alpha compositing the rules are those of 3DGS: clones and halves keep the opacity, the faint vanish and later the large,
+Gaussians outside the volume stay, and from time to time all opacities are lowered (`reset_opacity`).
 """
 from __future__ import annotations
 
 import numpy as np
 
 from .settings import Settings
-from .state import PARAMETERS, State, activate, inverse_scale, inverse_softplus
+from .state import State, activate, inverse_scale, inverse_sigmoid, inverse_softplus
 
+RESET = .01   # 3DGS: opacity that `reset_opacity` leaves at most
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
-def densify(state: State, settings: Settings, half, rng, flat: bool = False) -> State:
+def densify(state: State, settings: Settings, half, rng, flat: bool = False, largest: float = np.inf) -> State:
     """Clone, split and prune once, then clear the statistic.
 
     half   half the volume's sides, [3]: Gaussians centred outside are removed
     rng    numpy Generator; places the halves of splits
     flat   whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
+    largest   standard deviation above which the Gaussians of alpha compositing vanish
     """
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
     _, scale, _, _ = activate(state, settings)
@@ -31,11 +36,11 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False) -> 
     large = scale.max(1) > settings.split_size
     state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
                   settings, rng, flat)
-    return prune(state, settings, half)
+    return prune(state, settings, half, largest)
 
 
 def clone(state: State, chosen) -> State:
-    """Copy the chosen Gaussians [N] to the end; original and copy get half the density each."""
+    """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
     halved = _with_density(state, chosen, .5)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
@@ -57,17 +62,34 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     return _append(_take(state, ~chosen), children)
 
 
-def prune(state: State, settings: Settings, half) -> State:
-    """Remove Gaussians whose density is below the bound or whose centre left the volume; clear the statistic."""
-    centre, _, _, density = activate(state, settings)
-    keep = (density >= settings.prune_density) & (np.abs(centre) <= np.asarray(half)).all(1)
+def prune(state: State, settings: Settings, half, largest: float = np.inf) -> State:
+    """Remove Gaussians whose density is below the bound or whose centre left the volume; clear the statistic.
+
+    For alpha compositing: those whose opacity is below the bound or a standard deviation above `largest`.
+    """
+    centre, scale, _, density = activate(state, settings)
+    inside = (np.abs(centre) <= np.asarray(half)).all(1) if settings.render == 'integral' else scale.max(1) <= largest
+    keep = (density >= settings.prune_density) & inside
     kept = _take(state, keep)
     kept.gradient[:], kept.seen[:] = 0, 0
     return kept
 
 
+def reset_opacity(state: State) -> State:
+    """Lower all opacities to 0.01 and forget their moments, so that only those that images need come back (3DGS)."""
+    def with_opacity(columns, opacity):
+        return columns | {'opacity': opacity}
+    opacity = state.values['opacity']
+    zeros = np.zeros_like(opacity)
+    return State(with_opacity(state.values, np.minimum(opacity, np.float32(inverse_sigmoid(RESET)))),
+                 with_opacity(state.first, zeros), with_opacity(state.second, zeros.copy()), state.gradient, state.seen,
+                 state.born)
+
+
 def _with_density(state, chosen, factor):
-    """The state with the chosen densities multiplied."""
+    """The state with the chosen densities multiplied; opacities are not shared."""
+    if 'density' not in state.values:
+        return state
     values = dict(state.values)
     raw = values['density'].astype(float)
     raw[chosen] = inverse_softplus(np.logaddexp(0., raw[chosen]) * factor)
@@ -86,14 +108,14 @@ def _fresh(state, index):
     """Newborn copies of Gaussians: their parameters, no moments, no statistic."""
     taken = _take(state, index)
     n = len(taken)
-    zeros = {k: np.zeros((n, size), np.float32) for k, size in PARAMETERS.items()}
+    zeros = {k: np.zeros_like(v) for k, v in taken.values.items()}
     return State(taken.values, zeros, {k: v.copy() for k, v in zeros.items()}, np.zeros(n, np.float32),
                  np.zeros(n, np.float32), np.ones(n, bool))
 
 
 def _append(state, more):
     def join(a, b):
-        return {k: np.concatenate([a[k], b[k]]) for k in PARAMETERS}
+        return {k: np.concatenate([v, b[k]]) for k, v in a.items()}
     return State(join(state.values, more.values), join(state.first, more.first), join(state.second, more.second),
                  np.concatenate([state.gradient, more.gradient]), np.concatenate([state.seen, more.seen]),
                  np.concatenate([state.born, more.born]))

@@ -6,10 +6,12 @@ import mitsuba as mi
 import numpy as np
 
 from .settings import Settings
-from .state import PARAMETERS, State
+from .state import State
+
 
 def _types():
-    return dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
+    return dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float, opacity=mi.Float,
+                radiance=mi.Float, harmonics=mi.ArrayXf)
 
 
 class DeviceState:
@@ -19,7 +21,7 @@ class DeviceState:
         types = _types()
 
         def upload(columns):
-            return {k: types[k](*(uploaded(c) for c in columns[k].T)) for k in PARAMETERS}
+            return {k: types[k](*(uploaded(c) for c in v.T)) for k, v in columns.items()}
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
         self.gradient, self.seen = uploaded(state.gradient), uploaded(state.seen)
         self.born = state.born
@@ -31,21 +33,27 @@ class DeviceState:
         """The state as NumPy arrays."""
         def download(columns):
             # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
-            return {k: np.stack([c.numpy() for c in (columns[k] if size > 1 else [columns[k]])], 1)
-                    for k, size in PARAMETERS.items()}
+            return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1)
+                    for k, x in columns.items()}
         return State(download(self.values), download(self.first), download(self.second), self.gradient.numpy(),
                      self.seen.numpy(), self.born)
 
     def gaussians(self, settings: Settings):
-        """Centres, standard deviations, quaternions (not normalised) and densities; differentiable."""
+        """Centres, standard deviations, quaternions (not normalised) and densities; differentiable.
+
+        For alpha compositing opacities in place of densities, followed by what `xray.radiance.seen` takes.
+        """
         v = self.values
         low, high = dr.opaque(mi.Float, settings.scale_min), dr.opaque(mi.Float, settings.scale_max - settings.scale_min)
         scale = low + high / (1 + dr.exp(-v['scale']))
+        if settings.render == 'alpha':
+            radiance = [v[k] for k in ('radiance', 'harmonics') if k in v]
+            return v['centre'], scale, v['rotation'], 1 / (1 + dr.exp(-v['opacity'])), *radiance
         return v['centre'], scale, v['rotation'], _softplus(v['density'])
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""
-        return bool(dr.all(dr.isfinite(sum(dr.sum(x) if k != 'density' else x for k, x in self.values.items()))))
+        return bool(dr.all(dr.isfinite(sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values()))))
 
     def adam(self, gradients: dict, settings: Settings, iteration: int):
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""

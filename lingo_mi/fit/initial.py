@@ -14,6 +14,7 @@ from ..scan import Scan
 from .device import DeviceState
 from .loop import bounded
 from .model import linearised
+from .points import cuboid, random_points
 from .r2_init import r2_initialise
 from .settings import Settings
 from .state import start
@@ -21,7 +22,7 @@ from .step import Stepper, density_unit
 
 
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
-    """Where a fit of `scan` starts: LINGO's cloud (paper, section III-A and B) or R2-Gaussian's.
+    """Where a fit of `scan` starts: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume.
 
     `info['seconds']` is the whole time, an FDK reconstruction or renderings included. Raises InputError where the scan
     gives no cloud.
@@ -31,7 +32,11 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     rng = np.random.default_rng(seed)
     scan = linearised(scan, settings)
     g, unit = scan.geometry, density_unit(scan, settings)
-    if settings.init == 'r2':
+    if settings.init == 'random':
+        cloud = random_points(g.half, g.nVoxel[2] == 1, settings.n_points, rng)
+    elif settings.init == 'cuboid':
+        cloud = cuboid(g.nVoxel, g.half, settings.cuboid_step)
+    elif settings.init == 'r2':
         volume = fdk(scan) / unit
         cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, rescale=settings.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)

@@ -12,10 +12,10 @@ from ..errors import InputError
 from ..lingo.initialise import InitialCloud
 from ..scan import Scan
 from . import checkpoint
-from .densify import densify
+from .densify import densify, reset_opacity
 from .device import DeviceState
 from .settings import Settings
-from .state import PARAMETERS, State, start
+from .state import State, parameters, start
 from .step import Stepper
 
 
@@ -68,7 +68,8 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0., [], dict(initial.info)
-        state = DeviceState(start(points, initial.spacing, initial.density / stepper.unit, settings))
+        density = None if settings.render == 'alpha' else initial.density / stepper.unit
+        state = DeviceState(start(points, initial.spacing, density, settings))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()
 
@@ -89,9 +90,12 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         order, iteration = rest, iteration + 1
         if (settings.densify_from < iteration < settings.densify_until
                 and iteration % settings.densify_every == 0):
-            state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat))
+            largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
+            state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat, largest))
             if len(state) == 0:
                 raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+        if settings.reset_every and iteration < settings.densify_until and iteration % settings.reset_every == 0:
+            state = DeviceState(reset_opacity(state.host()))
         if iteration in marks:
             dr.sync_thread()
             value = float(loss[0])
@@ -128,9 +132,13 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
 
     The largest scale becomes so small that no Gaussian in the volume can reach the source: beyond it the integral of a
     cone beam's Gaussian is no footprint (see `xray.footprint`). `values_per_gaussian` bounds the number of Gaussians.
-    Raises InputError where the source is in the volume.
+    What is in units of the scene's radius becomes a length. Raises InputError where the source is in the volume.
     """
     g = scan.geometry
+    if settings.render == 'alpha':
+        radius = scene_radius(g)
+        settings = replace(settings, rate_centre=tuple(radius * r for r in settings.rate_centre),
+                           split_size=radius * settings.split_size, prune_size=radius * settings.prune_size)
     if settings.values_per_gaussian > 0:
         most = min(max(int(scan.projections.size / settings.values_per_gaussian), 1), settings.max_gaussians)
         settings = replace(settings, max_gaussians=most, n_points=min(settings.n_points, most))
@@ -144,14 +152,23 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     return replace(settings, scale_max=min(settings.scale_max, largest))
 
 
+def scene_radius(geometry) -> float:
+    """3DGS's unit of length: 1.1 times the largest distance of a source from the mean of all, in the normalised frame.
+
+    1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
+    """
+    frames = geometry.normalised_frames()
+    if frames.parallel:
+        return 1.
+    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.
+
+
 def _same_fit(host, extra, settings, scan, seed, path):
     """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
-    columns = [(group[k], size) for group in (host.values, host.first, host.second) for k, size in PARAMETERS.items()]
-    if not ({'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys()
-            and len(host.gradient) == len(host.seen) == len(host)
-            and all(x.shape == (len(host), size) and np.isfinite(x).all() for x, size in columns)):
-        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again '
+    damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again '
                          'without --resume')
+    if not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys():
+        raise damaged
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     changed = [k for k in now if before.get(k) != now[k] and k != 'checkpoint_seconds']
@@ -162,3 +179,8 @@ def _same_fit(host, extra, settings, scan, seed, path):
     if changed:
         raise InputError(f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
                          'settings, or start again without --resume')
+    shapes = {k: (len(host), size) for k, size in parameters(settings).items()}
+    if not (len(host.gradient) == len(host.seen) == len(host)
+            and all({k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
+                    for group in (host.values, host.first, host.second))):
+        raise damaged

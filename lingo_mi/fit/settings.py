@@ -1,4 +1,4 @@
-"""The settings of a fit and the three recipes: every number named, with its source."""
+"""The settings of a fit and the recipes: every number named, with its source."""
 from __future__ import annotations
 
 import math
@@ -20,8 +20,10 @@ class Settings:
     checkpoint_seconds how often a checkpoint is written
 
     Start
-    init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume)
+    init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume); for alpha compositing 'random' (points in
+                       the volume, as 3DGS where it has no others) or 'cuboid' (X-Gaussian's regular grid)
     n_points           Gaussians to start with (paper: 50k)
+    cuboid_step        voxels between the points of `cuboid` (X-Gaussian: 8)
     high_fraction, low_factor, occupancy_voxels, V_S, misses, outside, init_density
                        of `lingo`: see `lingo_mi.lingo.initialise.Settings`; the density 'fdk' becomes 'lsq' where FDK
                        cannot reconstruct (poses off the circle, invalid pixels)
@@ -31,6 +33,13 @@ class Settings:
                        constants and the bounds then mean the same for any object; R2 expects volumes in [0, 1]
 
     Forward model
+    render             'integral': pixels are line integrals; or 'alpha': grey images, the projections over their maximum, are
+                       composited front to back from opacities and radiances (3DGS, see `lingo_mi.xray.alpha`), which
+                       makes no volume. For the latter `rate_centre`, `split_size` and `prune_size` are in units of the
+                       scene's radius (see `lingo_mi.fit.loop.scene_radius`)
+    sh_degree          of `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0 for radiance that is the
+                       same in all directions (X-Gaussian)
+    sh_every           iterations after which another degree joins in (3DGS: 1000)
     extent             cut-off in standard deviations (R2: 3)
     effects            'model': where a scan has effects (spectrum, focal spot, blur, dead pixels), the cloud is seen through
                        them, since a scene that names them says how its data came about; or 'ignore': projections are
@@ -45,6 +54,8 @@ class Settings:
 
     Adam
     rate_centre, rate_density, rate_scale, rate_rotation
+    rate_opacity, rate_radiance, rate_harmonics
+                       of `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025, and a twentieth of that, none of which fall)
     rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;
                        0, 0 leaves the poses alone (see `lingo_mi.fit.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
@@ -55,7 +66,11 @@ class Settings:
     densify_threshold  mean gradient of the projected centre, in normalised device units (5e-5)
     split_size         Gaussians with a larger standard deviation split, others clone (R2: 0.1 of the longest side)
     split_keeps_mass   whether the halves of a split weigh what their parent did (R2: no)
-    prune_density      Gaussians below vanish, as do those outside the volume (1e-5)
+    prune_density      Gaussians below vanish, as do those outside the volume (1e-5); of `alpha` an opacity, and Gaussians
+                       outside stay (3DGS: 0.005)
+    reset_every        of `alpha`: iterations after which opacities are lowered to 0.01, while densification lasts (3DGS: 3000);
+                       0: never
+    prune_size         of `alpha`: Gaussians with a larger standard deviation vanish after the first reset (3DGS: 0.1)
     max_gaussians      no densification beyond (500k)
     values_per_gaussian
                        measured values that there must be for each Gaussian (own; 0: any number): bounds the Gaussians at
@@ -72,6 +87,7 @@ class Settings:
     checkpoint_seconds: float = 30.
     init: str = 'r2'
     n_points: int = 50_000
+    cuboid_step: int = 8
     high_fraction: float = .25
     low_factor: float = .1
     occupancy_voxels: int = 16
@@ -82,6 +98,9 @@ class Settings:
     fdk_threshold: float = .05
     fdk_rescale: float = .15
     normalise: bool = False
+    render: str = 'integral'
+    sh_degree: int = 3
+    sh_every: int = 1000
     extent: float = 3.
     effects: str = 'model'
     lambda_ssim: float = .25
@@ -92,6 +111,9 @@ class Settings:
     rate_density: tuple[float, float] = (1e-2, 1e-3)
     rate_scale: tuple[float, float] = (5e-3, 5e-4)
     rate_rotation: tuple[float, float] = (1e-3, 1e-4)
+    rate_opacity: tuple[float, float] = (5e-2, 5e-2)
+    rate_radiance: tuple[float, float] = (2.5e-3, 2.5e-3)
+    rate_harmonics: tuple[float, float] = (1.25e-4, 1.25e-4)
     rate_pose: tuple[float, float] = (0., 0.)
     beta1: float = .9
     beta2: float = .999
@@ -103,6 +125,8 @@ class Settings:
     split_size: float = .2
     split_keeps_mass: bool = False
     prune_density: float = 1e-5
+    reset_every: int = 0
+    prune_size: float = .1
     max_gaussians: int = 500_000
     values_per_gaussian: float = 0.
     scale_min: float = 1e-3
@@ -121,7 +145,16 @@ class Settings:
         require(0 <= self.beta1 < 1 and 0 <= self.beta2 < 1, 'beta1 and beta2 must lie in [0, 1)')
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
-        require(self.init in ('lingo', 'r2'), f"init is 'lingo' or 'r2', not {self.init!r}")
+        require(self.render in ('integral', 'alpha'), f"render is 'integral' or 'alpha', not {self.render!r}")
+        inits = ('random', 'cuboid') if self.render == 'alpha' else ('lingo', 'r2')
+        require(self.init in inits, f"init is {inits[0]!r} or {inits[1]!r} with render={self.render}, not {self.init!r}")
+        require(self.render == 'integral' or self.normalise and self.lambda_tv == 0 and self.effects == 'ignore',
+                'render=alpha composites grey images and knows no densities: it needs normalise=true, lambda_tv=0 and '
+                'effects=ignore, as in the method 3dgs')
+        require(0 <= self.sh_degree <= 3, f'sh_degree is from 0 to 3, not {self.sh_degree}')
+        require(self.sh_every >= 1, f'sh_every must be at least 1, not {self.sh_every}')
+        require(self.cuboid_step >= 1, f'cuboid_step must be at least 1, not {self.cuboid_step}')
+        require(self.reset_every >= 0, f'reset_every must not be negative, not {self.reset_every}')
         require(self.outside in ('invalid', 'ignore', 'auto'),
                 f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
@@ -134,14 +167,15 @@ class Settings:
         require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
-        for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'):
+        for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation', 'rate_opacity', 'rate_radiance',
+                     'rate_harmonics'):
             rate = getattr(self, name)
             require(len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}')
         require(len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
                 f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}')
 
     def rate(self, name: str, iteration: int) -> float:
-        """Adam's step size for 'centre', 'density', 'scale', 'rotation' or 'pose' at an iteration, counted from 0."""
+        """Adam's step size for a parameter (see `lingo_mi.fit.state`) or 'pose' at an iteration, counted from 0."""
         first, last = getattr(self, f'rate_{name}')
         share = min(iteration / max(self.decay_steps or self.iterations, 1), 1.)
         return first ** (1 - share) * last ** share
@@ -189,4 +223,19 @@ FAST = Settings(
     beta1=.8, beta2=.95, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     split_keeps_mass=True, values_per_gaussian=20)
 
-METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2}
+# Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM TOG 42 (2023), and its released settings, on
+# grey images. Its loss 0.8 L1 + 0.2 (1 - SSIM) is 0.8 times the one here, so that a gradient of 2e-4 there is 2.5e-4 here. Its
+# scales have no bounds: these keep them where float32 and the footprints are sound.
+GS3D = Settings(
+    render='alpha', init='random', n_points=100_000, normalise=True, effects='ignore', extent=3.33, lambda_tv=0.,
+    rate_centre=(1.6e-4, 1.6e-6), rate_scale=(5e-3, 5e-3), rate_rotation=(1e-3, 1e-3),
+    densify_threshold=2.5e-4, split_size=.01, prune_density=5e-3, reset_every=3000, scale_min=1e-5)
+# Cai et al., "Radiative Gaussian Splatting for Efficient X-ray Novel View Synthesis", ECCV 2024: radiance that is the same in
+# all directions, the cuboid to start from, and the released settings of its foot scan. Its threshold is 2.7e-5 of that loss.
+XGAUSSIAN = replace(
+    GS3D, init='cuboid', sh_degree=0, iterations=20_000, decay_steps=20_000, rate_centre=(1.79e-4, 1.79e-6),
+    rate_radiance=(2e-3, 2e-3), rate_opacity=(6e-3, 6e-3), densify_until=8000, densify_every=800,
+    densify_threshold=3.375e-5, split_size=.008, reset_every=1200)
+
+METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2, '3dgs': GS3D, 'xgaussian': XGAUSSIAN}
+VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.render == 'integral')  # those that make a volume

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import operator
 from dataclasses import replace
 
@@ -12,8 +13,10 @@ import numpy as np
 from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Scan
+from ..xray.alpha import composite, flatten
 from ..xray.footprint import project
 from ..xray.frame import View, vector64
+from ..xray.radiance import seen
 from ..xray.splat import splat
 from ..xray.voxelize import Grid, voxelize
 from . import losses
@@ -98,6 +101,10 @@ class Stepper:
         if self.flat:
             gradients['centre'].z, gradients['scale'].z = 0, 0
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
+        if 'harmonics' in gradients:  # those of a degree that has not joined in stay at zero
+            joined = [dr.opaque(mi.Float, float((iteration + 1) // s.sh_every >= k)) for k in range(1, s.sh_degree + 1)]
+            for i in range(len(gradients['harmonics'])):
+                gradients['harmonics'][i] *= joined[math.isqrt(i + 1) - 1]
         state.adam(gradients, s, iteration)
         return total
 
@@ -113,12 +120,12 @@ class Stepper:
 
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
         """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
-        the expected signal where the fit models effects."""
+        the expected signal where the fit models effects. Grey images of alpha compositing are taken for line integrals."""
         frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
         def integrals(rays):
-            return self._integrals(project(*gaussians, rays, self.settings.extent), rays, share)
+            return self._integrals(self._project(gaussians, rays), rays, share)
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
@@ -128,8 +135,13 @@ class Stepper:
                 progress(i + 1, len(geometry))
         return out * np.float32(self.unit / geometry.scale)
 
-    def volume(self, state: DeviceState) -> np.ndarray:
-        """The cloud's density at the voxel centres of the scan's grid, float32 [x, y, z]."""
+    def volume(self, state: DeviceState) -> np.ndarray | None:
+        """The cloud's density at the voxel centres of the scan's grid, float32 [x, y, z].
+
+        None for alpha compositing: opacities and radiances are no attenuation.
+        """
+        if self.settings.render == 'alpha':
+            return None
         g = self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
         return grid.volume(voxelize(*state.gaussians(self.settings), grid, self.settings.extent)) * np.float32(self.unit)
@@ -152,8 +164,18 @@ class Stepper:
         if 'share' in arrays:
             self.share = uploaded(arrays['share'])
 
+    def _project(self, gaussians, rays):
+        """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
+        if self.settings.render == 'alpha':
+            centre, scale, rotation, opacity, *radiance = gaussians
+            return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
+        return project(*gaussians, rays, self.settings.extent)
+
     def _integrals(self, footprints, rays, share):
-        """Line integrals along the rays of a view, a list of Float: of the cloud, or of each of its two materials."""
+        """Line integrals along the rays of a view, a list of Float: of the cloud, or of each of its two materials; or the grey
+        image that alpha compositing takes for them."""
+        if self.settings.render == 'alpha':
+            return [composite(footprints, rays.height, rays.width)]
         amplitude, *others = footprints.values
         parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
         return [splat(replace(footprints, values=(part, *others)), rays.height, rays.width, self.settings.extent)
@@ -165,7 +187,7 @@ class Stepper:
         bundles = []  # of rays: one, or all those that the model takes a mean over
 
         def integrals(rays):
-            footprints = project(*gaussians, rays, s.extent)
+            footprints = self._project(gaussians, rays)
             leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
             bundles.append((footprints, leaf))
             return self._integrals(replace(footprints, values=leaf), rays, self.share)
@@ -182,7 +204,7 @@ class Stepper:
         with dr.suspend_grad():
             norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
             state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
-            state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
+            state.seen += dr.select(footprints.seen, 1., 0.)
         for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
             _pass_on(leaf, footprints.values, flags)
             _evaluate(gaussians)

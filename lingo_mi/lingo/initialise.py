@@ -21,13 +21,13 @@ class InitialCloud:
     """What a fit starts from, in the normalised frame.
 
     points   float64 [N, 3]
-    density  float64 [N], value at the centre, in units of the volume's density
+    density  float64 [N], value at the centre, in units of the volume's density; None for a cloud to be composited
     spacing  float64 [N], suggested standard deviation: rms distance to the three nearest neighbours
     info     how it came about (numbers and strings only)
     """
 
     points: np.ndarray
-    density: np.ndarray
+    density: np.ndarray | None
     spacing: np.ndarray
     info: dict = field(default_factory=dict, compare=False)
 

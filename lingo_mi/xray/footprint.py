@@ -62,6 +62,11 @@ class Footprints:
     area: object
     straddles: object
 
+    @property
+    def seen(self):
+        """Whether a Gaussian has pixels in the image, Bool [N]."""
+        return self.row_end > self.row_begin
+
 
 def rotate_inverse(q, v):
     """R^T v for the unit quaternion q = (x, y, z, w), a 4-vector (`mi.Quaternion4f` would multiply as one)."""
