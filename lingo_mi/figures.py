@@ -91,7 +91,7 @@ class Section:
 def sections(data) -> list[Section]:
     """The sections for which `data` has content, top to bottom."""
     out = []
-    single = len(planes(data.volume.shape)) == 1
+    single = len(planes(data.shape)) == 1
     compared = data.truth is not None
     caption = ('The slice of the fan beam' if single else 'Slices through the object at its richest, z up')
     caption += ', in mm. Grey is density in 1/mm, white is dense. '
@@ -100,7 +100,8 @@ def sections(data) -> list[Section]:
                     'truth: red is too dense, blue too thin.')
     else:
         caption += 'This scan has no known true volume to compare with.'
-    out.append(Section('Slices', draw_slices, lambda width: _slices_height(data, width), caption, single))
+    if data.volume is not None:
+        out.append(Section('Slices', draw_slices, lambda width: _slices_height(data, width), caption, single))
     if data.views is not None:
         thin = data.views.shape[1] == 1
         caption = ('Views the fit has never seen, as line integrals ln(I0/I), over the detector in mm from '
@@ -111,9 +112,11 @@ def sections(data) -> list[Section]:
         out.append(Section('Held-out views', draw_views, lambda width: _views_height(data, width), caption,
                            single))
     if data.cloud_centres is not None and len(data.cloud_centres):
-        out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width),
-                           'Centres of the Gaussians seen along an axis, in mm, coloured by the density at '
-                           'their centre; the densest are drawn last. The box is the reconstructed volume.'))
+        caption = (f'Centres of the Gaussians seen along an axis, in mm, coloured by {data.cloud_unit}; the largest are drawn '
+                   'last. The box is the volume.')
+        if data.volume is None:
+            caption += ' Opacities and radiances are no attenuation: this cloud makes no volume, and no scene renders it.'
+        out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width), caption))
     if any(len(series(data.history, 'iteration', y)[0]) for y in ('loss', 'psnr_2d', 'psnr_3d', 'gaussians')):
         out.append(Section('Convergence', draw_curves, lambda width: 5.2,
                            'Loss, quality and number of Gaussians against iterations (left) and against '
@@ -123,7 +126,7 @@ def sections(data) -> list[Section]:
 
 def draw_slices(fig, data):
     """Orthogonal slices: rows reconstruction, truth, difference; a single-slice volume in one row."""
-    shape, axes = data.volume.shape, planes(data.volume.shape)
+    shape, axes = data.shape, planes(data.shape)
     reference = data.volume if data.truth is None else data.truth
     index = {axis: richest(reference, axis) for axis in axes}
     kinds = {'Reconstruction': data.volume}
@@ -232,7 +235,7 @@ def draw_cloud(fig, data):
     # A few very dense Gaussians would leave the rest one colour.
     top = float(np.percentile(density, 99)) or None
     for ax, axis in zip(grid, axes):
-        extent = plane_extent(data.volume.shape, data.spacing, data.centre, axis)
+        extent = plane_extent(data.shape, data.spacing, data.centre, axis)
         name, across, up, _ = PLANES[axis]
         a, b = (i for i in range(3) if i != axis)
         drawn = ax.scatter(centres[:, a], centres[:, b], c=density, s=np.clip(8e4 / len(centres), 3, 25),
@@ -244,7 +247,7 @@ def draw_cloud(fig, data):
         ax.plot([extent[i] for i in (0, 1, 1, 0, 0)], [extent[i] for i in (2, 2, 3, 3, 2)],
                 color='#777777', lw=.8)
         _ticks(ax)
-    _bar(fig, drawn, list(grid), 'density at the centre [1/mm]')
+    _bar(fig, drawn, list(grid), data.cloud_unit)
 
 
 def draw_curves(fig, data):
@@ -354,7 +357,7 @@ def _spread(total, n):
 
 
 def _slices_height(data, width):
-    shape = data.volume.shape
+    shape = data.shape
     extents = [plane_extent(shape, data.spacing, data.centre, axis) for axis in planes(shape)]
     wide, high = sum(e[1] - e[0] for e in extents), max(e[3] - e[2] for e in extents)
     kinds = 1 if data.truth is None else 3
@@ -374,11 +377,11 @@ def _views_height(data, width):
 
 
 def _cloud_planes(data):
-    return planes(data.volume.shape)[:2]
+    return planes(data.shape)[:2]
 
 
 def _cloud_height(data, width):
     axes = _cloud_planes(data)
-    extents = [plane_extent(data.volume.shape, data.spacing, data.centre, axis) for axis in axes]
+    extents = [plane_extent(data.shape, data.spacing, data.centre, axis) for axis in axes]
     ratio = max((e[3] - e[2]) / (e[1] - e[0]) for e in extents)
     return float(np.clip((width - 2.6) / len(axes) * ratio, 2.5, 6)) + .9

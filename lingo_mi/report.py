@@ -40,13 +40,14 @@ HEADLINE = {
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """What a report shows. Only `title`, `metrics`, `volume` and `spacing` are needed.
+    """What a report shows. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
 
     title           of the report
     metrics         the numbers, by the keys of QUALITY and SETTINGS; None and NaN read as 'n/a', other scalar
                     entries join the settings. `history` is a list of dicts with `iteration`, `seconds`,
                     `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
-    volume          [x, y, z] density, 1/mm
+    volume          [x, y, z] density, 1/mm; None where the cloud makes none
+    shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
     centre          of the volume, (x, y, z), mm
@@ -55,7 +56,7 @@ class ReportData:
     views_angles    [n] degrees
     pixel           size of a detector pixel, (v, u), mm
     cloud_centres   [N, 3] centres of the Gaussians, mm
-    cloud_density   [N] density at their centres, 1/mm
+    cloud_density   [N] density at their centres, 1/mm, or what `cloud_unit` names instead
     command         the command line that makes this result again
 
     Raises InputError where shapes do not fit or an image holds NaN or infinity.
@@ -63,9 +64,10 @@ class ReportData:
 
     title: str
     metrics: dict
-    volume: np.ndarray
+    volume: np.ndarray | None
     spacing: tuple[float, float, float]
     truth: np.ndarray | None = None
+    shape: tuple[int, int, int] | None = None
     centre: tuple[float, float, float] = (0., 0., 0.)
     views: np.ndarray | None = None
     views_truth: np.ndarray | None = None
@@ -73,6 +75,7 @@ class ReportData:
     pixel: tuple[float, float] = (1., 1.)
     cloud_centres: np.ndarray | None = None
     cloud_density: np.ndarray | None = None
+    cloud_unit: str = 'density at the centre [1/mm]'
     command: str = ''
     history: list[dict] = field(init=False)
 
@@ -93,8 +96,12 @@ class ReportData:
                 raise InputError(f'{name} of the report contains NaN or infinity')
             object.__setattr__(self, name, value)
 
+        if self.volume is None and self.shape is None:
+            raise InputError('the report needs a volume, or its shape')
         fix('volume', (None,) * 3)
-        fix('truth', self.volume.shape)
+        if self.volume is not None:
+            object.__setattr__(self, 'shape', self.volume.shape)
+            fix('truth', self.volume.shape)
         for name, n in (('spacing', 3), ('centre', 3), ('pixel', 2)):
             fix(name, (n,))
         fix('views', (None,) * 3)
@@ -175,7 +182,7 @@ def _page(data: ReportData) -> str:
     metrics = data.metrics
     quality = [(label, _value(key, metrics[key])) for key, (label, *_) in QUALITY.items() if key in metrics]
     settings = [(label, _value(key, metrics[key])) for key, label in SETTINGS.items() if key in metrics]
-    size = ' x '.join(str(n) for n in data.volume.shape)
+    size = ' x '.join(str(n) for n in data.shape)
     settings.append(('Volume', f'{size} voxels of {" x ".join(f"{s:.4g}" for s in data.spacing)} mm'))
     known = {*QUALITY, *SETTINGS, 'history'}
     settings += [(key, _value(key, value)) for key, value in metrics.items()

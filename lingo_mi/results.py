@@ -14,11 +14,11 @@ import numpy as np
 
 from . import metrics
 from .files.images import write_exr
-from .files.ply import write_ply
+from .files.ply import write_ply, write_radiance_ply
 from .files.volumes import first_voxel, write_volume
 from .fit.device import DeviceState
 from .fit.loop import Fitted
-from .fit.state import activate
+from .fit.state import activate, harmonics
 from .lingo.ipsd import ipsd, reverse_distance
 from .report import ReportData, write_report
 from .scan import Dataset
@@ -37,8 +37,8 @@ def quick_measure(dataset: Dataset, most: int = 4):
         if test is not None and len(test):
             rendered = _comparable(stepper.render(state, test.geometry), test)
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
-        if dataset.volume is not None:
-            out['psnr_3d'] = _number(metrics.psnr_3d(stepper.volume(state), dataset.volume))
+        if dataset.volume is not None and (volume := stepper.volume(state)) is not None:
+            out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
         return out
     return measure
 
@@ -49,26 +49,33 @@ def _comparable(rendered, test):
 
 
 def world_cloud(fitted: Fitted, geometry):
-    """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities [N]."""
-    centre, scale, rotation, density = activate(fitted.state, fitted.settings)
-    return (centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation,
-            density * fitted.stepper.unit)
+    """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities or opacities [N]."""
+    centre, scale, rotation, amount = activate(fitted.state, fitted.settings)
+    unit = fitted.stepper.unit if fitted.settings.render == 'integral' else 1
+    return centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation, amount * unit
 
 
 def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, seed: int,
                   command: str) -> dict:
     """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
+
+    A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
     """
     geometry, test = dataset.train.geometry, dataset.test
     state = DeviceState(fitted.state)
     volume = fitted.stepper.volume(state)
-    write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
     cloud = world_cloud(fitted, geometry)
-    share = fitted.stepper.shares(state)
-    write_ply(folder / 'gaussians.ply', *cloud, None if share is None else share.numpy())
-    effects = dataset.train.effects if fitted.stepper.model is not None else None
-    write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent, effects)
+    if volume is None:
+        for stale in 'volume.nii.gz', 'result.xml':
+            (folder / stale).unlink(missing_ok=True)
+        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state))
+    else:
+        write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+        share = fitted.stepper.shares(state)
+        write_ply(folder / 'gaussians.ply', *cloud, None if share is None else share.numpy())
+        effects = dataset.train.effects if fitted.stepper.model is not None else None
+        write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent, effects)
     rendered = None
     if test is not None and len(test):
         rendered = fitted.stepper.render(state, test.geometry)
@@ -84,10 +91,12 @@ def write_results(folder: Path, fitted: Fitted, dataset: Dataset, *, title: str,
         angles=_degrees(geometry), test_angles=_degrees(test.geometry) if rendered is not None else [],
         versions=versions())
     report = ReportData(
-        title=title, metrics=measured, volume=volume, truth=dataset.volume, spacing=geometry.dVoxel,
+        title=title, metrics=measured, volume=volume, truth=None if volume is None else dataset.volume,
+        shape=geometry.nVoxel, spacing=geometry.dVoxel,
         centre=geometry.offOrigin, views=rendered, views_truth=test.projections if rendered is not None else None,
         views_angles=np.degrees(test.geometry.angles) if rendered is not None else None, pixel=geometry.dDetector,
-        cloud_centres=cloud[0], cloud_density=cloud[3], command=command)
+        cloud_centres=cloud[0], cloud_density=cloud[3],
+        cloud_unit='opacity' if volume is None else 'density at the centre [1/mm]', command=command)
     write_report(folder, report)
     temporary = folder / (METRICS + '.partial')
     temporary.write_text(json.dumps(measured, indent=1, default=np.generic.item) + '\n', encoding='utf-8')

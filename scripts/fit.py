@@ -9,7 +9,7 @@
 The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
 measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a
 volume in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and
-metrics.json.
+metrics.json. The baselines 3dgs and xgaussian make neither volume nor scene.
 """
 import argparse
 import shlex
@@ -26,10 +26,12 @@ def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument('--method', choices=METHODS, default='fast',
-                   help='recipe: fast (default), or the published lingo and r2')
+                   help='recipe: fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
+                   'composite opacities and make views but no volume')
     p.add_argument('--views', type=int, default=0, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
-    p.add_argument('--init', choices=('lingo', 'r2'), help='initial cloud: Otsu masks (lingo) or an FDK volume (r2)')
+    p.add_argument('--init', choices=('lingo', 'r2', 'random', 'cuboid'), help='initial cloud: Otsu masks (lingo) or an FDK '
+                   'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid)')
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
     p.add_argument('--force', action='store_true', help='replace an earlier result')
@@ -80,7 +82,8 @@ def main():
     result = write_results(folder, fit, scan, title=args.volume or args.projections or scene.name, method=args.method,
                            seed=args.seed, command='python ' + shlex.join(sys.argv))
     print(summary(result))
-    print(f'{folder}/: report.html, volume.nii.gz, gaussians.ply, result.xml, metrics.json')
+    written = ('report.html', 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'metrics.json')
+    print(f'{folder}/: {", ".join(name for name in written if (folder / name).exists())}')
 
 
 if __name__ == '__main__':

@@ -9,7 +9,7 @@ A method may be followed by settings that differ (`METHOD:name=value,name=value`
 exchanged alone.
 
 Runs scripts/fit.py for each combination that has no result yet in --out (an interrupted one goes on where it stopped), then
-draws all histories and prints a Markdown table. --iterations is for lingo and r2; fast keeps its own number.
+draws all histories and prints a Markdown table. --iterations is for all but fast, which keeps its own number.
 """
 import argparse
 import json
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from lingo_mi.cli import guard
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.settings import METHODS, VOLUMETRIC
 
 COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'), ('ssim_2d', 'SSIM', '{:.4f}'),
            ('psnr_3d', 'volume, dB', '{:.2f}'), ('ssim_3d', 'SSIM 3D', '{:.4f}'), ('ipsd', 'IPSD', '{:.4f}'),
@@ -40,7 +40,8 @@ def method(text):
 def arguments():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path)
-    p.add_argument('--methods', nargs='+', type=method, default=list(METHODS), metavar='METHOD[:name=value,...]')
+    p.add_argument('--methods', nargs='+', type=method, default=list(VOLUMETRIC), metavar='METHOD[:name=value,...]',
+                   help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})')
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)
     p.add_argument('-D', dest='define', action='append', default=[], metavar='name=value', help='for every fit, see fit.py')
@@ -78,6 +79,8 @@ def draw(results, figure):
         for row, key in enumerate(('psnr_2d', 'psnr_3d')):
             axis = axes[row, scenes.index(scene)]
             points = [(e['seconds'], e[key]) for e in metrics['history'] if e.get(key) is not None]
+            if not points:  # 3dgs and xgaussian make no volume
+                continue
             axis.semilogx(*zip(*points), '.-', label=f'{method}, {metrics["iterations"]} iterations')
             axis.set(title=scene if row == 0 else None, xlabel='time in steps [s]',
                      ylabel=f'PSNR, {"held-out views" if row == 0 else "volume"} [dB]')

@@ -9,6 +9,8 @@ attribute `density`. The plugin takes a file for a 3DGS cloud, and would misread
 directly precedes `scale_0`: here `density` does, so f_dc and opacity become plain attributes. They are there
 for viewers alone: mid-grey, and the logit of the opacity of a ray through the centre, 1 - exp(-density sqrt(2
 pi) s) with s the geometric mean of the scales. `read_ply` ignores them.
+
+Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes exactly the columns of 3DGS.
 """
 from __future__ import annotations
 
@@ -20,23 +22,24 @@ from .paths import reading, replacing
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'
 _ROT = 'rot_0', 'rot_1', 'rot_2', 'rot_3'
+_REST = 15  # coefficients of the harmonics of degrees 1 to 3, of each of three colours
 _PROPERTIES = (*_CENTRE, 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'density', *_SCALE, *_ROT)
 _TYPES = {'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1', 'short': '<i2', 'int16': '<i2',
           'ushort': '<u2', 'uint16': '<u2', 'int': '<i4', 'int32': '<i4', 'uint': '<u4', 'uint32': '<u4',
           'float': '<f4', 'float32': '<f4', 'double': '<f8', 'float64': '<f8'}
 
 
-def _check(where, centres, scales, quaternions, density):
+def _check(where, centres, scales, quaternions, density, name='density'):
     n = len(density)
     if n == 0:
         raise InputError(f'{where}: the cloud is empty; at least one Gaussian is needed')
-    for name, array, shape in (('centres', centres, (n, 3)), ('scales', scales, (n, 3)),
-                               ('quaternions', quaternions, (n, 4)), ('density', density, (n,))):
+    for what, array, shape in (('centres', centres, (n, 3)), ('scales', scales, (n, 3)),
+                               ('quaternions', quaternions, (n, 4)), (name, density, (n,))):
         if array.shape != shape:
-            raise InputError(f'{where}: {name} must have the shape {shape}, not {array.shape}')
+            raise InputError(f'{where}: {what} must have the shape {shape}, not {array.shape}')
         if not np.isfinite(array).all():
             bad = int(np.argwhere(~np.isfinite(array))[0, 0])
-            raise InputError(f'{where}: {name} of Gaussian {bad} is not finite; remove that Gaussian')
+            raise InputError(f'{where}: {what} of Gaussian {bad} is not finite; remove that Gaussian')
     if not (scales > 0).all():
         raise InputError(f'{where}: the scale of Gaussian {int(np.argwhere(scales <= 0)[0, 0])} is not '
                          'positive')
@@ -70,6 +73,29 @@ def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
     table = np.concatenate([centres, zeros, opacity[:, None], *more, density[:, None], np.log(scales),
                             quaternions[:, [3, 0, 1, 2]]], 1)
     names = [p for name in _PROPERTIES for p in (['second'] if more and name == 'density' else []) + [name]]
+    _write(path, names, table)
+
+
+def write_radiance_ply(path, centres, scales, quaternions, opacity, radiance, harmonics) -> None:
+    """Writes a grey cloud as 3DGS does, for its viewers, whole or not at all.
+
+    centres, scales, quaternions as for `write_ply`; opacity [N] in (0, 1); radiance [N] and harmonics [N, 0, 3, 8 or 15],
+    coefficients of the spherical harmonics of degree 0 and of the higher ones, to which viewers add 1/2. Raises InputError as
+    `write_ply` does.
+    """
+    centres, scales, quaternions, opacity = (np.asarray(a, float) for a in (centres, scales, quaternions, opacity))
+    _check(path, centres, scales, quaternions, opacity, 'opacity')
+    quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    rest = np.zeros((len(opacity), _REST))
+    rest[:, :np.shape(harmonics)[1]] = harmonics
+    names = [*_CENTRE, 'nx', 'ny', 'nz', *(f'f_dc_{i}' for i in range(3)), *(f'f_rest_{i}' for i in range(3 * _REST)),
+             'opacity', *_SCALE, *_ROT]
+    _write(path, names, np.concatenate([
+        centres, np.zeros((len(opacity), 3)), np.repeat(np.reshape(radiance, (-1, 1)), 3, 1), np.tile(rest, 3),
+        (np.log(opacity) - np.log1p(-opacity))[:, None], np.log(scales), quaternions[:, [3, 0, 1, 2]]], 1))
+
+
+def _write(path, names, table):
     header = ''.join(['ply\nformat binary_little_endian 1.0\n', f'element vertex {len(table)}\n',
                       *(f'property float {name}\n' for name in names), 'end_header\n'])
     with replacing(path) as temporary, open(temporary, 'wb') as stream:

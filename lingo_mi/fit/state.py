@@ -79,6 +79,17 @@ def activate(state: State, settings: Settings):
     return v['centre'], scale, rotation, amount
 
 
+def harmonics(state: State):
+    """Coefficients of the radiance's spherical harmonics: of degree 0 [N], to whose harmonic 1/2 is added, and higher [N, M].
+
+    Radiance that is the same in all directions is a sigmoid of its raw value (see `xray.radiance`).
+    """
+    raw = state.values['radiance'][:, 0].astype(float)
+    if 'harmonics' in state.values:
+        return raw, state.values['harmonics']
+    return np.sqrt(4 * np.pi) * (1 / (1 + np.exp(-raw)) - .5), np.zeros((len(raw), 0))
+
+
 def softplus(x):
     """ln(1 + e^x), without overflow."""
     return np.logaddexp(0., x)
