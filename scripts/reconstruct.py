@@ -29,7 +29,8 @@ def arguments():
     p.add_argument('--algorithm', choices=ALGORITHMS, default='fdk', help='(default: fdk)')
     p.add_argument('--views', type=int, default=0, metavar='N', help='use N evenly spaced views (default: all); with '
                    '--complete: measured and rendered ones together')
-    p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered')
+    p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered; '
+                   'checkpoint.npz of one by 3dgs or xgaussian')
     p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -95,6 +96,8 @@ def main():
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     cloud = load_cloud(args.complete) if args.complete else None
+    if args.algorithm == 'voxelize' and not hasattr(cloud, 'gaussians'):
+        raise InputError(f'{args.complete}: opacities and radiances make no volume; take another --algorithm')
     dataset = read_input(args, scene, 0 if args.complete else args.views)
     scan = dataset.train
     began = time.monotonic()

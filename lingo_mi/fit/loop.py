@@ -54,6 +54,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
     resume     go on from `path`: the same steps as without the interruption
     """
+    from ..plugins.ct_scanner import describe
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
@@ -79,7 +80,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
             checkpoint.save(path, state.host(), dict(
                 seed=seed, rng=rng.bit_generator.state, iteration=iteration,
                 seconds=seconds + time.perf_counter() - clock, history=history, info=info,
-                settings=asdict(settings), views=len(scan)),
+                settings=asdict(settings), views=len(scan), scanner=describe(scan.geometry), unit=stepper.unit),
                 dict(initial=points, order=np.array(order, int)) | stepper.arrays())
 
     while iteration < settings.iterations:

@@ -4,16 +4,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
 from ..effects.forward import Effects, find_effects
 from ..errors import InputError
+from ..fit import checkpoint
+from ..fit.device import DeviceState
+from ..fit.settings import Settings
+from ..fit.state import State
+from ..fit.step import Stepper
 from ..geometry import Geometry
 from ..scan import Dataset, Scan
 from ..scanning import load_scene, render_objects, render_with
 from ..xray.objects import Ellipsoids, find_objects
 from .circle import require_circle
 from .fdk import gaps
+
+WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or xgaussian'
 
 
 @dataclass(frozen=True)
@@ -31,18 +39,55 @@ class FittedCloud:
     extent: float
     effects: Effects | None
 
+    def render(self, geometry: Geometry) -> np.ndarray:
+        """Line integrals in any views, float32 [view, v, u]."""
+        return render_objects([self.gaussians], geometry, self.extent)
 
-def load_cloud(path) -> FittedCloud:
-    """The cloud of a scene such as a fit's result.xml.
 
-    Raises InputError where the scene holds anything else.
+@dataclass(frozen=True)
+class CompositedCloud:
+    """A cloud as a fit by alpha compositing left it, which no scene renders.
+
+    state, settings   of the fit
+    geometry          of the scan that it was fitted to
+    unit              what the fit counts as 1 (`fit.step.density_unit`)
     """
+
+    state: State
+    settings: Settings
+    geometry: Geometry
+    unit: float
+    effects = None
+
+    def render(self, geometry: Geometry) -> np.ndarray:
+        """Composited images, taken for line integrals, in any views, float32 [view, v, u]."""
+        blank = Scan(geometry.subset([0]), np.zeros((1, *geometry.nDetector)))
+        return Stepper(blank, self.settings, self.unit).render(DeviceState(self.state), geometry)
+
+
+def load_cloud(path) -> FittedCloud | CompositedCloud:
+    """The cloud of a scene such as a fit's result.xml, or of the checkpoint (.npz) of a fit by alpha compositing.
+
+    Raises InputError where there is anything else.
+    """
+    if Path(path).suffix == '.npz':
+        return _composited(path)
     loaded = load_scene(Path(path))
     objects = find_objects(loaded.scene)
     quality = getattr(loaded.scene.integrator(), 'quality', None)
     if quality is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
-        raise InputError(f"{path}: is no cloud of Gaussians; give the result.xml of a fit")
+        raise InputError(f'{path}: is no cloud of Gaussians; {WANTED}')
     return FittedCloud(objects[0], loaded.scanner.geometry, quality.extent, find_effects(loaded.scene, loaded.scanner))
+
+
+def _composited(path):
+    if not Path(path).exists():
+        raise InputError(f'{path}: no such file; {WANTED}')
+    state, extra, _ = checkpoint.load(path)
+    if extra.get('settings', {}).get('render') != 'alpha':
+        raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
+    settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()})
+    return CompositedCloud(state, settings, mi.load_dict(extra['scanner']).geometry, extra['unit'])
 
 
 def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
@@ -70,7 +115,7 @@ def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
     return np.concatenate([angles[i] + g * np.arange(1, k) / k for i, g, k in zip(order, gap, parts)])
 
 
-def without_effects(scan: Scan, cloud: FittedCloud) -> Scan:
+def without_effects(scan: Scan, cloud: FittedCloud | CompositedCloud) -> Scan:
     """The line integrals of measured views, at the reference energy of the effects that the cloud's fit has modelled.
 
     Linearised, plus what linearising leaves of the effects in the cloud's own views: blur, and the second material, corrected
@@ -79,14 +124,14 @@ def without_effects(scan: Scan, cloud: FittedCloud) -> Scan:
     effects = cloud.effects
     if effects is None:
         return scan
-    clean = render_objects([cloud.gaussians], scan.geometry, cloud.extent)
+    clean = cloud.render(scan.geometry)
     seen = render_with(effects, [cloud.gaussians], scan.geometry, np.zeros(len(scan)), 0, cloud.extent)
     left = effects.linearised(Scan(scan.geometry, seen)).projections - clean
     linear = effects.linearised(scan)
     return replace(linear, projections=linear.projections - left)
 
 
-def complete(scan: Scan, cloud: FittedCloud, views: int) -> Scan:
+def complete(scan: Scan, cloud: FittedCloud | CompositedCloud, views: int) -> Scan:
     """A scan of `views` views: the measured ones, `without_effects`, and those between them rendered from the cloud.
 
     Raises InputError where fewer views are asked for than were measured, and for a scan that is no circle about z.
@@ -100,4 +145,4 @@ def complete(scan: Scan, cloud: FittedCloud, views: int) -> Scan:
         return scan
     rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
     both = replace(geometry, angles=np.concatenate([geometry.angles, rendered.angles]))
-    return Scan(both, np.concatenate([scan.projections, render_objects([cloud.gaussians], rendered, cloud.extent)]))
+    return Scan(both, np.concatenate([scan.projections, cloud.render(rendered)]))
