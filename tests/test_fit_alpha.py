@@ -16,7 +16,7 @@ from lingo_mi.fit.loop import run, scene_radius
 from lingo_mi.fit.points import cuboid, random_points
 from lingo_mi.fit.settings import METHODS, R2
 from lingo_mi.fit.state import activate, harmonics, start
-from lingo_mi.xray.frame import View
+from lingo_mi.xray.frame import View, vector64
 from lingo_mi.xray.radiance import seen
 
 ALPHA = '3dgs', 'xgaussian'
@@ -45,24 +45,24 @@ def whole(request, scan):
 #  Radiance and starts
 # ------------------------------------------------------------------------------------------------------------
 
-def towards(direction, mode='cone'):
-    """A view whose rays through the origin run along a direction, and Gaussians there."""
+def towards(directions, mode='cone'):
+    """A view, and Gaussians to which its rays run along the directions [N, 3]; those of a parallel beam along the first."""
     view = View.of(geometry(mode=mode).normalised_frames(), 0, 8, 8)
-    direction = np.asarray(direction, float)
-    if mode == 'cone':
-        source = np.array([view.source[i].numpy()[0] for i in range(3)])
-        return mi.Point3f(*np.float32((source + 3 * direction).T)), view
-    view.source = mi.Vector3d(*direction)
-    return mi.Point3f(0, 0, 0), view
+    if mode == 'parallel':
+        view.source = vector64(directions[0])
+        return mi.Point3f(0, 0, 0), view
+    source = np.array([view.source[i].numpy()[0] for i in range(3)])
+    return mi.Point3f(*(mi.Float(np.float32(c)) for c in (source + 3 * directions).T)), view
 
 
-def basis(direction, index, mode='cone'):
-    """A spherical harmonic as `seen` uses it: of degree 0 for index 0."""
-    centre, view = towards(direction, mode)
-    coefficients = np.float32(np.arange(16) == index)
-    raised = seen(centre, view, mi.Float(coefficients[0]), mi.ArrayXf(*(mi.Float(c) for c in coefficients[1:])))
-    lowered = seen(centre, view, mi.Float(-coefficients[0]), mi.ArrayXf(*(mi.Float(-c) for c in coefficients[1:])))
-    return np.maximum(raised.numpy(), 0) - .5 if raised.numpy().min() > 0 else .5 - lowered.numpy()
+def basis(directions, mode='cone'):
+    """The sixteen spherical harmonics as `seen` uses them, [16, N]."""
+    centre, view = towards(directions, mode)
+    values = []
+    for index in range(16):
+        unit = [dr.full(mi.Float, .2 * (i == index), len(directions)) for i in range(16)]  # small enough not to be cut
+        values.append((seen(centre, view, unit[0], mi.ArrayXf(*unit[1:])).numpy() - .5) / .2)
+    return np.array(values)
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
@@ -70,8 +70,8 @@ def test_harmonics_of_degree_0_and_1(mode):
     """3DGS's order and signs: (-y, z, -x)."""
     d = np.array([.36, -.48, .8])
     c = np.sqrt(3 / (4 * np.pi))
-    for index, expected in enumerate([1 / np.sqrt(4 * np.pi), -c * d[1], c * d[2], -c * d[0]]):
-        assert abs(basis(d, index, mode) - expected) < 1e-5
+    expected = [1 / np.sqrt(4 * np.pi), -c * d[1], c * d[2], -c * d[0]]
+    np.testing.assert_allclose(basis(d[None], mode)[:4, 0], expected, atol=1e-5)
 
 
 def test_harmonics_are_orthonormal():
@@ -79,18 +79,14 @@ def test_harmonics_are_orthonormal():
     z = (np.arange(n) + .5) / n * 2 - 1
     turn = np.arange(n) * np.pi * (3 - np.sqrt(5))
     d = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
-    centre, view = towards(d)
-    values = []
-    for index in range(16):
-        unit = [mi.Float(np.full(n, .2 * (i == index), np.float32)) for i in range(16)]
-        values.append((seen(centre, view, unit[0], mi.ArrayXf(*unit[1:])).numpy() - .5) / .2)  # small enough not to be cut
-    np.testing.assert_allclose(4 * np.pi * np.array(values) @ np.array(values).T / n, np.eye(16), atol=1e-3)
+    values = basis(d)
+    np.testing.assert_allclose(4 * np.pi * values @ values.T / n, np.eye(16), atol=1e-3)
 
 
 def test_radiance_is_never_negative_and_a_sigmoid_without_harmonics():
-    centre, view = towards([0, 0, 1])
+    centre, view = towards(np.array([[0, 0, 1]]))
     black = seen(centre, view, mi.Float(-9), mi.ArrayXf(mi.Float(0), mi.Float(0), mi.Float(0)))
-    assert black.numpy() == 0
+    np.testing.assert_array_equal(black.numpy(), 0)
     np.testing.assert_allclose(seen(centre, view, mi.Float(np.float32([-1, 0, 2]))).numpy(), 1 / (1 + np.exp([1, 0, -2])),
                                rtol=1e-6)
 
@@ -116,7 +112,6 @@ def test_start_is_half_grey():
     for method in ALPHA:
         state = start(np.zeros((3, 3)), np.full(3, .1), None, METHODS[method])
         np.testing.assert_allclose(activate(state, METHODS[method])[3], .1, rtol=1e-6)
-        centre, view = towards([0, 0, 1])
         raw, more = harmonics(state)
         assert not raw.any() and not more.any()
     assert more.shape == (3, 0)
