@@ -89,13 +89,13 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         views, rest = order[:settings.batch], order[settings.batch:]
         loss = stepper.step(state, views, iteration, rng)
         order, iteration = rest, iteration + 1
-        if (settings.densify_from < iteration < settings.densify_until
-                and iteration % settings.densify_every == 0):
+        densifying = iteration < min(settings.densify_until, settings.iterations)  # not what no step would mend
+        if densifying and iteration > settings.densify_from and iteration % settings.densify_every == 0:
             largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
             state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat, largest))
             if len(state) == 0:
                 raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
-        if settings.reset_every and iteration < settings.densify_until and iteration % settings.reset_every == 0:
+        if densifying and settings.reset_every and iteration % settings.reset_every == 0:
             state = DeviceState(reset_opacity(state.host()))
         if iteration in marks:
             dr.sync_thread()
