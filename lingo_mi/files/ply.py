@@ -79,13 +79,14 @@ def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
 def write_radiance_ply(path, centres, scales, quaternions, opacity, radiance, harmonics) -> None:
     """Writes a grey cloud as 3DGS does, for its viewers, whole or not at all.
 
-    centres, scales, quaternions as for `write_ply`; opacity [N] in (0, 1); radiance [N] and harmonics [N, 0, 3, 8 or 15],
+    centres, scales, quaternions as for `write_ply`; opacity [N] in [0, 1]; radiance [N] and harmonics [N, 0, 3, 8 or 15],
     coefficients of the spherical harmonics of degree 0 and of the higher ones, to which viewers add 1/2. Raises InputError as
     `write_ply` does.
     """
     centres, scales, quaternions, opacity = (np.asarray(a, float) for a in (centres, scales, quaternions, opacity))
     _check(path, centres, scales, quaternions, opacity, 'opacity')
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    opacity = np.clip(opacity, 1e-12, 1 - 1e-12)  # the ends have no logit
     rest = np.zeros((len(opacity), _REST))
     rest[:, :np.shape(harmonics)[1]] = harmonics
     names = [*_CENTRE, 'nx', 'ny', 'nz', *(f'f_dc_{i}' for i in range(3)), *(f'f_rest_{i}' for i in range(3 * _REST)),

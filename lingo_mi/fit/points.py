@@ -21,7 +21,7 @@ def random_points(half, flat: bool, n_points: int, rng) -> InitialCloud:
 
 
 def cuboid(shape, half, step: int) -> InitialCloud:
-    """The centres of every `step`-th voxel along the three axes, from the first on (X-Gaussian, section 3.2).
+    """The centres of every `step`-th voxel along the three axes, from the first on (X-Gaussian).
 
     shape, half   voxels of the volume, and half its sides in the normalised frame, [3] each
 

@@ -14,7 +14,7 @@ OPACITY = .1  # of all Gaussians at the start of a fit by alpha compositing (3DG
 def parameters(settings: Settings) -> dict[str, int]:
     """The raw parameters of a Gaussian by name, and how many numbers each is.
 
-    `PARAMETERS`; for alpha compositing 'opacity' and 'radiance' in place of the density, and 'harmonics', the coefficients of the
+    `PARAMETERS`; for alpha compositing 'opacity' and 'radiance' in place of the density, and 'harmonics', coefficients of the
     radiance's spherical harmonics from degree 1 on, degree by degree.
     """
     if settings.render == 'integral':

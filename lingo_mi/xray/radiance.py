@@ -17,7 +17,7 @@ def seen(centre, view, radiance, harmonics=None):
 
     With harmonics, max(0, 1/2 + sum of coefficient x harmonic) in the direction from source to centre, the harmonic of degree
     0 for `radiance` (Kerbl et al., ACM TOG 42, 2023, and the released code). Without, a sigmoid (Cai et al., X-Gaussian, ECCV
-    2024, equation 4).
+    2024, which weighs a vector of features for it: one number does the same for a grey image).
     """
     if harmonics is None:
         return 1 / (1 + dr.exp(-radiance))
