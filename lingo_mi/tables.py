@@ -30,7 +30,7 @@ from .files.volumes import read_volume
 from .fit.device import DeviceState
 from .fit.initial import initial_cloud
 from .fit.loop import run
-from .fit.settings import METHODS
+from .fit.settings import METHODS, Settings
 from .phantoms.scanning import scan
 from .progress import Progress
 from .recon.asd_pocs import asd_pocs
@@ -65,8 +65,8 @@ class Scale:
     iterations: tuple[int, ...]
 
 
-# Half the size in every length has a quarter of the surface, so a quarter of the Gaussians.
-SCALES = {'small': Scale(128, 256, 12_500, (5000,)), 'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000))}
+# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
+SCALES = {'small': Scale(96, 192, 7000, (5000,)), 'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000))}
 
 
 @dataclass(frozen=True)
@@ -100,21 +100,21 @@ class Volume:
         return f'{self.fit}, {self.algorithm}'
 
 
-def recipe(fit: Fit, scale: Scale):
-    """The settings of a fit.
-
-    Where the rates fall over the run (`decay_steps` 0), its length is the recipe's own.
+def settings_of(method: str, **values) -> Settings:
+    """The settings of `name` or `name:setting=value,...`; `values` replace the recipe's own, but not those.
 
     Raises InputError for an unknown method or setting.
     """
-    name, _, changes = fit.method.partition(':')
+    name, _, changes = method.partition(':')
     if name not in METHODS:
-        raise InputError(f'{fit.method}: the method is unknown; use one of {", ".join(METHODS)}')
-    settings = METHODS[name].changed(n_points=scale.n_points)
-    settings = settings.changed(**dict(change.partition('=')[::2] for change in changes.split(',') if change))
-    if fit.iterations is None or settings.decay_steps == 0:
-        return settings
-    return settings.changed(iterations=fit.iterations)
+        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
+    return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))
+
+
+def recipe(fit: Fit, scale: Scale) -> Settings:
+    """The settings of a fit."""
+    settings = settings_of(fit.method, n_points=scale.n_points)
+    return settings if fit.iterations is None else settings.changed(iterations=fit.iterations)
 
 
 def available(names, say) -> list[str]:
@@ -165,10 +165,10 @@ class Cells:
     def path(self, cell: Fit | Volume) -> Path:
         """Where a cell is stored."""
         fit = cell.fit if isinstance(cell, Volume) else cell
-        of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, seed=self.seed)
+        of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
-            options = dict(algorithm=ALGORITHMS[cell.algorithm][1])
+            options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'

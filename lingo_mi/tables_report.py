@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .files.paths import replacing
-from .tables import ALGORITHMS, Cells, Fit, Volume
+from .tables import ALGORITHMS, Cells, Fit, Volume, settings_of
 
 TABLES = 'views', 'ct', 'ablation'
 TITLES = dict(views='New views (Table 1 of the paper)', ct='CT reconstruction in two stages (Table 2 of the paper)',
@@ -118,6 +118,9 @@ def groups(table: str, views, iterations, methods) -> list[Group]:
 
 
 def _fit(views, method, iterations):
+    """The cell of an object; a recipe whose rates fall over the run keeps its own iterations."""
+    if settings_of(method).decay_steps == 0:
+        iterations = None
     return lambda name: Fit(name, views, method, iterations)
 
 
@@ -125,9 +128,8 @@ def _volume(views, method, iterations, algorithm):
     """The cell of an object; of the volume that a fit samples itself, the fit."""
     if method == 'none':
         return lambda name: None if algorithm == 'voxelize' else Volume(Fit(name, views, 'none'), algorithm)
-    if algorithm == 'voxelize':
-        return _fit(views, method, iterations)
-    return lambda name: Volume(Fit(name, views, method, iterations), algorithm)
+    fit = _fit(views, method, iterations)
+    return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 
 
 def plan(table_groups: list[Group], objects) -> list[Fit | Volume]:
