@@ -79,7 +79,8 @@ def rtk(geometry, scan, volume, cores):
         projector=lambda: bridge.project(volume, geometry, itk),
         transpose=lambda: bridge.backproject(scan, itk),
         FDK=lambda: bridge.reconstruct('FDK', scan, itk),
-        SART=lambda: bridge.reconstruct('SART', scan, itk, NumberOfIterations=1, Lambda=1., EnforcePositivity=True))
+        SART=lambda: bridge.reconstruct('SART', scan, itk, NumberOfIterations=1, NumberOfProjectionsPerSubset=1, Lambda=1.,
+                                        EnforcePositivity=True))
 
 
 def diffct(geometry, scan, volume, cores):

@@ -101,7 +101,8 @@ def test_paper_beside_ours():
     assert '| 5 | 5000 | mean of 2 | 35.00 | 0.9000 | – |' in text
     found = groups('ct', [10], [30_000], ['lingo'])
     nothing = mock.Mock(get=lambda cell: None)
-    assert '| 10 | asd-pocs | paper | 25.64 | 0.7215 | 28.90 | 0.8252 |' in markdown('ct', found, results(found, ['a'], nothing))
+    text = markdown('ct', found, results(found, ['a'], nothing))
+    assert '| 10 | asd-pocs | paper | 25.64 | 0.7215 | 28.90 | 0.8252 |' in text
     found = groups('ablation', [25], [30_000], [])
     assert '| 25 | + + + | paper | 0.47 | 47.04 | 0.9911 | 0.0289 | 32.91 | 0.8924 |' in markdown(
         'ablation', found, results(found, ['a'], nothing))
@@ -161,7 +162,7 @@ def test_killed(tmp_path):
     process = subprocess.Popen([sys.executable, '-c', code, *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()
     while not second.parent.exists():
-        assert process.poll() is None and time.monotonic() - begun < 120
+        assert process.poll() is None and time.monotonic() - begun < 300
         time.sleep(.01)
     process.kill()
     process.communicate()
@@ -196,9 +197,9 @@ def test_recipes():
 
 
 @pytest.mark.parametrize('args, message', [
-    (['views', '--objects', 'hand'], "'hand' is unknown"), (['views', '--views', '11'], '10'), (['views', '--views', '0'], '10'),
-    (['ct', '--iterations', '0'], 'at least 1'), (['views', '--seed', '-1'], 'negative'), (['figures'], 'invalid choice'),
-    (['views', '--methods', 'nerf'], 'invalid choice')])
+    (['views', '--objects', 'hand'], "'hand' is unknown"), (['views', '--views', '11'], '10'),
+    (['views', '--views', '0'], '10'), (['ct', '--iterations', '0'], 'at least 1'), (['views', '--seed', '-1'], 'negative'),
+    (['figures'], 'invalid choice'), (['views', '--methods', 'nerf'], 'invalid choice')])
 def test_bad_input(args, message, tmp_path):
     code, _, err = run(TABLES, *args, '--out', tmp_path / 'a')
     said = err if isinstance(code, int) else code
