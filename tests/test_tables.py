@@ -26,8 +26,8 @@ SHORT = 'r2:densify_from=5,densify_until=100,densify_every=6,densify_threshold=1
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     monkeypatch.setitem(SCALES, 'small', TINY)
-    monkeypatch.setattr(tables, 'SCANNED', 10)
-    monkeypatch.setattr(tables, 'COMPLETED', 20)
+    monkeypatch.setattr(tables, 'SCANNED', 25)
+    monkeypatch.setattr(tables, 'COMPLETED', 30)
     monkeypatch.setitem(tables.METHODS, 'fast', tables.METHODS['fast'].changed(iterations=15))
     monkeypatch.setitem(tables.ALGORITHMS, 'sart', (tables.sart, dict(niter=2)))
     monkeypatch.setitem(tables.ALGORITHMS, 'asd-pocs', (tables.asd_pocs, dict(niter=1, tviter=2)))
@@ -75,22 +75,24 @@ def test_two_stages(out):
     # The numbers are those of the functions, on views rendered from the stored cloud.
     cells = Cells(out, TINY)
     whole = cells._completed(Fit('foot', 4, 'r2', 20))
-    assert len(whole) == 20
+    assert len(whole) == 30
     train = cells.dataset('foot').train
-    np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 2, 5, 7]])
+    np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
     volume = tables.fdk(whole)
     assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, make('foot', 16).data), abs=1e-3)
 
 
-def test_ablation_shares_its_ends_with_the_other_tables(out):
-    code, text, err = script('ablation', out, '--views', '4', '--iterations', '20')
-    assert code == 0, err
-    rows = {r['second']: r['columns'] for r in json.loads((out / 'ablation.json').read_text()) if r['object'] == 'foot'}
-    assert list(rows) == list(ABLATION)
-    stored = Cells(out, TINY).get(Fit('foot', 4, 'lingo', 20))
-    assert rows['+ + +']['fit']['psnr_2d_r2'] == stored['psnr_2d_r2']
-    assert stored['settings']['loss_scale'] == 'dynamic' and stored['initial'] and '12 of 12 cells' in text
-    assert len({json.dumps(r['fit']) for r in rows.values()}) == 6
+def test_the_parts_of_lingo():
+    """Each row has its parts and nothing else; the first and the last are the recipes of the other tables."""
+    found = groups('ablation', [25], [20], [])
+    cells = {group.second: [column.cell('foot') for column in group.columns] for group in found}
+    assert list(cells) == list(ABLATION) and all(volume == Volume(fit, 'asd-pocs') for fit, volume in cells.values())
+    assert cells['- - -'][0] == Fit('foot', 25, 'r2', 20) and cells['+ + +'][0] == Fit('foot', 25, 'lingo', 20)
+    base = recipe(cells['+ + +'][0], TINY)
+    for parts, (fit, _) in cells.items():
+        scale, start, voxels = (part == '+' for part in parts.split())
+        changes = dict(loss_scale='dynamic' if scale else 'none', init='lingo' if start else 'r2')
+        assert recipe(fit, TINY) == base.changed(**changes, V_S=20. if voxels or not start else 1.)
 
 
 def test_paper_beside_ours():
@@ -151,14 +153,14 @@ def _stop_at(iteration):
 
 def test_killed(tmp_path):
     """`kill -9` in the middle of the second cell: the first stays, and the same command ends the table."""
-    arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '60'
+    arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
     code = ('import runpy, sys\nimport lingo_mi\nfrom lingo_mi.runtime import use_variant\n'
             f'use_variant({mi.variant()!r})\nfrom lingo_mi import tables\n'
-            'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,))\ntables.SCANNED = 10\n'
+            'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,))\ntables.SCANNED = 25\n'
             'sys.argv = sys.argv[1:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n')
     command = [TABLES, 'views', '--objects', 'foot', '--out', tmp_path, *arguments, '--variant', mi.variant()]
     cells = Cells(tmp_path, TINY)
-    first, second = (cells.path(Fit('foot', n, 'r2', 60)) for n in (4, 5))
+    first, second = (cells.path(Fit('foot', n, 'r2', 20)) for n in (4, 5))
     process = subprocess.Popen([sys.executable, '-c', code, *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     begun = time.monotonic()
     while not second.parent.exists():
@@ -197,8 +199,8 @@ def test_recipes():
 
 
 @pytest.mark.parametrize('args, message', [
-    (['views', '--objects', 'hand'], "'hand' is unknown"), (['views', '--views', '11'], '10'),
-    (['views', '--views', '0'], '10'), (['ct', '--iterations', '0'], 'at least 1'), (['views', '--seed', '-1'], 'negative'),
+    (['views', '--objects', 'hand'], "'hand' is unknown"), (['views', '--views', '26'], '25'),
+    (['views', '--views', '0'], '25'), (['ct', '--iterations', '0'], 'at least 1'), (['views', '--seed', '-1'], 'negative'),
     (['figures'], 'invalid choice'), (['views', '--methods', 'nerf'], 'invalid choice')])
 def test_bad_input(args, message, tmp_path):
     code, _, err = run(TABLES, *args, '--out', tmp_path / 'a')
