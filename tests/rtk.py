@@ -56,3 +56,29 @@ def reconstruct(kind, scan, itk, **settings):
         getattr(reconstruction, 'Set' + name)(value)
     reconstruction.Update()
     return array(reconstruction.GetOutput(), itk).copy()
+
+
+def project(volume, geometry, itk):
+    """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
+    zeros = np.zeros((len(geometry), *geometry.nDetector))
+    found = _filter('JosephForwardProjectionImageFilter', geometry, itk, projection_image(zeros, geometry, itk),
+                    volume_image(volume, geometry, itk))
+    return itk.array_from_image(found)[:, ::-1]
+
+
+def backproject(scan, itk):
+    """Volume [x, y, z] of a scan by the transpose of that projector."""
+    geometry = scan.geometry
+    found = _filter('JosephBackProjectionImageFilter', geometry, itk, volume_image(np.zeros(geometry.nVoxel), geometry, itk),
+                    projection_image(scan.projections, geometry, itk))
+    return array(found, itk)
+
+
+def _filter(name, geometry, itk, *inputs):
+    image = itk.Image[itk.F, 3]
+    run = getattr(itk.RTK, name)[image, image].New()
+    for i, x in enumerate(inputs):
+        run.SetInput(i, x)
+    run.SetGeometry(gantry(geometry, itk))
+    run.Update()
+    return run.GetOutput()

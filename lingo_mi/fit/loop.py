@@ -52,7 +52,8 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where
                everything is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
-    resume     go on from `path`: the same steps as without the interruption
+    resume     go on from `path`: the same steps as without the interruption. More iterations than the checkpoint was made
+               with are right where `decay_steps` sets the rates and `coarse_share` is 0
     """
     from ..plugins.ct_scanner import describe
     settings = bounded(settings, scan)
@@ -172,7 +173,10 @@ def _same_fit(host, extra, settings, scan, seed, path):
         raise damaged
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
-    changed = [k for k in now if before.get(k) != now[k] and k != 'checkpoint_seconds']
+    free = {'checkpoint_seconds'}
+    if settings.decay_steps and not settings.coarse_share and extra['iteration'] <= settings.iterations:
+        free.add('iterations')  # what was done so far did not depend on it
+    changed = [k for k in now if before.get(k) != now[k] and k not in free]
     if extra['seed'] != seed:
         changed.append('seed')
     if extra['views'] != len(scan):

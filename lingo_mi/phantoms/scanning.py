@@ -11,13 +11,14 @@ from ..scan import Dataset, Scan
 from . import Phantom
 
 
-def default_geometry(phantom: Phantom, angles) -> Geometry:
+def default_geometry(phantom: Phantom, angles, pixels: int = 512) -> Geometry:
     """X3D's scanner about a phantom.
 
-    DSD 1500 and DSO 1000 mm, 512 x 512 pixels of 1/256 of the phantom's side (1 mm for a cube of 256 mm).
+    DSD 1500 and DSO 1000 mm; `pixels` x `pixels` that together are twice as wide as the phantom's longest side (512
+    pixels of 1 mm for a cube of 256 mm).
     """
-    pixel = phantom.spacing[0] * phantom.data.shape[0] / 256
-    return Geometry(DSO=1000., DSD=1500., nDetector=(512, 512), dDetector=(pixel, pixel),
+    pixel = 2 * max(n * d for n, d in zip(phantom.data.shape, phantom.spacing)) / pixels
+    return Geometry(DSO=1000., DSD=1500., nDetector=(pixels, pixels), dDetector=(pixel, pixel),
                     nVoxel=phantom.data.shape, dVoxel=phantom.spacing, angles=angles)
 
 
@@ -40,16 +41,16 @@ def simulate(phantom: Phantom, geometry: Geometry,
 
 
 def scan(phantom: Phantom, views: int = 50, seed: int = 0,
-         progress: Callable[[int, int], None] | None = None) -> Dataset:
+         progress: Callable[[int, int], None] | None = None, pixels: int = 512) -> Dataset:
     """The default scan: `views` evenly spaced over [0, 180) degrees to fit, as many random ones in it held
     out.
 
-    seed decides the held-out angles. Raises InputError unless views is at least 1.
+    seed decides the held-out angles, `pixels` the panel (see `default_geometry`). Raises InputError unless views is at least 1.
     """
     if views < 1:
         raise InputError(f'a scan needs at least one view, not {views}')
     angles = np.concatenate([circular(views, 180.),
                              np.sort(np.random.default_rng(seed).uniform(0, np.pi, views))])
-    geometry = default_geometry(phantom, angles)
+    geometry = default_geometry(phantom, angles, pixels)
     both = Scan(geometry, simulate(phantom, geometry, progress))
     return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)

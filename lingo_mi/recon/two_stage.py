@@ -137,12 +137,19 @@ def complete(scan: Scan, cloud: FittedCloud | CompositedCloud, views: int) -> Sc
     Raises InputError where fewer views are asked for than were measured, and for a scan that is no circle about z.
     """
     require_circle(scan, 'the completion of a scan')
+    return filled(without_effects(scan, cloud), views, cloud.render)
+
+
+def filled(scan: Scan, views: int, render) -> Scan:
+    """A scan of `views` views: the given ones and those between them, by `render`, a function of their geometry.
+
+    Raises InputError where fewer views are asked for than are given.
+    """
     geometry = scan.geometry
     if views < len(scan):
         raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
-    scan = without_effects(scan, cloud)
     if views == len(scan):
         return scan
     rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
     both = replace(geometry, angles=np.concatenate([geometry.angles, rendered.angles]))
-    return Scan(both, np.concatenate([scan.projections, cloud.render(rendered)]))
+    return Scan(both, np.concatenate([scan.projections, render(rendered)]))

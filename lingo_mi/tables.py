@@ -1,0 +1,255 @@
+"""The paper's tables as cells: fits of sparse scans and reconstructions from completed ones, each stored when it is done.
+
+A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written in one piece, below a
+folder that names its recipe and a hash of every setting: a cell that exists is not computed again, one of other settings is
+another cell. A fit keeps its checkpoint beside it, from which it goes on after an interruption, from which the next longer fit
+of the same recipe begins, and from which the views missing to a CT volume are rendered.
+
+Every object is scanned as in X3D's scenes (`phantoms.scanning`): 50 views over half a turn, of which a fit sees a few evenly
+spaced ones, and 50 others held out. For a CT volume, the fitted views are completed to 100.
+"""
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from skimage.transform import resize_local_mean
+
+from . import metrics, phantoms
+from .cli import between_steps
+from .errors import InputError
+from .files.paths import replacing
+from .files.volumes import read_volume
+from .fit.device import DeviceState
+from .fit.initial import initial_cloud
+from .fit.loop import run
+from .fit.settings import METHODS, Settings
+from .phantoms.scanning import scan
+from .progress import Progress
+from .recon.asd_pocs import asd_pocs
+from .recon.fdk import fdk
+from .recon.sart import sart
+from .recon.two_stage import filled
+from .results import CHECKPOINT, measure, versions
+from .scan import Dataset
+from .scanning import choose_views
+
+PHANTOMS = 'foot', 'chest'
+VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
+SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
+
+# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
+ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10))}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large everything is.
+
+    size         voxels along an object's longest side, at most; larger volumes are averaged down
+    pixels       along a side of the panel
+    n_points     Gaussians that a fit starts with
+    iterations   of the fits, where the user names none
+    """
+
+    size: int
+    pixels: int
+    n_points: int
+    iterations: tuple[int, ...]
+
+
+# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
+SCALES = {'small': Scale(96, 192, 7000, (5000,)), 'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000))}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A cell: a cloud fitted to some views of an object.
+
+    method       a name of METHODS, or `name:setting=value,...`
+    iterations   Adam steps; None: the recipe's own
+    """
+
+    object: str
+    views: int
+    method: str
+    iterations: int | None = None
+
+    def __str__(self):
+        return f'{self.object}, {self.views} views, {self.method}'
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
+
+    Where the fit's method is 'none', from these views alone.
+    """
+
+    fit: Fit
+    algorithm: str
+
+    def __str__(self):
+        return f'{self.fit}, {self.algorithm}'
+
+
+def settings_of(method: str, **values) -> Settings:
+    """The settings of `name` or `name:setting=value,...`; `values` replace the recipe's own, but not those.
+
+    Raises InputError for an unknown method or setting.
+    """
+    name, _, changes = method.partition(':')
+    if name not in METHODS:
+        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
+    return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))
+
+
+def recipe(fit: Fit, scale: Scale) -> Settings:
+    """The settings of a fit."""
+    settings = settings_of(fit.method, n_points=scale.n_points)
+    return settings if fit.iterations is None else settings.changed(iterations=fit.iterations)
+
+
+def available(names, say) -> list[str]:
+    """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
+
+    say   called with a line for each of VOLUMES that is missing
+
+    Raises InputError for a name that is neither.
+    """
+    found = []
+    for name in names:
+        if name in PHANTOMS or (path := _file(name)) is not None and path.is_file():
+            found.append(name)
+        elif name in VOLUMES:
+            say(f'{name}: skipped, since there is no {name}.nii.gz in the folder that LINGO_MI_DATA names')
+        else:
+            raise InputError(f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
+                             'in the folder that LINGO_MI_DATA names')
+    return found
+
+
+def _file(name: str) -> Path | None:
+    folder = os.environ.get('LINGO_MI_DATA')
+    return Path(folder) / f'{name}.nii.gz' if folder else None
+
+
+def load_object(name: str, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
+    if name in PHANTOMS:
+        return phantoms.make(name, size)
+    volume = read_volume(_file(name))
+    shape = volume.data.shape
+    if max(shape) <= size:
+        return phantoms.Phantom(volume.data, volume.spacing, name)
+    smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
+    spacing = tuple(d * n / m for d, n, m in zip(volume.spacing, shape, smaller))
+    return phantoms.Phantom(resize_local_mean(volume.data, smaller).astype(np.float32), spacing, name)
+
+
+class Cells:
+    """The cells of one scale and seed below a folder."""
+
+    def __init__(self, folder: Path, scale: Scale, seed: int = 0):
+        self.folder, self.scale, self.seed = Path(folder), scale, seed
+        self.dataset = functools.lru_cache(1)(self._dataset)
+        self._completed = functools.lru_cache(1)(self._completed)
+
+    def path(self, cell: Fit | Volume) -> Path:
+        """Where a cell is stored."""
+        fit = cell.fit if isinstance(cell, Volume) else cell
+        of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
+        where = self.folder / fit.object / f'{fit.views}_views'
+        if isinstance(cell, Volume):
+            options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
+            if fit.method == 'none':
+                return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
+            return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
+        settings = asdict(recipe(fit, self.scale))
+        del settings['checkpoint_seconds']
+        iterations = settings.pop('iterations')
+        return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
+
+    def get(self, cell: Fit | Volume) -> dict | None:
+        """The numbers of a cell, or None where it has not been computed."""
+        path = self.path(cell)
+        return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
+
+    def compute(self, cell: Fit | Volume, label: str) -> dict:
+        """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
+
+        Raises InputError where it cannot be computed, and KeyboardInterrupt, after which a fit goes on where it was.
+        """
+        path = self.path(cell)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        found = (self._fit if isinstance(cell, Fit) else self._volume)(cell, path, label)
+        fit = cell if isinstance(cell, Fit) else cell.fit
+        found |= dict(object=fit.object, views=fit.views, seed=self.seed, scale=asdict(self.scale), variant=mi.variant(),
+                      versions=versions())
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
+        return found
+
+    def _dataset(self, name: str) -> Dataset:
+        thing = load_object(name, self.scale.size)
+        with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
+            return scan(thing, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
+
+    def _measured(self, fit: Fit) -> Dataset:
+        return choose_views(self.dataset(fit.object), fit.views)
+
+    def _fit(self, cell: Fit, path: Path, label: str) -> dict:
+        dataset, settings, checkpoint = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
+        self._begin(settings, checkpoint)
+        cloud = None if checkpoint.exists() else initial_cloud(dataset.train, settings, self.seed)
+        with Progress(label, settings.iterations) as bar, between_steps() as check:
+            def progress(iteration, **fields):
+                bar.update(iteration, **fields)
+                check()
+            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, checkpoint, cloud is None)
+        state = DeviceState(fitted.state)
+        rendered = fitted.stepper.render(state, dataset.test.geometry)
+        found = measure(fitted, dataset, fitted.stepper.volume(state), rendered)
+        return found | dict(method=cell.method, settings=asdict(settings), initial=fitted.info)
+
+    def _begin(self, settings, checkpoint: Path):
+        """Where there is no checkpoint yet, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
+        if checkpoint.exists() or settings.decay_steps == 0 or settings.coarse_share:
+            return
+        done = [int(path.parent.name) for path in checkpoint.parents[1].glob('*/fit.json')]
+        shorter = max((n for n in done if n < settings.iterations), default=None)
+        if shorter is not None:
+            with replacing(checkpoint) as temporary:
+                temporary.write_bytes((checkpoint.parents[1] / str(shorter) / CHECKPOINT).read_bytes())
+
+    def _completed(self, fit: Fit):
+        train = self._measured(fit).train
+        fitted = run(train, recipe(fit, self.scale), None, self.seed, path=self.path(fit).with_name(CHECKPOINT), resume=True)
+        state = DeviceState(fitted.state)
+        return filled(train, COMPLETED, lambda geometry: fitted.stepper.render(state, geometry))
+
+    def _volume(self, cell: Volume, path: Path, label: str) -> dict:
+        function, options = ALGORITHMS[cell.algorithm]
+        if cell.fit.method != 'none' and self.get(cell.fit) is None:
+            raise InputError('there is no fit to complete the views from')
+        dataset = self._measured(cell.fit)
+        views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
+        with Progress(label, options.get('niter', len(views))) as bar:
+            def progress(done, _, residual=None):
+                bar.update(done, residual=residual)
+            begun = time.perf_counter()
+            result = function(views, **options, progress=progress)
+        volume = result if isinstance(result, np.ndarray) else result.volume
+        return dict(algorithm=cell.algorithm, options=options, method=cell.fit.method, seconds=time.perf_counter() - begun,
+                    psnr_3d=metrics.psnr_3d(volume, dataset.volume), ssim_3d=metrics.ssim_3d(volume, dataset.volume))
+
+
+def _hash(values: dict) -> str:
+    return hashlib.sha1(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
