@@ -3,8 +3,9 @@ import copy
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from lingo_mi.fit.densify import SHRINK, clone, densify, prune, split
+from lingo_mi.fit.densify import SHRINK, clone, densify, halve, prune, split
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import PARAMETERS, State, activate, start
 
@@ -60,20 +61,49 @@ def test_clone_keeps_the_mass():
     np.testing.assert_array_equal(after.values['density'][:40][~chosen], state.values['density'][~chosen])
 
 
-@pytest.mark.parametrize('keeps', [True, False])
-def test_mass_of_a_split(keeps):
+def test_mass_of_a_split():
     """R2's rule gives both halves half the density, and so 1 / 1.6^3 of the mass: a quarter in all."""
     state = state_of(np.random.default_rng(1), 30)
     chosen = np.arange(30) < 20
-    after = split(state, chosen, SETTINGS.changed(split_keeps_mass=keeps), np.random.default_rng(5))
+    after = split(state, chosen, SETTINGS, np.random.default_rng(5))
     assert len(after) == 10 + 40
     assert_consistent(after)
     children = mass(after)[10:].reshape(20, 2)
-    expected = mass(state)[chosen] * (1 if keeps else SHRINK ** -3)
+    expected = mass(state)[chosen] * SHRINK ** -3
     assert abs(children.sum() / expected.sum() - 1) < 1e-6
     np.testing.assert_allclose(children.sum(1), expected, rtol=5e-6)
     parents = activate(state, SETTINGS)[1][chosen].repeat(2, 0)
     np.testing.assert_allclose(activate(after, SETTINGS)[1][10:], parents / SHRINK, rtol=5e-6)
+
+
+@pytest.mark.parametrize('flat', [False, True])
+def test_halves_keep_mass_mean_and_covariance(flat):
+    state = state_of(np.random.default_rng(1), 30)
+    if flat:
+        state.values['rotation'][:, :2] = 0
+    chosen = np.arange(30) < 20
+    after = halve(state, chosen, SETTINGS, flat)
+    assert len(after) == 10 + 40
+    assert_consistent(after)
+    children = mass(after)[10:].reshape(20, 2)
+    np.testing.assert_allclose(children, mass(state)[chosen].repeat(2).reshape(20, 2) / 2, rtol=5e-6)
+    centre, wanted = activate(state, SETTINGS)[0][chosen], covariance(state)[chosen]
+    halves = activate(after, SETTINGS)[0][10:].reshape(20, 2, 3)
+    np.testing.assert_allclose(halves.mean(1), centre, atol=1e-6)
+    half = (halves[:, 0] - halves[:, 1]) / 2
+    assert not flat or not half[:, 2].any()
+    found = covariance(after)[10::2] + half[:, :, None] * half[:, None]
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    for group in ('first', 'second'):
+        for k in PARAMETERS:
+            np.testing.assert_array_equal(getattr(after, group)[k][10:], getattr(state, group)[k][chosen].repeat(2, 0))
+    assert after.born[10:].all()
+
+
+def covariance(state):
+    _, scale, q, _ = activate(state, SETTINGS)
+    R = Rotation.from_quat(q).as_matrix()
+    return R * scale[:, None] ** 2 @ R.transpose(0, 2, 1)
 
 
 def test_children_are_drawn_from_their_parent():
@@ -165,7 +195,7 @@ def test_no_growth_beyond_the_maximum():
 
 
 @pytest.mark.parametrize('operation', [
-    lambda s, c: clone(s, c), lambda s, c: split(s, c, SETTINGS, np.random.default_rng(0)),
+    lambda s, c: clone(s, c), lambda s, c: split(s, c, SETTINGS, np.random.default_rng(0)), lambda s, c: halve(s, c, SETTINGS),
     lambda s, c: prune(s, SETTINGS, HALF), lambda s, c: densify(s, SETTINGS, HALF, np.random.default_rng(0))])
 def test_inputs_stay_as_they_are(operation):
     state, chosen = state_of(np.random.default_rng(8), 20), np.arange(20) < 9
@@ -192,9 +222,9 @@ def test_coincident_gaussians_stay_distinct():
             v[:] = v[0]
     state.gradient[:], state.seen[:] = 5, 1
     state.values['centre'][:] = 0
-    after = densify(state, SETTINGS.changed(split_keeps_mass=True), HALF, np.random.default_rng(0))
+    after = densify(state, SETTINGS, HALF, np.random.default_rng(0))
     assert len(after) == 16 and len(np.unique(after.values['centre'], axis=0)) == 16
-    assert abs(mass(after).sum() / mass(state).sum() - 1) < 2e-6
+    assert abs(mass(after).sum() / mass(state).sum() / SHRINK ** -3 - 1) < 2e-6
 
 
 def test_nothing_chosen_changes_nothing():

@@ -11,6 +11,8 @@ from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS, R2, VOLUMETRIC
 from lingo_mi.fit.state import activate
+from lingo_mi.fit.state import start as start_state
+from lingo_mi.fit.step import Stepper
 from lingo_mi.geometry import Geometry, circular
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.phantoms.gaussians import Cloud
@@ -129,12 +131,13 @@ def test_each_method(method, scan):
     assert volume.shape == scan.geometry.nVoxel and volume.max() > 0
 
 
+@pytest.mark.parametrize('birth', ['clone', 'halve'])
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
-def test_fan_beam_stays_in_its_plane(mode):
+def test_fan_beam_stays_in_its_plane(mode, birth):
     """One row and one slice: nothing may leave the plane or turn out of it."""
     g = geometry(6, nDetector=(1, 48), dDetector=(8., 8.), nVoxel=(32, 32, 1), mode=mode)
     scan, start = tiny_scan(g, flat=True), some_points(g)
-    settings = SHORT.changed(split_size=.08, split_keeps_mass=True)
+    settings = SHORT.changed(split_size=.08, birth=birth)
     fitted = run(scan, settings, start)
     assert fitted.state.born.any()  # clones and halves of splits, which are drawn at random
     centre, scale, rotation, _ = activate(fitted.state, fitted.settings)
@@ -142,6 +145,21 @@ def test_fan_beam_stays_in_its_plane(mode):
     np.testing.assert_allclose(scale[:, 2], .08, rtol=1e-5)
     before = run(scan, settings.changed(iterations=1), start)
     assert error_of(fitted, scan) < .9 * error_of(before, scan)
+
+
+@pytest.mark.parametrize('stride', [1, 2, 3])
+def test_total_variation_is_of_every_nth_voxel(scan, stride):
+    """With so many samples that they fit in one place only, between the first and the last voxels."""
+    g = replace(scan.geometry, nVoxel=(13, 13, 7), dVoxel=(20., 20., 36.))
+    stepper = Stepper(replace(scan, geometry=g), SHORT.changed(tv_stride=stride, tv_size=13))
+    start = some_points(g)
+    state = DeviceState(start_state(start.points.astype(np.float32), start.spacing, start.density, stepper.settings))
+    gaussians = state.gaussians(stepper.settings)
+    dr.enable_grad(gaussians)
+    found = stepper._total_variation(gaussians, np.random.default_rng(0))[0]
+    volume = stepper.volume(state)[::stride, ::stride, ::stride] / stepper.unit
+    wanted = sum(np.abs(np.diff(volume, axis=i)).mean() for i in range(3))
+    np.testing.assert_allclose(found, stepper.settings.lambda_tv * wanted, rtol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------------------------

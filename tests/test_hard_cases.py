@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from oracle import Cloud, Pose, random_cloud
 
-from lingo_mi.fit.densify import clone, densify, split
+from lingo_mi.fit.densify import clone, densify, halve, split
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.loss_scale import loss_scale, otsu
 from lingo_mi.fit.losses import combined, ssim
@@ -148,10 +148,10 @@ def test_coincident_gaussians_densify():
     state = coincident()
     after = densify(state, SETTINGS, np.ones(3), np.random.default_rng(0))
     assert len(after) == 16 and all(np.isfinite(v).all() for v in after.values.values())
-    everyone, keep = np.ones(8, bool), SETTINGS.changed(split_keeps_mass=True)
+    everyone = np.ones(8, bool)
     assert abs(mass(clone(state, everyone)) / mass(state) - 1) < 1e-5
-    halves = split(state, everyone, keep, np.random.default_rng(0))
-    assert abs(mass(halves) / mass(state) - 1) < 1e-5
+    assert abs(mass(halve(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
+    halves = split(state, everyone, SETTINGS, np.random.default_rng(0))
     assert len(np.unique(halves.values['centre'], axis=0)) == 16  # drawn from their parents, so no longer at one place
 
 

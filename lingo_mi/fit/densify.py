@@ -1,10 +1,13 @@
 """Adaptive density control: pure functions from state to state, in NumPy.
 
-R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one split in
-two. A clone and its original take half the density each, which keeps the mass. The halves of a split are smaller by 1.6;
-R2 gives them half the density too, so that three quarters of the mass vanish; with `split_keeps_mass` they get what
-keeps it. Where there is not room for all, the strongest go first (R2-Gaussian stops). Afterwards faint and stray Gaussians
-are removed. Adam's moments travel with their Gaussian; new ones start at zero.
+R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one
+split in two. A clone and its original take half the density each, which keeps the mass. The halves of a split are
+smaller by 1.6; R2 gives them half the density too, so that three quarters of the mass vanish. Where there is not room
+for all, the strongest go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are removed. Adam's moments
+travel with their Gaussian; new ones start at zero.
+
+With birth 'halve', which is this project's own, all that are chosen are cut in two along their longest axis instead. Mass,
+mean and covariance stay, so that images hardly change, and both halves keep the moments.
 
 For alpha compositing the rules are those of 3DGS: clones and halves keep the opacity, the faint vanish and later the large,
 Gaussians outside the volume stay, and from time to time all opacities are lowered (`reset_opacity`).
@@ -17,6 +20,7 @@ from .settings import Settings
 from .state import State, activate, inverse_scale, inverse_sigmoid, inverse_softplus
 
 RESET = .01   # 3DGS: opacity that `reset_opacity` leaves at most
+APART = .7    # distance of a half's centre from its parent's, in the parent's standard deviations
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
@@ -33,6 +37,8 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     strong = mean >= settings.densify_threshold
     room = max(settings.max_gaussians - len(state), 0)  # each adds one
     strong[np.argsort(-mean, kind='stable')[room:]] = False
+    if settings.birth == 'halve':
+        return prune(halve(state, strong, settings, flat), settings, half, largest)
     large = scale.max(1) > settings.split_size
     state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
                   settings, rng, flat)
@@ -51,14 +57,29 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     low, high = settings.scale_min, settings.scale_max
     centre, scale, rotation, _ = activate(state, settings)
     shrink = np.array([SHRINK, SHRINK, 1. if flat else SHRINK])
-    factor = .5 * shrink.prod() if settings.split_keeps_mass else .5
-    children = _fresh(_with_density(state, chosen, factor), parents)
+    children = _fresh(_with_density(state, chosen, .5), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
     if flat:
         offset[:, 2] = 0
     children.values['centre'] = (centre[parents] + _rotate(rotation[parents], offset)).astype(np.float32)
     smaller = np.clip(scale[parents] / shrink, low * 1.01, high * .99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32)
+    return _append(_take(state, ~chosen), children)
+
+
+def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State:
+    """Replace each of the chosen Gaussians [N] by two, side by side along its longest axis, with its mass and covariance."""
+    parents = np.flatnonzero(chosen)
+    low, high = settings.scale_min, settings.scale_max
+    centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
+    axis = np.eye(3)[scale[:, :2 if flat else 3].argmax(1)]
+    shrink = np.where(axis > 0, np.sqrt(1 - APART ** 2), 1)
+    children = _take(_with_density(state, chosen, .5 / np.sqrt(1 - APART ** 2)), parents.repeat(2))
+    offset = _rotate(rotation, APART * axis * scale)
+    children.values['centre'] = np.stack([centre + offset, centre - offset], 1).reshape(-1, 3).astype(np.float32)
+    smaller = np.clip(scale * shrink, low * 1.01, high * .99)
+    children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32).repeat(2, 0)
+    children.born[:] = True
     return _append(_take(state, ~chosen), children)
 
 

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..lingo.initialise import InitialCloud
 from ..scan import Scan
 from . import checkpoint
+from .average import Average
 from .densify import densify, reset_opacity
 from .device import DeviceState
 from .settings import Settings
@@ -59,6 +60,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
+    average = Average(settings.average)
     if resume:
         host, extra, arrays = checkpoint.load(path)
         _same_fit(host, extra, settings, scan, seed, path)
@@ -67,6 +69,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
         state = DeviceState(host)
         stepper.restore(arrays)
+        average.restore(arrays, state)
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0., [], dict(initial.info)
@@ -82,7 +85,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
                 seed=seed, rng=rng.bit_generator.state, iteration=iteration,
                 seconds=seconds + time.perf_counter() - clock, history=history, info=info,
                 settings=asdict(settings), views=len(scan), scanner=describe(scan.geometry), unit=stepper.unit),
-                dict(initial=points, order=np.array(order, int)) | stepper.arrays())
+                dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays())
 
     while iteration < settings.iterations:
         while len(order) < settings.batch:  # every view once before any a second time
@@ -94,10 +97,13 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         if densifying and iteration > settings.densify_from and iteration % settings.densify_every == 0:
             largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
             state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat, largest))
+            average.restart()
             if len(state) == 0:
                 raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
         if densifying and settings.reset_every and iteration % settings.reset_every == 0:
             state = DeviceState(reset_opacity(state.host()))
+            average.restart()
+        average.add(state)
         if iteration in marks:
             dr.sync_thread()
             value = float(loss[0])
@@ -106,7 +112,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
                                  'projections')
             seconds += time.perf_counter() - clock
             entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
-            history.append(entry | (measure(stepper, state) if measure else {}))
+            history.append(entry | (measure(stepper, average.of(state)) if measure else {}))
             clock = time.perf_counter()  # measuring is not fitting
         if progress is not None:
             last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
@@ -118,6 +124,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         if time.perf_counter() - saved > settings.checkpoint_seconds:
             store()
             saved = time.perf_counter()
+    state = average.of(state)
     dr.sync_thread()
     store()
     seconds += time.perf_counter() - clock

@@ -48,7 +48,8 @@ class Settings:
     Loss (paper, section III-C)
     lambda_ssim        weight of 1 - SSIM (0.25)
     lambda_tv          weight of the total variation of a random cube (0.05)
-    tv_size            voxels along its sides (32)
+    tv_size            samples along its sides (32)
+    tv_stride          voxels from sample to sample (own: 2 smooths eight times the volume at the same cost; published: 1)
     loss_scale         'none'; 'dynamic', the paper's T_g + 1 / (4 T_g) on the whole loss; or 'statistic', the same
                        factor on the densification statistic alone (Adam cancels a constant factor anyway)
 
@@ -60,12 +61,14 @@ class Settings:
                        0, 0 leaves the poses alone (see `lingo_mi.fit.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
     epsilon            added to the root of the second moment (R2: 1e-15)
+    average            decay of the running mean of the parameters which is the result (own); 0: those of the last step
 
     Densification
     densify_from, densify_until, densify_every   iterations (500, 15000, 100)
     densify_threshold  mean gradient of the projected centre, in normalised device units (5e-5)
-    split_size         Gaussians with a larger standard deviation split, others clone (R2: 0.1 of the longest side)
-    split_keeps_mass   whether the halves of a split weigh what their parent did (R2: no)
+    birth              'clone': the small are cloned and the large split (R2); 'halve': all are cut in two along their longest
+                       axis, which keeps mass and covariance (own): see `lingo_mi.fit.densify`
+    split_size         of `clone`: Gaussians with a larger standard deviation split (R2: 0.1 of the longest side)
     prune_density      Gaussians below vanish, as do those outside the volume (1e-5); of `alpha` an opacity, and Gaussians
                        outside stay (3DGS: 0.005)
     reset_every        of `alpha`: iterations after which opacities are lowered to 0.01, while densification lasts (3DGS: 3000);
@@ -106,6 +109,7 @@ class Settings:
     lambda_ssim: float = .25
     lambda_tv: float = .05
     tv_size: int = 32
+    tv_stride: int = 1
     loss_scale: str = 'none'
     rate_centre: tuple[float, float] = (2e-4, 2e-5)
     rate_density: tuple[float, float] = (1e-2, 1e-3)
@@ -118,12 +122,13 @@ class Settings:
     beta1: float = .9
     beta2: float = .999
     epsilon: float = 1e-15
+    average: float = 0.
     densify_from: int = 500
     densify_until: int = 15_000
     densify_every: int = 100
     densify_threshold: float = 5e-5
+    birth: str = 'clone'
     split_size: float = .2
-    split_keeps_mass: bool = False
     prune_density: float = 1e-5
     reset_every: int = 0
     prune_size: float = .1
@@ -143,6 +148,9 @@ class Settings:
         require(self.iterations >= 1, f'iterations must be at least 1, not {self.iterations}')
         require(self.batch >= 1, f'batch must be at least 1, not {self.batch}')
         require(0 <= self.beta1 < 1 and 0 <= self.beta2 < 1, 'beta1 and beta2 must lie in [0, 1)')
+        require(0 <= self.average < 1, f'average must be at least 0 and below 1, not {self.average:g}')
+        require(self.birth in ('clone', 'halve'), f"birth is 'clone' or 'halve', not {self.birth!r}")
+        require(self.tv_size >= 1 and self.tv_stride >= 1, 'tv_size and tv_stride must be at least 1')
         require(self.checkpoint_seconds >= 0, f'checkpoint_seconds must not be negative, not {self.checkpoint_seconds:g}')
         require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
         require(self.render in ('integral', 'alpha'), f"render is 'integral' or 'alpha', not {self.render!r}")
@@ -217,11 +225,11 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # times higher that fall over the run, moments that forget faster, more weight on SSIM, which brings fine detail forward,
 # and earlier densification, as far as the scan's size allows.
 FAST = Settings(
-    init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1500, decay_steps=0,
-    lambda_ssim=1.5, lambda_tv=.1,
-    rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
-    beta1=.8, beta2=.95, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
-    split_keeps_mass=True, values_per_gaussian=20)
+    init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1500, decay_steps=0, extent=3.5,
+    lambda_ssim=1.5, lambda_tv=.3, tv_stride=2,
+    rate_centre=(1e-3, 1e-4), rate_density=(5e-2, 6e-3), rate_scale=(1.5e-1, 1e-2), rate_rotation=(2e-2, 2e-3),
+    beta1=.8, beta2=.95, average=.98, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
+    birth='halve', values_per_gaussian=16)
 
 # Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM TOG 42 (2023), and its released settings, on
 # grey images. Its loss 0.8 L1 + 0.2 (1 - SSIM) is 0.8 times the one here, so that a gradient of 2e-4 there is 2.5e-4 here. Its

@@ -211,11 +211,14 @@ class Stepper:
         return dr.detach(loss) * (1 / batch)
 
     def _total_variation(self, gaussians, rng):
-        """Add the gradient of the total variation of a cube at a random place (R2-Gaussian)."""
+        """Add the gradient of the total variation of a cube at a random place (R2-Gaussian), its samples between the centres
+        of the first and the last voxels."""
         s = self.settings
-        voxel = 2 * self.half / self.geometry.nVoxel
-        shape = tuple(int(min(s.tv_size, n)) for n in self.geometry.nVoxel)
-        corner = -self.half + rng.random(3) * (2 * self.half - shape * voxel)
+        voxel, between = 2 * self.half / self.geometry.nVoxel, np.array(self.geometry.nVoxel) - 1
+        shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
+        room = between - (np.array(shape) - 1) * s.tv_stride
+        corner = -self.half + (.5 - .5 * s.tv_stride + rng.random(3) * room) * voxel
+        voxel = voxel * s.tv_stride
         low, high = vector64(corner), vector64(corner + shape * voxel)
         with dr.suspend_grad():
             centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
