@@ -28,13 +28,13 @@ def centres_of(settings, scan, **more):
 
 
 def test_the_result_is_the_mean_since_the_last_densification():
-    """Of SHORT's, after iterations 6 and 12: the mean begins with the parameters as they are then."""
+    """Of SHORT's, after iterations 6 and 12: the mean begins with the parameters after the next step."""
     scan = tiny_scan(geometry())
     fitted, seen = centres_of(AVERAGED, scan)
     assert fitted.state.born.any() and len(seen) == 16
     for k in PARAMETERS:
-        mean = seen[11][k].astype(float)
-        for value in seen[12:]:
+        mean = seen[12][k].astype(float)
+        for value in seen[13:]:
             mean = .8 * mean + .2 * value[k]
         np.testing.assert_allclose(fitted.state.values[k], mean, rtol=1e-5, atol=1e-5)
         assert not np.allclose(mean, seen[-1][k], rtol=1e-4, atol=1e-4)

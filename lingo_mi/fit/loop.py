@@ -88,21 +88,15 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
                 dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays())
 
     while iteration < settings.iterations:
+        # Not after the last step, which nothing would mend; a longer fit that goes on from there does it first.
+        if iteration < settings.densify_until and (renewed := _renewed(state, stepper, settings, iteration, rng)):
+            state = renewed
+            average.restart()
         while len(order) < settings.batch:  # every view once before any a second time
             order += rng.permutation(len(scan)).tolist()
         views, rest = order[:settings.batch], order[settings.batch:]
         loss = stepper.step(state, views, iteration, rng)
         order, iteration = rest, iteration + 1
-        densifying = iteration < min(settings.densify_until, settings.iterations)  # not what no step would mend
-        if densifying and iteration > settings.densify_from and iteration % settings.densify_every == 0:
-            largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
-            state = DeviceState(densify(state.host(), settings, stepper.half, rng, stepper.flat, largest))
-            average.restart()
-            if len(state) == 0:
-                raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
-        if densifying and settings.reset_every and iteration % settings.reset_every == 0:
-            state = DeviceState(reset_opacity(state.host()))
-            average.restart()
         average.add(state)
         if iteration in marks:
             dr.sync_thread()
@@ -129,6 +123,21 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     store()
     seconds += time.perf_counter() - clock
     return Fitted(state.host(), stepper, settings, points, history, seconds, info)
+
+
+def _renewed(state, stepper, settings, iteration, rng):
+    """The state densified and its opacities reset, as far as they are due after so many iterations; None if neither is."""
+    densifying = iteration > settings.densify_from and iteration % settings.densify_every == 0
+    resetting = settings.reset_every and iteration > 0 and iteration % settings.reset_every == 0
+    if not (densifying or resetting):
+        return None
+    host = state.host()
+    if densifying:
+        largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
+        host = densify(host, settings, stepper.half, rng, stepper.flat, largest)
+        if len(host) == 0:
+            raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+    return DeviceState(reset_opacity(host) if resetting else host)
 
 
 def measure_at(iterations: int) -> list[int]:
@@ -181,7 +190,7 @@ def _same_fit(host, extra, settings, scan, seed, path):
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
-    if settings.decay_steps and not settings.coarse_share and extra['iteration'] <= settings.iterations:
+    if settings.decay_steps and not (settings.coarse_share or settings.average) and extra['iteration'] <= settings.iterations:
         free.add('iterations')  # what was done so far did not depend on it
     changed = [k for k in now if before.get(k) != now[k] and k not in free]
     if extra['seed'] != seed:
