@@ -80,7 +80,7 @@ def without_effects(scan: Scan, cloud: FittedCloud) -> Scan:
     if effects is None:
         return scan
     clean = render_objects([cloud.gaussians], scan.geometry, cloud.extent)
-    seen = render_with(effects, [cloud.gaussians], scan.geometry, np.zeros(len(scan)), 0, cloud.extent)
+    seen = render_with(effects, [cloud.gaussians], scan.geometry, np.arange(len(scan)), 0, cloud.extent)
     left = effects.linearised(Scan(scan.geometry, seen)).projections - clean
     linear = effects.linearised(scan)
     return replace(linear, projections=linear.projections - left)
