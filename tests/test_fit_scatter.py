@@ -18,7 +18,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.scattered import RENEWED, Scattered
 from lingo_mi.fit.state import activate
-from lingo_mi.recon.descatter import linearised
+from lingo_mi.recon.corrections import linearised
 from lingo_mi.results import write_scene
 from lingo_mi.scan import Scan
 from lingo_mi.scanning import load_scene, render_with

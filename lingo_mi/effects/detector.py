@@ -119,6 +119,12 @@ class Detector:
             light = _filled(light / gains, dead)
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
 
+    def deviation(self, transmission) -> np.ndarray:
+        """Standard deviation of a line integral -ln(N / I0) by the noise of its counts, to first order, for transmissions of
+        any shape; at least that of half a count."""
+        counts = self.photons * np.maximum(transmission, self.floor)
+        return np.sqrt(counts + self.electronic_noise ** 2) / counts
+
     def maps(self, shape):
         """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""
         return _maps(self.seed, self.gain, self.dead, tuple(shape))

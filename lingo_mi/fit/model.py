@@ -8,8 +8,9 @@ from scipy import ndimage
 
 from ..effects.forward import Effects
 from ..effects.hardening import hardened, second_share
+from ..errors import InputError
 from ..geometry import Geometry
-from ..recon import descatter
+from ..recon import corrections
 from ..scan import Scan
 from ..xray.quality import Quality
 from .device import uploaded
@@ -78,6 +79,27 @@ def model_of(scan: Scan, settings, unit: float) -> Model | None:
     return Model(effects, scan.geometry, unit)
 
 
+def weights_of(scan: Scan, settings) -> np.ndarray | None:
+    """What pixels are multiplied by before they are compared, float32 [view, v, u]; None where they are as they are.
+
+    One over the standard deviation of a pixel's noise, so that all have the same (as the weights of penalised weighted least
+    squares, Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993, which are squares of these). It follows the mean signal of
+    3 x 3 measured pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The
+    largest projection stays as large as it was, for the sake of the loss's constants.
+
+    Raises InputError for a scan that does not say how many photons it has counted.
+    """
+    if settings.weights == 'equal':
+        return None
+    detector = scan.effects.detector if scan.effects else None
+    if not (detector and detector.photons):
+        raise InputError('weights=noise needs a ct_detector with photons in the scene, or leave it out')
+    p = scan.projections
+    light = ndimage.uniform_filter(np.exp(-p.astype(float)), (1, 3, 3), mode='nearest')
+    weights = 1 / detector.deviation(light)
+    return (weights * (p.max() / (weights * p).max())).astype(np.float32)
+
+
 def trusted(scan: Scan, settings) -> Scan:
     """The scan without the pixels that its detector knows to be dead."""
     effects = scan.effects if settings.effects == 'model' else None
@@ -87,4 +109,4 @@ def trusted(scan: Scan, settings) -> Scan:
 def linearised(scan: Scan, settings) -> Scan:
     """A scan of line integrals at the reference energy for what knows no effects: initial clouds, FDK."""
     effects = scan.effects if settings.effects == 'model' else None
-    return scan if effects is None else descatter.linearised(scan, effects)
+    return scan if effects is None else corrections.linearised(scan, effects)

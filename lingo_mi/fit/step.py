@@ -20,7 +20,7 @@ from ..xray.voxelize import Grid, voxelize
 from . import losses
 from .device import DeviceState, uploaded
 from .loss_scale import loss_scale
-from .model import RENEWED, model_of, trusted
+from .model import RENEWED, model_of, trusted, weights_of
 from .poses import Poses, gathered, place
 from .scattered import RENEWED as SCATTER_RENEWED, light
 from .settings import Settings
@@ -28,15 +28,18 @@ from .settings import Settings
 
 class Target:
     """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), which of
-    them are valid (None: all), and the scattered light that is expected in them (None: none)."""
+    them are valid (None: all), what they are multiplied by before they are compared (None: nothing), and the scattered light
+    that is expected in them (None: none)."""
 
-    def __init__(self, scan: Scan, index: int, unit: float):
+    def __init__(self, scan: Scan, index: int, unit: float, weights=None):
         height, width = scan.geometry.nDetector
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
         self.frames = scan.geometry.normalised_frames()[[index]]
         self.view = View.of(self.frames, 0, height, width, panel=False)
-        self.pixels = mi.Float(scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit))
+        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
+        self.weights = None if weights is None else uploaded(weights[index].ravel())
+        self.pixels = mi.Float(pixels if weights is None else pixels * weights[index].ravel())
         dr.eval(self.pixels)
         self.valid, self.scattered = None, None
         if scan.valid is not None and not scan.valid[index].all():
@@ -44,11 +47,18 @@ class Target:
             dr.make_opaque(self.valid)
 
     def seen(self, image):
-        """An image as this view compares it: pixels that are not valid are zero, in it as in the measured one.
+        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
 
         To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
         """
+        if self.weights is not None:
+            image = image * self.weights
         return image if self.valid is None else dr.select(self.valid, image, 0)
+
+
+def _targets(scan, unit, settings):
+    weights = weights_of(scan, settings)
+    return [Target(scan, i, unit, weights) for i in range(len(scan))]
 
 
 class Stepper:
@@ -62,10 +72,9 @@ class Stepper:
         self.model = model_of(scan, settings, self.unit)
         self.share = None  # of the second of two materials in every Gaussian, as the steps know it
         self.scattered = None  # what `Scattered.estimate` gave, as the steps know it
-        self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
+        self.targets = _targets(scan, self.unit, settings)
         self.coarse_until = round(settings.coarse_share * settings.iterations)
-        coarse = scan.binned(2) if self.coarse_until else scan
-        self.coarse = [Target(coarse, i, self.unit) for i in range(len(scan))] if self.coarse_until else []
+        self.coarse = _targets(scan.binned(2), self.unit, settings) if self.coarse_until else []
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1

@@ -10,9 +10,10 @@ from ..effects.forward import Effects, find_effects
 from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Dataset, Scan
-from ..scanning import load_scene, render_objects, render_with
+from ..scanning import load_scene, render_objects
 from ..xray.objects import Ellipsoids, find_objects
 from .circle import require_circle
+from .corrections import corrected
 from .fdk import gaps
 
 
@@ -71,19 +72,9 @@ def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
 
 
 def without_effects(scan: Scan, cloud: FittedCloud) -> Scan:
-    """The line integrals of measured views, at the reference energy of the effects that the cloud's fit has modelled.
-
-    Linearised, plus what linearising leaves of the effects in the cloud's own views: blur, and the second material, corrected
-    as by Joseph and Spital (J. Comput. Assist. Tomogr. 2, 1978). Where the fit has modelled none, the projections themselves.
-    """
-    effects = cloud.effects
-    if effects is None:
-        return scan
-    clean = render_objects([cloud.gaussians], scan.geometry, cloud.extent)
-    seen = render_with(effects, [cloud.gaussians], scan.geometry, np.arange(len(scan)), 0, cloud.extent)
-    left = effects.linearised(Scan(scan.geometry, seen)).projections - clean
-    linear = effects.linearised(scan)
-    return replace(linear, projections=linear.projections - left)
+    """The line integrals of measured views, `corrected` by the cloud for the effects that its fit has modelled; where it has
+    modelled none, the projections themselves."""
+    return scan if cloud.effects is None else corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
 
 
 def complete(scan: Scan, cloud: FittedCloud, views: int) -> Scan:
