@@ -84,8 +84,8 @@ def weights_of(scan: Scan, settings) -> np.ndarray | None:
 
     One over the standard deviation of a pixel's noise, so that all have the same (as the weights of penalised weighted least
     squares, Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993, which are squares of these). It follows the mean signal of
-    3 x 3 measured pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The
-    largest projection stays as large as it was, for the sake of the loss's constants.
+    3 x 3 valid pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The largest
+    projection stays as large as it was, for the sake of the loss's constants.
 
     Raises InputError for a scan that does not say how many photons it has counted.
     """
@@ -95,8 +95,9 @@ def weights_of(scan: Scan, settings) -> np.ndarray | None:
     if not (detector and detector.photons):
         raise InputError('weights=noise needs a ct_detector with photons in the scene, or leave it out')
     p = scan.projections
-    light = ndimage.uniform_filter(np.exp(-p.astype(float)), (1, 3, 3), mode='nearest')
-    weights = 1 / detector.deviation(light)
+    valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
+    light, share = (ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
+    weights = 1 / detector.deviation(light / np.maximum(share, .1))
     return (weights * (p.max() / (weights * p).max())).astype(np.float32)
 
 
