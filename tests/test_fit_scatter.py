@@ -140,7 +140,7 @@ def scans():
     ball = GridInCube.of((.0205 * np.clip((108 - r) / 16, 0, 1)).astype(np.float32), [-128] * 3, [128] * 3, 'ball')
     few = replace(FEW, paths=256)
     lit, clean = (render_with(e, [ball], g, np.arange(12), 0) for e in (effects_of(replace(few, seed=5)), effects_of(None)))
-    return Scan(g, clean), Scan(g, lit, effects=effects_of(few))
+    return Scan(g, clean), Scan(g, lit, effects=replace(effects_of(few), detector=detector(photons=300.)))
 
 
 def test_linearised(scans):

@@ -15,7 +15,7 @@ has the same noise whichever others are rendered, and in any order.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -77,6 +77,11 @@ class Detector:
     def measures(self) -> bool:
         """Whether anything happens to the signal after the light: noise, gains, saturation, digits, dead pixels."""
         return any((self.photons, self.saturation, self.bits, self.dead, self.gain))
+
+    @property
+    def expected(self) -> Detector:
+        """The same, of which only what happens to the light is left."""
+        return replace(self, photons=0., electronic_noise=0., saturation=0., bits=0, dead=0., gain=0.)
 
     @property
     def floor(self) -> float:

@@ -131,19 +131,17 @@ class Stepper:
         frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
-        scattered = None
+        scattered = [None] * len(geometry)
         if self.model is not None and self.model.scattered:
-            scattered = light(self.model.scattered.estimate(self.cloud(state), geometry), geometry)
+            found = self.model.scattered.estimate(self.cloud(state), geometry)
+            scattered = [uploaded(image.ravel()) for image in light(found, geometry)]
 
         def integrals(rays):
             return self._integrals(project(*gaussians, rays, self.settings.extent), rays, share)
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
-            if self.model is None:
-                image = integrals(view)[0]
-            else:
-                image = self.model.image(integrals, view, None if scattered is None else uploaded(scattered[i].ravel()))
+            image = integrals(view)[0] if self.model is None else self.model.image(integrals, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))

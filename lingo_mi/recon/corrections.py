@@ -22,6 +22,7 @@ def corrected(scan: Scan, effects: Effects, objects, extent: float = 8.) -> Scan
     Linearised, less what linearising leaves of the effects in the objects' own views: blur, scatter, and the second material,
     as Joseph and Spital (J. Comput. Assist. Tomogr. 2, 1978) do.
 
+    effects   without noise: they say what is expected
     objects   as of `xray.objects.find_objects`; Gaussians end at `extent` standard deviations
     """
     clean = render_objects(objects, scan.geometry, extent)
@@ -46,7 +47,8 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
         return found
     g = scan.geometry
     scatter = effects.scatter.within(g)
-    effects = replace(effects, scatter=scatter, tube=replace(effects.tube, material=effects.tube.fitted(), materials={}))
+    effects = replace(effects, scatter=scatter, detector=effects.detector and effects.detector.expected,
+                      tube=replace(effects.tube, material=effects.tube.fitted(), materials={}))
     shape = np.ceil(np.array(g.sVoxel) * scatter.voxels / max(g.sVoxel) - 1e-6).astype(int).clip(1).tolist()
     coarse = g.with_volume(shape, [s / n for s, n in zip(g.sVoxel, shape)])
     for _ in range(PASSES):
