@@ -15,6 +15,7 @@ from lingo_mi.effects.scatter import Scatter
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fit import step
 from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.scattered import RENEWED, Scattered
 from lingo_mi.fit.state import activate
@@ -159,11 +160,10 @@ def test_linearised(scans):
 
 def test_a_fit_that_models_it_finds_the_volume(scans):
     clean, lit = scans
-    settings = SHORT.changed(iterations=120, densify_from=1000)
-    start = some_points(clean.geometry, 200)
     volumes = []
     for scan, change in ((clean, 'model'), (lit, 'model'), (lit, 'ignore')):
-        fitted = run(scan, settings.changed(effects=change), start, seed=3)
+        settings = SHORT.changed(iterations=60, densify_from=1000, init='lingo', init_density='fdk', n_points=200, effects=change)
+        fitted = run(scan, settings, initial_cloud(scan, settings), seed=3)
         volumes.append(fitted.stepper.volume(DeviceState(fitted.state)))
     errors = [np.linalg.norm(v - volumes[0]) / np.linalg.norm(volumes[0]) for v in volumes[1:]]
     assert errors[0] < .4 * errors[1] and errors[1] > .05
