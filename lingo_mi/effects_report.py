@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,12 +33,16 @@ class Experiment:
 
     title   in tables and pictures
     model   settings of the fit that models it, besides those of the others
+    ignore  the same of the fit that ignores it
+    scene   parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have
     turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
                   not told
     """
 
     title: str
     model: dict = field(default_factory=dict)
+    ignore: dict = field(default_factory=dict)
+    scene: dict = field(default_factory=dict)
     turn: float = 0.
     shift: float = 0.
 
@@ -48,7 +52,11 @@ EXPERIMENTS = dict(
     focal_spot=Experiment('focal spot of 2 mm, magnified 6 times'),
     psf=Experiment('point spread of 3 pixels'),
     dead_pixels=Experiment('every tenth pixel dead'),
-    misalignment=Experiment('views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), .5, 1.),
+    misalignment=Experiment('views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), turn=.5, shift=1.),
+    scatter=Experiment('scatter and hardening of a chest, 120 kVp'),
+    noise=Experiment('noise of 3000 photons a pixel', dict(weights='noise')),
+    truncation=Experiment('panel of half the width', dict(outside='ignore'), dict(outside='invalid'),
+                          dict(clean=dict(across='64', columns='96'), model=dict(across='64'))),
 )
 
 
@@ -65,23 +73,45 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
     if name not in EXPERIMENTS:
         raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
     experiment = EXPERIMENTS[name]
-    loaded = load_scene(SCENES / f'{name}.xml', parameters)
+    scenes, found = {}, {}
+    for kind, changes in dict(clean={}, ignore=dict(effects='ignore') | experiment.ignore, model=experiment.model).items():
+        given = (parameters or {}) | experiment.scene.get(kind, {})
+        key = tuple(sorted(given.items()))
+        if key not in scenes:
+            scenes[key] = scans(name, given, seed)
+        what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], settings.changed(**changes)
+        fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
+        found[kind] = fitted.stepper.volume(DeviceState(fitted.state)), pace(fitted.history)
+    first = next(iter(scenes.values()))  # of the clean scan
+    shape = np.min([volume.shape for volume, _ in found.values()], 0)
+    truth = middle(first['truth'], shape)
+    fits = {kind: quality(middle(volume, shape), truth) | dict(ms_per_iteration=ms, volume=middle(volume, shape))
+            for kind, (volume, ms) in found.items()}
+    return dict(title=experiment.title, largest=float(first['clean'].projections.max()), truth=truth,
+                spacing=list(first['clean'].geometry.dVoxel), **fits)
+
+
+def scans(name: str, parameters: dict, seed: int) -> dict:
+    """A clean scan of an experiment's scene, a scan with its effect, and the truth [x, y, z], None where the grid is not the
+    object's own."""
+    experiment, loaded = EXPERIMENTS[name], load_scene(SCENES / f'{name}.xml', parameters)
     dataset = take_scan(loaded, seed=seed)
-    scan, truth = dataset.train, dataset.volume
-    objects = find_objects(loaded.scene)
+    scan, objects = dataset.train, find_objects(loaded.scene)
     clean = Scan(scan.geometry, render_objects(objects, scan.geometry))
     if experiment.turn or experiment.shift:
         moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
         scan = Scan(scan.geometry, render_objects(objects, moved))
-    fits = {}
-    for kind, (what, changes) in dict(clean=(clean, {}), ignore=(scan, dict(effects='ignore')),
-                                      model=(scan, experiment.model)).items():
-        chosen = settings.changed(**changes)
-        fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
-        volume = fitted.stepper.volume(DeviceState(fitted.state))
-        fits[kind] = quality(volume, truth) | dict(ms_per_iteration=pace(fitted.history), volume=volume)
-    return dict(title=experiment.title, largest=float(clean.projections.max()), truth=truth,
-                spacing=list(scan.geometry.dVoxel), **fits)
+    if scan.effects and scan.effects.scatter:  # a fit must not know the random numbers of its data, and may be quicker
+        scatter = scan.effects.scatter
+        scan = replace(scan, effects=replace(scan.effects, scatter=replace(
+            scatter, paths=-(-scatter.paths // 4), seed=scatter.seed + 1)))
+    return dict(clean=clean, scan=scan, truth=dataset.volume)
+
+
+def middle(volume, shape):
+    """The middle of a volume [x, y, z] of at least a shape."""
+    first = [(n - m) // 2 for n, m in zip(volume.shape, shape)]
+    return volume[tuple(slice(a, a + m) for a, m in zip(first, shape))]
 
 
 def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geometry:

@@ -151,9 +151,10 @@ def write_scene(path: Path, geometry, extent: float, effects=None):
     if effects is not None and effects.tube:
         spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
         given = {k: v for k, v in effects.tube.given.items() if not (v is None or v == '' or k.startswith('material'))}
-        if effects.tube.hardens:  # the cloud stands for all shapes
+        if effects.tube.hardens or effects.scatter:  # the cloud stands for all shapes
             given['material'] = ' + '.join(effects.tube.fitted())
-        lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot, 8), '    </emitter>']
+        scatter = effects.scatter.within(geometry).given if effects.scatter else {}
+        lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot | scatter, 8), '    </emitter>']
     path.write_text('\n'.join([*lines, '</scene>']) + '\n', encoding='utf-8')
 
 

@@ -71,6 +71,10 @@ class XRayTube(mi.Emitter):
        - |int|
        - Voxels along the longest side of the box of all objects, on which they are sampled for it, 1 to 512. A single
          grid is used as it is. (Default: 64)
+     * - scatter_box
+       - |string|
+       - "x0, y0, z0, x1, y1, z1": the lowest and the highest corner, mm, of a box outside which nothing scatters.
+         (Default: that of all objects, Gaussians out to 4 standard deviations)
      * - scatter_seed
        - |int|
        - Of its random numbers. (Default: 0)
@@ -113,4 +117,5 @@ class XRayTube(mi.Emitter):
 create = XRayTube
 
 _DEFAULTS = dict(energy=None, kvp=None, angle=12., filtration='Al 2.5', reference=None, material='', split='', bands=4)
-_SCATTER = dict(scatter=0, scatter_grid='16', scatter_orders=-1, scatter_voxels=64, scatter_energies=3, scatter_seed=0)
+_SCATTER = dict(scatter=0, scatter_grid='16', scatter_orders=-1, scatter_voxels=64, scatter_energies=3, scatter_seed=0,
+                scatter_box='')

@@ -8,7 +8,8 @@
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both. Where the true volume is known, PSNR and SSIM are printed.
-Beam hardening that the scene's tube names is taken out of the projections first.
+Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
+given; with --complete, those that the fit has modelled.
 """
 import argparse
 import inspect
@@ -36,7 +37,7 @@ def arguments():
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument('-D', dest='define', action='append', default=[], metavar='NAME=VALUE',
                    help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of '
-                   'the scene file')
+                   'the scene file; effects=ignore takes projections for line integrals')
     return p.parse_args()
 
 
@@ -79,6 +80,7 @@ def main():
     from lingo_mi.progress import Progress
     from lingo_mi.recon.asd_pocs import asd_pocs
     from lingo_mi.recon.cgls import cgls
+    from lingo_mi.recon.corrections import linearised
     from lingo_mi.recon.fdk import fdk
     from lingo_mi.recon.sart import os_sart, sart, sirt
     from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud
@@ -92,7 +94,11 @@ def main():
     run = {'fdk': fdk, 'sart': sart, 'os-sart': os_sart, 'sirt': sirt, 'cgls': cgls, 'asd-pocs': asd_pocs,
            'voxelize': voxelize_cloud}[args.algorithm]
     defined, own = definitions(args.define), defaults(args.scene)
-    given = options(run, {k: v for k, v in defined.items() if k not in own})
+    chosen = {k: v for k, v in defined.items() if k not in own}
+    effects = chosen.pop('effects', 'model')
+    if effects not in ('model', 'ignore') or effects == 'ignore' and args.complete:
+        raise InputError(f"-D effects={effects}: must be 'model' or 'ignore', and with --complete goes by the fit")
+    given = options(run, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     cloud = load_cloud(args.complete) if args.complete else None
@@ -106,8 +112,8 @@ def main():
     else:
         if args.complete:
             scan = complete(fitted_views(dataset, cloud.geometry), cloud, args.views)
-        elif scan.effects is not None:
-            scan = scan.effects.linearised(scan)
+        elif scan.effects is not None and effects == 'model':
+            scan = linearised(scan, scan.effects)
         began = time.monotonic()
         volume, residuals = reconstruct(run, scan, given, Progress)
     seconds = time.monotonic() - began

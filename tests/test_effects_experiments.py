@@ -11,7 +11,7 @@ TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12'
 
 
 def test_every_experiment_has_its_scene():
-    assert set(EXPERIMENTS) <= {path.stem for path in SCENES.glob('*.xml')}
+    assert set(EXPERIMENTS) == {path.stem for path in SCENES.glob('*.xml')}
     with pytest.raises(InputError, match='no experiment'):
         measure('rain')
 

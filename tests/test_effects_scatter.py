@@ -323,6 +323,8 @@ def test_scan(scene_file):  # noqa: F811
     ('<integer name="scatter" value="9"/><string name="scatter_grid" value="2"/>', 'scatter_grid must be one or two whole'),
     ('<integer name="scatter" value="9"/><integer name="scatter_orders" value="0"/>', 'scatter_orders must be positive'),
     ('<integer name="scatter" value="9"/><integer name="scatter_energies" value="0"/>', 'scatter_energies must be'),
+    ('<integer name="scatter" value="9"/><string name="scatter_box" value="0,0,0,1,1"/>', 'scatter_box must be x, y, z'),
+    ('<integer name="scatter" value="9"/><string name="scatter_box" value="0,0,0,1,1,0"/>', 'scatter_box must be x, y, z'),
     ('<integer name="scatter" value="9"/><string name="scatter_voxels" value="many"/>', 'scatter_voxels must be')])
 def test_one_line_that_names_element_and_place(scene_file, given, match):  # noqa: F811
     with pytest.raises(InputError, match=match) as caught:

@@ -22,6 +22,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.loss_scale import loss_scale
+from lingo_mi.fit.model import weights_of
 from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
 from lingo_mi.scan import Scan
@@ -225,6 +226,28 @@ def test_dead_pixels_are_left_out():
     dead = scan.effects.detector.maps(scan.geometry.nDetector)[1]
     np.testing.assert_array_equal(masks[0].numpy(), ~dead.ravel())
     assert masks[1] is None and 0 < dead.sum() < dead.size
+
+
+def test_noise_is_weighed():
+    """Weighted, all pixels have the same noise, dark ones too; what is not valid spoils no neighbour."""
+    seen = detector(photons=2000., electronic_noise=5.)
+    p = np.broadcast_to(np.repeat([0., 1., 2., 3.], 8), (2, 32, 32))
+    g, effects = geometry(2), Effects(None, None, seen)
+    valid = np.ones(p.shape, bool)
+    valid[:, 5:7, 8:20] = False
+    scan, settings = Scan(g, np.where(valid, p, np.nan), valid, effects), SHORT.changed(weights='noise')
+    weights = weights_of(scan, settings)
+    noisy = np.stack([seen.measure(np.exp(-p[0]), view) for view in range(400)])[:, 12:]
+    inner = [slice(8 * i + 1, 8 * i + 7) for i in range(4)]
+    spread = np.array([(noisy * weights[0, 12:])[:, :, at].std() for at in inner])
+    np.testing.assert_allclose(spread, spread[0], rtol=.04)  # of the second order: 100 photons
+    np.testing.assert_allclose((weights * scan.projections).max(), 3, rtol=1e-6)
+    np.testing.assert_allclose(weights[0, 5:7, 9:15], weights[0, 20, 12], rtol=1e-6)
+    target = Stepper(scan, settings).targets[0]
+    np.testing.assert_allclose(target.seen(target.pixels / target.weights).numpy(), target.pixels.numpy(), rtol=1e-6)
+    for without in (None, Effects(None, None, detector(psf=1.))):
+        with pytest.raises(InputError, match='weights=noise needs a ct_detector with photons'):
+            Stepper(replace(scan, effects=without), settings)
 
 
 @physics

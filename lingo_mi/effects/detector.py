@@ -15,7 +15,7 @@ has the same noise whichever others are rendered, and in any order.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -79,6 +79,11 @@ class Detector:
         return any((self.photons, self.saturation, self.bits, self.dead, self.gain))
 
     @property
+    def expected(self) -> Detector:
+        """The same, of which only what happens to the light is left."""
+        return replace(self, photons=0., electronic_noise=0., saturation=0., bits=0, dead=0., gain=0.)
+
+    @property
     def floor(self) -> float:
         """The least transmission that is told from none."""
         return max(.5 / self.photons if self.photons else DARKEST, .5 * self._step)
@@ -118,6 +123,12 @@ class Detector:
             gains, dead = self.maps(light.shape)
             light = _filled(light / gains, dead)
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
+
+    def deviation(self, transmission) -> np.ndarray:
+        """Standard deviation of a line integral -ln(N / I0) by the noise of its counts, to first order, for transmissions of
+        any shape; at least that of half a count."""
+        counts = self.photons * np.maximum(transmission, self.floor)
+        return np.sqrt(counts + self.electronic_noise ** 2) / counts
 
     def maps(self, shape):
         """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""

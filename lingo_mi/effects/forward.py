@@ -33,7 +33,7 @@ class Effects:
     @property
     def ideal(self) -> bool:
         """Whether the expected signal is exp(-line integral) along the ray through a pixel's centre."""
-        return not (self.tube and self.tube.hardens or self.spot and max(self.spot.size)
+        return not (self.tube and self.tube.hardens or self.spot and max(self.spot.size) or self.scatter
                     or self.detector and (self.detector.aperture or self.detector.psf))
 
     def scaled(self, factor: float) -> Effects:

@@ -85,11 +85,11 @@ class Tube:
         names = tuple(dict.fromkeys([*self.material, *(name for shape in self.materials.values() for name in shape)]))
         if not names:
             raise InputError('xray_tube: without a material a spectrum says nothing: add <string name="material" '
-                             'value="water"/>, or fit with effects=ignore')
+                             'value="water"/>, or leave it out with -D effects=ignore')
         if len(names) > 2 or len(names) == 2 and self.split is None:
             raise InputError(f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
                              + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
-                             + ', or fit with effects=ignore')
+                             + ', or leave it out with -D effects=ignore')
         return names
 
     def signal(self, names, response: str = 'energy') -> energy_bands.Bands:

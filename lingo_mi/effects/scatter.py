@@ -14,7 +14,7 @@ Scattered photons are attenuated at the energy at which they left the tube.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -46,9 +46,10 @@ class Scatter:
     voxels: int = 64
     energies: int = 3
     seed: int = 0
+    box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @staticmethod
-    def of(paths, grid, orders, voxels, energies, seed) -> Scatter | None:
+    def of(paths, grid, orders, voxels, energies, seed, box) -> Scatter | None:
         """From plugin parameters, None without paths. Raises InputError."""
         for name, value, least, most in (
                 ('scatter', paths, 0, MOST_PATHS), ('scatter_orders', orders, -1, MOST_ORDERS),
@@ -65,7 +66,19 @@ class Scatter:
         if len(numbers) not in (1, 2) or not all(LEAST_GRID <= x <= MOST_GRID for x in numbers):
             raise InputError(f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and '
                              f'columns, not {grid!r}')
-        return Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed) if paths else None
+        return Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed, _corners(box)) if paths else None
+
+    def within(self, geometry) -> Scatter:
+        """The same, but nothing scatters outside the volume of a `Geometry`."""
+        centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+        return replace(self, box=(tuple((centre - half).tolist()), tuple((centre + half).tolist())))
+
+    @property
+    def given(self) -> dict:
+        """The parameters of `xray_tube` that make it."""
+        box = {} if self.box is None else dict(scatter_box=', '.join(repr(x) for corner in self.box for x in corner))
+        return dict(scatter=self.paths, scatter_grid='{}, {}'.format(*self.grid), scatter_orders=self.orders,
+                    scatter_voxels=self.voxels, scatter_energies=self.energies, scatter_seed=self.seed) | box
 
     def light(self, objects, tube, response: str, view, index: int):
         """Scattered signal over the open beam's, Float [height * width], at the pixel centres of a view; not differentiable.
@@ -83,10 +96,10 @@ class Scatter:
     def estimate(self, objects, tube, response: str, view, index: int):
         """The same on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
-            key, made_of = (response, self.voxels, self.energies), (tube, *objects)
+            key, made_of = (response, self.voxels, self.energies, self.box), (tube, *objects)
             if not (_LATEST and key == _LATEST[0] and len(made_of) == len(_LATEST[1])
                     and all(a is b for a, b in zip(made_of, _LATEST[1]))):
-                _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies)
+                _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies, self.box)
             low, high, beam, scenes = _LATEST[2]
             beam.aim(view)
             rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
@@ -100,6 +113,19 @@ class Scatter:
 
 
 _LATEST: list = []  # what was last made of which objects: all views of a scan share it
+
+
+def _corners(text):
+    """Two corners from a plugin's parameter, None from an empty one."""
+    if text == '':
+        return None
+    try:
+        numbers = [float(x) for x in str(text).replace(',', ' ').split()]
+    except ValueError:
+        numbers = []
+    if not (len(numbers) == 6 and np.isfinite(numbers).all() and all(a < b for a, b in zip(numbers, numbers[3:]))):
+        raise InputError(f'scatter_box must be x, y, z of its lowest and of its highest corner, mm, not {text!r}')
+    return tuple(numbers[:3]), tuple(numbers[3:])
 
 
 def smoothed(means, errors, height: int, width: int) -> np.ndarray:
@@ -117,13 +143,12 @@ def smoothed(means, errors, height: int, width: int) -> np.ndarray:
 #  The scene
 # ----------------------------------------------------------------------------------------------------------------------
 
-def _scenes(objects, tube, response, voxels, energies):
+def _scenes(objects, tube, response, voxels, energies, box):
     """The box of the objects, the beam, and (weight, scene) of every energy; none where nothing attenuates."""
-    if len(objects) == 1 and isinstance(objects[0], GridInCube):
-        low, high = np.array(objects[0].low, float).ravel(), np.array(objects[0].high, float).ravel()
+    low, high = bounds(objects) if box is None else np.array(box)
+    if len(objects) == 1 and isinstance(objects[0], GridInCube) and box is None:
         shape = tuple(objects[0].size)
     else:
-        low, high = bounds(objects)
         step = (high - low).max() / voxels
         shape = tuple(np.maximum(1, np.ceil((high - low) / step - 1e-6)).astype(int).tolist())
     step = (high - low) / shape
@@ -215,7 +240,7 @@ class _Rays:
         for h in height[1:]:
             nearest = dr.minimum(nearest, h)
         if dr.any(nearest <= 0):
-            raise InputError('scatter: the box of the objects reaches the panel; move the panel, or make the box smaller')
+            raise InputError('scatter: the box of the objects reaches the panel; move the panel, or give a smaller scatter_box')
         dr.eval(self.shifted, self.origin, self.normal, self.open)
 
     def means(self, integrator, scene, rng) -> np.ndarray:

@@ -43,7 +43,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     else:
         def render(points, density, spacing, views):
             state = start(points, spacing, density / unit, settings)
-            stepper = Stepper(scan.subset(views[:1]), settings, unit)
+            stepper = Stepper(scan.subset(views[:1]), settings.changed(weights='equal'), unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
         density = 'lsq' if settings.init_density == 'fdk' and not on_circle(scan) else settings.init_density
         chosen = lingo.Settings(

@@ -8,9 +8,13 @@ from scipy import ndimage
 
 from ..effects.forward import Effects
 from ..effects.hardening import hardened, second_share
+from ..errors import InputError
+from ..geometry import Geometry
+from ..recon import corrections
 from ..scan import Scan
 from ..xray.quality import Quality
 from .device import uploaded
+from .scattered import Scattered
 
 RENEWED = 50  # steps after which the shares of two materials are looked at again
 
@@ -23,30 +27,33 @@ class Model:
     Spital, J. Comput. Assist. Tomogr. 2, 1978, who divide a first reconstruction so); the shares are constants to the
     derivatives and are renewed now and then.
 
-    effects   with lengths in the fit's frame
-    bands     of the spectrum; None where nothing hardens
-    split     densities between which the second material's share rises, 1/mm; None for one material
+    effects     with lengths in the fit's frame
+    bands       of the spectrum; None where no material matters
+    split       densities between which the second material's share rises, 1/mm; None for one material
+    scattered   what the cloud scatters; None where the scan is without
     """
 
-    def __init__(self, effects: Effects, scale: float, unit: float):
-        """scale: of the fit's lengths over mm; unit: the density that counts as 1, 1/mm."""
-        self.effects = effects.scaled(scale)
-        self.factor = dr.opaque(mi.Float, unit / scale)
+    def __init__(self, effects: Effects, geometry: Geometry, unit: float):
+        """unit: the density that counts as 1, 1/mm."""
+        self.effects = effects.scaled(geometry.scale)
+        self.factor = dr.opaque(mi.Float, unit / geometry.scale)
         self.bands, self.split = None, None
-        if effects.tube and effects.tube.hardens:
+        self.scattered = Scattered(effects, geometry) if effects.scatter else None
+        if effects.tube and (effects.tube.hardens or effects.scatter):
             names = effects.tube.fitted()
             self.bands = effects.tube.signal(names, effects.response)
             self.split = effects.tube.split if len(names) == 2 else None
 
-    def image(self, integrals, view):
+    def image(self, integrals, view, scattered=None):
         """What the pixels of a view are expected to be, Float [height * width]; differentiable.
 
         integrals   gives line integrals along the rays of a View, one Float a material
+        scattered   light over the open beam's, Float [height * width], a constant to the derivatives; None: none
         """
         def seen(rays):
             parts = [self.factor * q for q in integrals(rays)]
             return hardened(parts, self.bands) if self.bands else parts[0]
-        return self.effects.averaged(seen, view, Quality()) / self.factor
+        return self.effects.averaged(seen, view, Quality(), scattered) / self.factor
 
     def shares(self, volume, centres, half):
         """The second material's share in every Gaussian's density, Float [N]; None for one material.
@@ -69,7 +76,29 @@ def model_of(scan: Scan, settings, unit: float) -> Model | None:
     effects = scan.effects if settings.effects == 'model' else None
     if effects is None or effects.ideal:
         return None
-    return Model(effects, scan.geometry.scale, unit)
+    return Model(effects, scan.geometry, unit)
+
+
+def weights_of(scan: Scan, settings) -> np.ndarray | None:
+    """What pixels are multiplied by before they are compared, float32 [view, v, u]; None where they are as they are.
+
+    One over the standard deviation of a pixel's noise, so that all have the same (as the weights of penalised weighted least
+    squares, Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993, which are squares of these). It follows the mean signal of
+    3 x 3 valid pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The largest
+    projection stays as large as it was, for the sake of the loss's constants.
+
+    Raises InputError for a scan that does not say how many photons it has counted.
+    """
+    if settings.weights == 'equal':
+        return None
+    detector = scan.effects.detector if scan.effects else None
+    if not (detector and detector.photons):
+        raise InputError('weights=noise needs a ct_detector with photons in the scene, or leave it out')
+    p = scan.projections
+    valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
+    light, share = (ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
+    weights = 1 / detector.deviation(light / np.maximum(share, .1))
+    return (weights * (p.max() / (weights * p).max())).astype(np.float32)
 
 
 def trusted(scan: Scan, settings) -> Scan:
@@ -81,4 +110,4 @@ def trusted(scan: Scan, settings) -> Scan:
 def linearised(scan: Scan, settings) -> Scan:
     """A scan of line integrals at the reference energy for what knows no effects: initial clouds, FDK."""
     effects = scan.effects if settings.effects == 'model' else None
-    return scan if effects is None else effects.linearised(scan)
+    return scan if effects is None else corrections.linearised(scan, effects)

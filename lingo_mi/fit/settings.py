@@ -50,6 +50,8 @@ class Settings:
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
     tv_stride          voxels from sample to sample (own: 2 smooths eight times the volume at the same cost; published: 1)
+    weights            'equal', or 'noise' (own): an image and the measured one are compared after each pixel is divided by
+                       the standard deviation of its noise, as the scan's `ct_detector` says it is
     loss_scale         'none'; 'dynamic', the paper's T_g + 1 / (4 T_g) on the whole loss; or 'statistic', the same
                        factor on the densification statistic alone (Adam cancels a constant factor anyway)
 
@@ -110,6 +112,7 @@ class Settings:
     lambda_tv: float = .05
     tv_size: int = 32
     tv_stride: int = 1
+    weights: str = 'equal'
     loss_scale: str = 'none'
     rate_centre: tuple[float, float] = (2e-4, 2e-5)
     rate_density: tuple[float, float] = (1e-2, 1e-3)
@@ -168,6 +171,7 @@ class Settings:
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
+        require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
         require(self.max_gaussians >= 1, f'max_gaussians must be at least 1, not {self.max_gaussians}')
         require(self.values_per_gaussian >= 0,
                 f'values_per_gaussian must not be negative, not {self.values_per_gaussian:g}')

@@ -16,40 +16,52 @@ from ..scan import Scan
 from ..xray.alpha import composite, flatten
 from ..xray.footprint import project
 from ..xray.frame import View, vector64
+from ..xray.objects import Ellipsoids
 from ..xray.radiance import seen
 from ..xray.splat import splat
 from ..xray.voxelize import Grid, voxelize
 from . import losses
 from .device import DeviceState, uploaded
 from .loss_scale import loss_scale
-from .model import RENEWED, model_of, trusted
+from .model import RENEWED, model_of, trusted, weights_of
 from .poses import Poses, gathered, place
+from .scattered import RENEWED as SCATTER_RENEWED, light
 from .settings import Settings
 
 
 class Target:
-    """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), and which
-    of them are valid (None: all)."""
+    """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), which of
+    them are valid (None: all), what they are multiplied by before they are compared (None: nothing), and the scattered light
+    that is expected in them (None: none)."""
 
-    def __init__(self, scan: Scan, index: int, unit: float):
+    def __init__(self, scan: Scan, index: int, unit: float, weights=None):
         height, width = scan.geometry.nDetector
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
         self.frames = scan.geometry.normalised_frames()[[index]]
         self.view = View.of(self.frames, 0, height, width, panel=False)
-        self.pixels = mi.Float(scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit))
+        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
+        self.weights = None if weights is None else uploaded(weights[index].ravel())
+        self.pixels = mi.Float(pixels if weights is None else pixels * weights[index].ravel())
         dr.eval(self.pixels)
-        self.valid = None
+        self.valid, self.scattered = None, None
         if scan.valid is not None and not scan.valid[index].all():
             self.valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(self.valid)
 
     def seen(self, image):
-        """An image as this view compares it: pixels that are not valid are zero, in it as in the measured one.
+        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
 
         To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
         """
+        if self.weights is not None:
+            image = image * self.weights
         return image if self.valid is None else dr.select(self.valid, image, 0)
+
+
+def _targets(scan, unit, settings):
+    weights = weights_of(scan, settings)
+    return [Target(scan, i, unit, weights) for i in range(len(scan))]
 
 
 class Stepper:
@@ -62,10 +74,10 @@ class Stepper:
         self.unit = density_unit(scan, settings) if unit is None else unit
         self.model = model_of(scan, settings, self.unit)
         self.share = None  # of the second of two materials in every Gaussian, as the steps know it
-        self.targets = [Target(scan, i, self.unit) for i in range(len(scan))]
+        self.scattered = None  # what `Scattered.estimate` gave, as the steps know it
+        self.targets = _targets(scan, self.unit, settings)
         self.coarse_until = round(settings.coarse_share * settings.iterations)
-        coarse = scan.binned(2) if self.coarse_until else scan
-        self.coarse = [Target(coarse, i, self.unit) for i in range(len(scan))] if self.coarse_until else []
+        self.coarse = _targets(scan.binned(2), self.unit, settings) if self.coarse_until else []
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
@@ -79,6 +91,8 @@ class Stepper:
         s = self.settings
         if self.share is None or iteration % RENEWED == 0 or dr.width(self.share) != len(state):
             self.share = self.shares(state)
+        if self.model is not None and self.model.scattered and iteration in {round(x * s.iterations) for x in SCATTER_RENEWED}:
+            self.scatter(state)
         for value in state.values.values():
             dr.enable_grad(value)
         gaussians = state.gaussians(s)
@@ -124,12 +138,17 @@ class Stepper:
         frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
+        scattered = [None] * len(geometry)
+        if self.model is not None and self.model.scattered:
+            found = self.model.scattered.estimate(self.cloud(state), geometry)
+            scattered = [uploaded(image.ravel()) for image in light(found, geometry)]
+
         def integrals(rays):
             return self._integrals(self._project(gaussians, rays), rays, share)
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
-            image = integrals(view)[0] if self.model is None else self.model.image(integrals, view)
+            image = integrals(view)[0] if self.model is None else self.model.image(integrals, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
@@ -152,10 +171,18 @@ class Stepper:
             return None
         return self.model.shares(self.volume(state), np.stack([c.numpy() for c in state.values['centre']], 1), self.half)
 
+    def cloud(self, state: DeviceState) -> Ellipsoids:
+        """The Gaussians in the world frame, mm, densities 1/mm."""
+        centre, scale, rotation, density = (dr.detach(x) for x in state.gaussians(self.settings))
+        size, middle = dr.opaque(mi.Float, self.geometry.scale), dr.opaque(mi.Point3f, self.geometry.offOrigin)
+        return Ellipsoids.of(centre / size + middle, scale / size, rotation, density * dr.opaque(mi.Float, self.unit),
+                             self.shares(state), 'cloud')
+
     def arrays(self) -> dict:
         """What steps keep beside the state, by name, for a checkpoint."""
-        return ({} if self.poses is None else self.poses.arrays()) | ({} if self.share is None else
-                                                                       dict(share=self.share.numpy()))
+        share = {} if self.share is None else dict(share=self.share.numpy())
+        scattered = {} if self.scattered is None else dict(scattered=self.scattered)
+        return ({} if self.poses is None else self.poses.arrays()) | share | scattered
 
     def restore(self, arrays: dict):
         """Take over what `arrays` gave."""
@@ -163,6 +190,21 @@ class Stepper:
             self.poses.restore(arrays)
         if 'share' in arrays:
             self.share = uploaded(arrays['share'])
+        if 'scattered' in arrays:
+            self.scattered = arrays['scattered']
+            self._show_scattered()
+
+    def scatter(self, state: DeviceState):
+        """Estimate anew what the cloud scatters into the views."""
+        self.scattered = self.model.scattered.estimate(self.cloud(state), self.corrected())
+        self._show_scattered()
+
+    def _show_scattered(self):
+        """Give all views the scattered light that is expected in them."""
+        views = Scan(self.geometry, light(self.scattered, self.geometry))
+        for targets, scan in ((self.targets, views), (self.coarse, views.binned(2))):
+            for target, image in zip(targets, scan.projections):
+                target.scattered = uploaded(image.ravel())
 
     def _project(self, gaussians, rays):
         """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
@@ -191,7 +233,7 @@ class Stepper:
             leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
             bundles.append((footprints, leaf))
             return self._integrals(replace(footprints, values=leaf), rays, self.share)
-        image = integrals(view)[0] if self.model is None else self.model.image(integrals, view)
+        image = integrals(view)[0] if self.model is None else self.model.image(integrals, view, target.scattered)
         loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
         factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
         weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)

@@ -16,9 +16,10 @@ from ..fit.state import State
 from ..fit.step import Stepper
 from ..geometry import Geometry
 from ..scan import Dataset, Scan
-from ..scanning import load_scene, render_objects, render_with
+from ..scanning import load_scene, render_objects
 from ..xray.objects import Ellipsoids, find_objects
 from .circle import require_circle
+from .corrections import corrected
 from .fdk import gaps
 
 WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or xgaussian'
@@ -116,19 +117,9 @@ def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
 
 
 def without_effects(scan: Scan, cloud: FittedCloud | CompositedCloud) -> Scan:
-    """The line integrals of measured views, at the reference energy of the effects that the cloud's fit has modelled.
-
-    Linearised, plus what linearising leaves of the effects in the cloud's own views: blur, and the second material, corrected
-    as by Joseph and Spital (J. Comput. Assist. Tomogr. 2, 1978). Where the fit has modelled none, the projections themselves.
-    """
-    effects = cloud.effects
-    if effects is None:
-        return scan
-    clean = cloud.render(scan.geometry)
-    seen = render_with(effects, [cloud.gaussians], scan.geometry, np.zeros(len(scan)), 0, cloud.extent)
-    left = effects.linearised(Scan(scan.geometry, seen)).projections - clean
-    linear = effects.linearised(scan)
-    return replace(linear, projections=linear.projections - left)
+    """The line integrals of measured views, `corrected` by the cloud for the effects that its fit has modelled; where it has
+    modelled none, the projections themselves."""
+    return scan if cloud.effects is None else corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
 
 
 def complete(scan: Scan, cloud: FittedCloud | CompositedCloud, views: int) -> Scan:

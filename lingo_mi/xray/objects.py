@@ -86,6 +86,15 @@ class Ellipsoids:
                     f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} '
                     'apart: its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
 
+    @classmethod
+    def of(cls, centre, scale, rotation, density, second, name: str) -> Ellipsoids:
+        """Gaussians without a shape of Mitsuba's, as trusted as they are: Point3f, Vector3f, Vector4f and Float [N]; second may
+        be None."""
+        self = cls.__new__(cls)
+        self.centre, self.scale, self.rotation, self.density = centre, scale, rotation, density
+        self.second, self.name = second, name
+        return self
+
     def line_integrals(self, view, extent, primal, affine=False, area=False):
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal,
                                     affine, area)
