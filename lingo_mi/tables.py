@@ -29,7 +29,7 @@ from .files.paths import replacing
 from .files.volumes import read_volume
 from .fit.device import DeviceState
 from .fit.initial import initial_cloud
-from .fit.loop import run
+from .fit.loop import extensible, run
 from .fit.settings import METHODS, Settings
 from .phantoms.scanning import scan
 from .progress import Progress
@@ -221,7 +221,7 @@ class Cells:
 
     def _begin(self, settings, checkpoint: Path):
         """Where there is no checkpoint yet, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
-        if checkpoint.exists() or settings.decay_steps == 0 or settings.coarse_share:
+        if checkpoint.exists() or not extensible(settings):
             return
         done = [int(path.parent.name) for path in checkpoint.parents[1].glob('*/fit.json')]
         shorter = max((n for n in done if n < settings.iterations), default=None)

@@ -170,6 +170,11 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     return replace(settings, scale_max=min(settings.scale_max, largest))
 
 
+def extensible(settings: Settings) -> bool:
+    """Whether a longer fit begins with the very steps of a shorter one, and can go on from where that ended."""
+    return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.average == 0
+
+
 def scene_radius(geometry) -> float:
     """3DGS's unit of length: 1.1 times the largest distance of a source from the mean of all, in the normalised frame.
 
@@ -190,8 +195,8 @@ def _same_fit(host, extra, settings, scan, seed, path):
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
-    if settings.decay_steps and not (settings.coarse_share or settings.average) and extra['iteration'] <= settings.iterations:
-        free.add('iterations')  # what was done so far did not depend on it
+    if extensible(settings) and extra['iteration'] <= settings.iterations:
+        free.add('iterations')
     changed = [k for k in now if before.get(k) != now[k] and k not in free]
     if extra['seed'] != seed:
         changed.append('seed')
