@@ -228,12 +228,12 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # Found by measurement on the foot and chest phantoms. Against LINGO: densities that start from an FDK volume, rates up to 40
 # times higher that fall over the run, moments that forget faster and a mean of the last steps, more weight on SSIM, which
 # brings fine detail forward, total variation of eight times the volume (with moments that forget, what smooths a Gaussian
-# must come more often than once in 64 steps), a wider cut-off, and earlier densification, as far as the scan's size allows.
+# must come more often than once in 64 steps), and earlier densification, as far as the scan's size allows.
 FAST = Settings(
-    init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1500, decay_steps=0, extent=3.5,
-    lambda_ssim=1.5, lambda_tv=.3, tv_stride=2,
-    rate_centre=(1e-3, 1e-4), rate_density=(5e-2, 6e-3), rate_scale=(1.5e-1, 1e-2), rate_rotation=(2e-2, 2e-3),
-    beta1=.8, beta2=.95, average=.98, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
+    init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1400, decay_steps=0,
+    lambda_ssim=1.5, lambda_tv=.2, tv_stride=2,
+    rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
+    beta1=.8, beta2=.95, average=.97, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     birth='halve', values_per_gaussian=16)
 
 # Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM TOG 42 (2023), and its released settings, on
