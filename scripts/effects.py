@@ -6,7 +6,7 @@
 
 Simulates each scene of scenes/effects/ with its effect, fits a cloud that ignores it and one that models it, and a third to a
 scan without it. Writes effects.json to --out, where results of other effects are kept, the pictures to docs/figures/effects/,
-and the table into docs/effects.md. A run of all takes under 10 minutes on two cores.
+and the table into docs/effects.md.
 """
 import argparse
 from pathlib import Path

@@ -115,30 +115,33 @@ EFFECTS = {
     'all': lambda: Effects(tube(), SPOT, detector(psf=15., aperture=1., aperture_order=2))}
 
 
+def rendered_from_files(stepper, state, effects, folder):
+    """The stepper's views by Mitsuba's integrator, from the scene and the cloud that a fit writes."""
+    from lingo_mi.files.ply import write_ply
+    from lingo_mi.fit.state import activate
+    from lingo_mi.results import write_scene
+    g, share = stepper.geometry, stepper.shares(state)
+    centre, scale, rotation, density = activate(state.host(), stepper.settings)
+    write_ply(folder / 'gaussians.ply', centre / g.scale, scale / g.scale, rotation, density * stepper.unit,
+              None if share is None else share.numpy())
+    write_scene(folder / 'result.xml', g, 7, effects)
+    loaded = load_scene(folder / 'result.xml')
+    return [np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(i)))[..., 0] for i in range(len(g))]
+
+
 @physics
 @pytest.mark.parametrize('name', EFFECTS)
 def test_the_fit_sees_what_the_integrator_renders(name, tmp_path):
     """The cloud written as result.xml, rendered through Mitsuba, is what the fit compares with its scan."""
-    from lingo_mi.files.ply import write_ply
-    from lingo_mi.fit.state import activate
-    from lingo_mi.results import write_scene
     effects = EFFECTS[name]()
     stepper, state = stepper_of(effects)
-    g = stepper.geometry
-    expected = stepper.render(state, g)
-    centre, scale, rotation, density = activate(state.host(), stepper.settings)
-    share = stepper.shares(state)
-    write_ply(tmp_path / 'gaussians.ply', centre / g.scale, scale / g.scale, rotation, density * stepper.unit,
-              None if share is None else share.numpy())
-    write_scene(tmp_path / 'result.xml', g, 7, effects)
-    loaded = load_scene(tmp_path / 'result.xml')
-    for i in range(len(g)):
-        image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(i)))[..., 0]
-        np.testing.assert_allclose(image, expected[i], rtol=1e-4, atol=1e-4 * expected.max())
+    expected = stepper.render(state, stepper.geometry)
+    for image, wanted in zip(rendered_from_files(stepper, state, effects, tmp_path), expected, strict=True):
+        np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-4 * expected.max())
     plain, _ = stepper_of(None)
     plain.unit = stepper.unit
-    assert np.abs(plain.render(state, g) - expected).max() > 5e-4 * expected.max()
-    assert name != 'two materials' or 0 < share.numpy().mean() < 1
+    assert np.abs(plain.render(state, stepper.geometry) - expected).max() > 5e-4 * expected.max()
+    assert name != 'two materials' or 0 < stepper.shares(state).numpy().mean() < 1
 
 
 @physics

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from test_fit import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
-from test_fit_effects import detector, stepper_of, tube
+from test_fit_effects import detector, rendered_from_files, stepper_of, tube
 
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
@@ -18,7 +18,6 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.scattered import RENEWED, Scattered
-from lingo_mi.fit.state import activate
 from lingo_mi.recon.corrections import linearised
 from lingo_mi.results import write_scene
 from lingo_mi.scan import Scan
@@ -48,16 +47,9 @@ def test_the_fit_sees_what_the_integrator_renders(effects, tmp_path):
     """The cloud written as result.xml, rendered through Mitsuba, scatters as in the fit."""
     stepper, state = stepper_of(effects)
     g, expected = stepper.geometry, stepper.render(state, stepper.geometry)
-    centre, scale, rotation, density = activate(state.host(), stepper.settings)
-    share = stepper.shares(state)
-    write_ply(tmp_path / 'gaussians.ply', centre / g.scale, scale / g.scale, rotation, density * stepper.unit,
-              None if share is None else share.numpy())
-    write_scene(tmp_path / 'result.xml', g, 7, effects)
-    loaded = load_scene(tmp_path / 'result.xml')
-    for i in range(len(g)):
-        image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(i)))[..., 0]
+    for image, wanted in zip(rendered_from_files(stepper, state, effects, tmp_path), expected, strict=True):
         # A path that just meets an electron on one way to round may miss it on the other.
-        np.testing.assert_allclose(image, expected[i], rtol=1e-4, atol=1e-3 * expected.max())
+        np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-3 * expected.max())
     plain, _ = stepper_of(replace(effects, scatter=None))
     assert np.abs(plain.render(state, g) - expected).max() > .05 * expected.max()
 

@@ -5,9 +5,10 @@ import copy
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from .device import DeviceState, uploaded
+from .device import DeviceState, download, upload
+
+PREFIX = 'average.'  # of the names in a checkpoint
 
 
 class Average:
@@ -45,11 +46,9 @@ class Average:
         return out
 
     def arrays(self) -> dict:
-        """The mean by name, float32 [components, N], for a checkpoint."""
-        return {f'average.{k}': np.stack([c.numpy() for c in ([v] if isinstance(v, mi.Float) else v)])
-                for k, v in (self.values or {}).items()}
+        """The mean by name, float32 [N, components], for a checkpoint."""
+        return {PREFIX + k: v for k, v in download(self.values or {}).items()}
 
-    def restore(self, arrays: dict, state: DeviceState):
+    def restore(self, arrays: dict):
         """Take over what `arrays` gave."""
-        if any(k.startswith('average.') for k in arrays):
-            self.values = {k: type(v)(*(uploaded(c) for c in arrays[f'average.{k}'])) for k, v in state.values.items()}
+        self.values = upload({k.removeprefix(PREFIX): v for k, v in arrays.items() if k.startswith(PREFIX)}) or None

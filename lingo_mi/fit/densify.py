@@ -25,21 +25,20 @@ SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over th
 
 
 def densify(state: State, settings: Settings, half, rng, flat: bool = False, largest: float = np.inf) -> State:
-    """Clone, split and prune once, then clear the statistic.
+    """Clone and split, or halve, and prune once, then clear the statistic.
 
-    half   half the volume's sides, [3]: Gaussians centred outside are removed
-    rng    numpy Generator; places the halves of splits
-    flat   whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
+    half      half the volume's sides, [3]: Gaussians centred outside are removed
+    rng       numpy Generator; places the halves of splits
+    flat      whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
     largest   standard deviation above which the Gaussians of alpha compositing vanish
     """
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
-    _, scale, _, _ = activate(state, settings)
     strong = mean >= settings.densify_threshold
     room = max(settings.max_gaussians - len(state), 0)  # each adds one
     strong[np.argsort(-mean, kind='stable')[room:]] = False
     if settings.birth == 'halve':
         return prune(halve(state, strong, settings, flat), settings, half, largest)
-    large = scale.max(1) > settings.split_size
+    large = activate(state, settings)[1].max(1) > settings.split_size
     state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
                   settings, rng, flat)
     return prune(state, settings, half, largest)

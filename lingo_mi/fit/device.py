@@ -18,10 +18,6 @@ class DeviceState:
     """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `seen` Float [N]."""
 
     def __init__(self, state: State):
-        types = _types()
-
-        def upload(columns):
-            return {k: types[k](*(uploaded(c) for c in v.T)) for k, v in columns.items()}
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
         self.gradient, self.seen = uploaded(state.gradient), uploaded(state.seen)
         self.born = state.born
@@ -31,10 +27,6 @@ class DeviceState:
 
     def host(self) -> State:
         """The state as NumPy arrays."""
-        def download(columns):
-            # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
-            return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1)
-                    for k, x in columns.items()}
         return State(download(self.values), download(self.first), download(self.second), self.gradient.numpy(),
                      self.seen.numpy(), self.born)
 
@@ -67,6 +59,18 @@ class DeviceState:
             self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + settings.epsilon)
             self.first[name], self.second[name] = m, v
         dr.eval(self.values, self.first, self.second, self.gradient, self.seen)
+
+
+def upload(columns: dict) -> dict:
+    """Parameters by name, float32 [N, components], as Dr.Jit's types."""
+    types = _types()
+    return {k: types[k](*(uploaded(c) for c in v.T)) for k, v in columns.items()}
+
+
+def download(columns: dict) -> dict:
+    """What `upload` was given."""
+    # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
+    return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1) for k, x in columns.items()}
 
 
 def _softplus(x):

@@ -69,7 +69,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
         state = DeviceState(host)
         stepper.restore(arrays)
-        average.restore(arrays, state)
+        average.restore(arrays)
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0., [], dict(initial.info)
