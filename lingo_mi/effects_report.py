@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .accuracy_report import insert, table
+from .accuracy.report import insert, table
 from .errors import InputError
 from .figures import PADS, STYLE, plane, plane_extent, richest
 from .fit.device import DeviceState

@@ -33,7 +33,7 @@ def main():
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.accuracy import FULL, QUICK, measure
-    from lingo_mi.accuracy_report import write
+    from lingo_mi.accuracy.report import write
 
     begun = time.perf_counter()
     found = measure(QUICK if args.quick else FULL,

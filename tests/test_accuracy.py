@@ -11,8 +11,10 @@ import oracle
 import pytest
 from oracle import random_cloud, relative
 
-from lingo_mi.accuracy import Sizes, Workload, by_function, by_integrator, compare, deviation, measure
-from lingo_mi.accuracy_report import BACKWARD, GRADIENTS, TITLES, insert, make_tables, write
+from lingo_mi.accuracy import Sizes, measure
+from lingo_mi.accuracy.compare import by_function, by_integrator, compare, deviation
+from lingo_mi.accuracy.workload import Workload
+from lingo_mi.accuracy.report import BACKWARD, GRADIENTS, TITLES, insert, make_tables, write
 from lingo_mi.closed_form import NAMES, image_and_gradients, rays_and_gradients
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import Geometry

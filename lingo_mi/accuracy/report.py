@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError
-from .figures import STYLE
-from .xray.quality import PRESETS
+from ..errors import InputError
+from ..figures import STYLE
+from ..xray.quality import PRESETS
 
 GRADIENTS = 'centre', 'scale', 'rotation', 'density'
 BACKWARD = 'gradients'
