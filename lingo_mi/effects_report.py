@@ -22,8 +22,8 @@ from .scanning import load_scene, render_objects, take_scan
 from .xray.objects import find_objects
 
 SCENES = Path(__file__).resolve().parents[1] / 'scenes' / 'effects'
-# Small, so that a fit takes less than a minute.
-SETTINGS = FAST.changed(iterations=250, densify_from=50, densify_until=180, values_per_gaussian=40.)
+# Small, so that a fit takes about a minute.
+SETTINGS = FAST.changed(iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.)
 FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
 
 
@@ -67,8 +67,8 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
 
     Returns title, the largest line integral of the clean scan, and for each of FITS: psnr_3d (the truth's maximum is full
     scale), psnr_3d_gain (after the factor that fits the truth best, so that a wrong scale alone costs nothing),
-    ms_per_iteration (over the second half of the steps, when all is compiled), volume; also truth [x, y, z], 1/mm, and
-    spacing, mm. Raises InputError for an unknown name.
+    ms_per_iteration (over the second half of the steps, when all is compiled), seconds (of start and steps), volume; also
+    truth [x, y, z], 1/mm, and spacing, mm. Raises InputError for an unknown name.
     """
     if name not in EXPERIMENTS:
         raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
@@ -81,12 +81,13 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
             scenes[key] = scans(name, given, seed)
         what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], settings.changed(**changes)
         fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
-        found[kind] = fitted.stepper.volume(DeviceState(fitted.state)), pace(fitted.history)
+        found[kind] = fitted.stepper.volume(DeviceState(fitted.state)), dict(
+            ms_per_iteration=pace(fitted.history), seconds=fitted.info['seconds'] + fitted.seconds)
     first = next(iter(scenes.values()))  # of the clean scan
     shape = np.min([volume.shape for volume, _ in found.values()], 0)
     truth = middle(first['truth'], shape)
-    fits = {kind: quality(middle(volume, shape), truth) | dict(ms_per_iteration=ms, volume=middle(volume, shape))
-            for kind, (volume, ms) in found.items()}
+    fits = {kind: quality(middle(volume, shape), truth) | times | dict(volume=middle(volume, shape))
+            for kind, (volume, times) in found.items()}
     return dict(title=experiment.title, largest=float(first['clean'].projections.max()), truth=truth,
                 spacing=list(first['clean'].geometry.dVoxel), **fits)
 
@@ -167,7 +168,9 @@ def make_table(numbers: dict) -> str:
         return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
     columns = [('effect', lambda r: r['title']), ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
                *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
-               ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS))]
+               ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
+               ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
+               ('extra, s', lambda r: f'{r["model"]["seconds"] - r["ignore"]["seconds"]:+.0f}')]
     return table(columns, numbers.values())
 
 
