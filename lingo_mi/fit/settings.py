@@ -236,7 +236,7 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # must come more often than once in 64 steps), and earlier densification, as far as the scan's size allows.
 FAST = Settings(
     init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1400, decay_steps=0,
-    volume_extent=3.5, lambda_ssim=1.5, lambda_tv=.2, tv_stride=2,
+    volume_extent=3.5, lambda_ssim=1.5, lambda_tv=.15, tv_stride=2,
     rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
     beta1=.8, beta2=.95, average=.97, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     birth='halve', values_per_gaussian=14)
