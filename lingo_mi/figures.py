@@ -278,7 +278,9 @@ def draw_curves(fig, data):
             grid[i, 0].yaxis.set_major_formatter('{x:,.0f}')
         grid[i, 0].set_ylabel(label)
         if label.startswith('PSNR'):
-            grid[i, 0].legend(loc='lower right', frameon=False)
+            low, high = grid[i, 0].get_ylim()
+            grid[i, 0].set_ylim(low - .25 * (high - low), high)  # room for the legend below the curves
+            grid[i, 0].legend(loc='lower right', ncols=2, frameon=False)
     for ax, (_, label) in zip(grid[-1], columns):
         ax.set_xlabel(label)
     fig.align_ylabels(grid[:, 0])

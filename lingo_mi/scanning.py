@@ -240,7 +240,7 @@ def _truth(objects, geometry) -> np.ndarray | None:
     return total
 
 
-def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float = 3.5) -> np.ndarray:
+def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.ndarray:
     """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm.
 
     extent   cut-off in standard deviations

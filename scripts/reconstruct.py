@@ -108,7 +108,7 @@ def main():
     scan = dataset.train
     began = time.monotonic()
     if args.algorithm == 'voxelize':
-        volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry), []
+        volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), []
     else:
         if args.complete:
             scan = complete(fitted_views(dataset, cloud.geometry), cloud, args.views)

@@ -151,7 +151,7 @@ def test_fan_beam_stays_in_its_plane(mode, birth):
 def test_total_variation_is_of_every_nth_voxel(scan, stride):
     """With so many samples that they fit in one place only, between the first and the last voxels."""
     g = replace(scan.geometry, nVoxel=(13, 13, 7), dVoxel=(20., 20., 36.))
-    stepper = Stepper(replace(scan, geometry=g), SHORT.changed(tv_stride=stride, tv_size=13, extent=6., volume_extent=6.))
+    stepper = Stepper(replace(scan, geometry=g), SHORT.changed(tv_stride=stride, tv_size=13, extent=6.))
     start = some_points(g)
     state = DeviceState(start_state(start.points.astype(np.float32), start.spacing, start.density, stepper.settings))
     gaussians = state.gaussians(stepper.settings)

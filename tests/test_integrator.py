@@ -361,7 +361,7 @@ def test_axes(axis, mode, offset):
     for image, angle in zip(images, (0, 90)):
         np.testing.assert_allclose(middle(image), expected_pixel(point, angle, g), atol=.05)
 
-    settings = Settings(extent=6., volume_extent=6., scale_min=1e-4, scale_max=.5)
+    settings = Settings(extent=6., scale_min=1e-4, scale_max=.5)
     normalised = (point - g.offOrigin) * g.scale
     state = DeviceState(start(normalised[None], np.array([4 * g.scale]), np.array([.1]), settings))
     stepper = Stepper(Scan(g, np.ones((2, *g.nDetector))), settings)

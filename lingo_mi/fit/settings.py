@@ -40,9 +40,7 @@ class Settings:
     sh_degree          of `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0 for radiance that is the
                        same in all directions (X-Gaussian)
     sh_every           iterations after which another degree joins in (3DGS: 1000)
-    extent             cut-off of projections in standard deviations (R2: 3)
-    volume_extent      cut-off of the volume that is the result (R2: 3; own: 3.5, since an ellipsoid that ends at 3 has lost 2.9 %
-                       of its mass, but its projection 1.1 %)
+    extent             cut-off in standard deviations (R2: 3)
     effects            'model': where a scan has effects (spectrum, focal spot, blur, dead pixels), the cloud is seen through
                        them, since a scene that names them says how its data came about; or 'ignore': projections are
                        taken for line integrals whatever the scene says
@@ -109,7 +107,6 @@ class Settings:
     sh_degree: int = 3
     sh_every: int = 1000
     extent: float = 3.
-    volume_extent: float = 3.
     effects: str = 'model'
     lambda_ssim: float = .25
     lambda_tv: float = .05
@@ -178,9 +175,7 @@ class Settings:
         require(self.max_gaussians >= 1, f'max_gaussians must be at least 1, not {self.max_gaussians}')
         require(self.values_per_gaussian >= 0,
                 f'values_per_gaussian must not be negative, not {self.values_per_gaussian:g}')
-        for name in ('extent', 'volume_extent'):
-            value = getattr(self, name)
-            require(1 <= value <= 20, f'{name} is from 1 to 20 standard deviations, not {value:g}')
+        require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
@@ -236,7 +231,7 @@ LINGO = Settings(init='lingo', loss_scale='dynamic')
 # must come more often than once in 64 steps), and earlier densification, as far as the scan's size allows.
 FAST = Settings(
     init='lingo', init_density='fdk', outside='auto', normalise=True, iterations=1400, decay_steps=0,
-    volume_extent=3.5, lambda_ssim=1.5, lambda_tv=.15, tv_stride=2,
+    lambda_ssim=1.5, lambda_tv=.15, tv_stride=2,
     rate_centre=(1e-3, 5e-5), rate_density=(5e-2, 3e-3), rate_scale=(1.5e-1, 5e-3), rate_rotation=(2e-2, 1e-3),
     beta1=.8, beta2=.95, average=.97, densify_from=150, densify_until=800, densify_every=50, densify_threshold=1e-4,
     birth='halve', values_per_gaussian=14)

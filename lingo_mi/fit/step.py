@@ -163,8 +163,7 @@ class Stepper:
             return None
         g = self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        density = voxelize(*state.gaussians(self.settings), grid, self.settings.volume_extent)
-        return grid.volume(density) * np.float32(self.unit)
+        return grid.volume(voxelize(*state.gaussians(self.settings), grid, self.settings.extent)) * np.float32(self.unit)
 
     def shares(self, state: DeviceState):
         """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""
