@@ -1,6 +1,6 @@
 """Projections against RTK's on the CPU: cone, parallel, offset, turned, tilted, helical.
 
-Two comparisons, each for every geometry:
+Three comparisons, each for every geometry:
 
     ellipsoids   RTK's ray-ellipsoid filter is exact and in double precision; here the chords of `Frames.rays`. They agree
                  to 4e-8 of the largest value: what is left is the rounding of RTK's images to float32, 6e-8.
@@ -9,14 +9,26 @@ Two comparisons, each for every geometry:
                  trilinear interpolant exactly. They differ by 0.4 to 1.1 % (norm) on voxels of 1 mm, most where a thin body
                  is seen along the grid, and by 0.08 to 0.21 % on voxels of half a millimetre: second order. The outermost
                  half voxel, where RTK's volume ends and this one holds its value, is left zero.
+    a CT         the same of an abdomen, whose edges are sharp, given to RTK on its own voxels and, by linear interpolation,
+                 which leaves the trilinear interpolant as it is, on ones of a half and a quarter. Joseph's sum is a
+                 trapezoidal rule for what this package integrates exactly: the difference of 0.14 to 0.25 % (norm)
+                 becomes 0.033 to 0.055 % and 0.008 to 0.013 %.
+
+On circular scans this package's own Joseph projector is RTK's, to 7e-7 of the largest value. In one, parallel and offset, it is
+to 6e-6.
 """
+import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import zoom
 from test_geometry import BODIES, Ellipsoids
 
 from lingo_mi.files import rtk_geometry
+from lingo_mi.files.volumes import read_volume
 from lingo_mi.frames import rotation
 from lingo_mi.geometry import Geometry, helix
+from lingo_mi.xray.grid import project
+from lingo_mi.xray.joseph import Joseph
 
 try:
     import itk
@@ -128,7 +140,6 @@ def smooth(g):
 
 
 def difference(name, n, folder):
-    from lingo_mi.xray.grid import project
     g = geometry(name, n)
     volume = smooth(g)
     expected = RTK(g, folder).volume(volume)
@@ -139,3 +150,44 @@ def test_a_volume_agrees_to_second_order(name, tmp_path):
     coarse, fine = (difference(name, n, tmp_path) for n in (40, 80))
     assert coarse < .012
     assert fine < .0025 and fine < .35 * coarse
+
+
+@pytest.fixture(scope='module')
+def abdomen(data):
+    """Every second voxel of a CT: [x, y, z], density of 6 mm voxels, with two layers of air around it, since RTK
+    gives the first and the last plane that a ray meets in its volume other weights."""
+    path = data / 'abdomen_ts.nii.gz'
+    if not path.is_file():
+        pytest.skip(f'LINGO_MI_DATA holds no {path.name}')
+    out = read_volume(path).data[::2, ::2, ::2].copy()
+    for axis in range(3):
+        np.moveaxis(out, axis, 0)[[0, 1, -2, -1]] = 0
+    return out
+
+
+def around(name, shape, dVoxel):
+    """The scanner `name` about a volume of 61 x 51 x 56 voxels of 6 mm, and the same nodes between them."""
+    return Geometry.per_view(**{**PLAIN, **GEOMETRIES[name], 'DSO': np.broadcast_to(800., 6), 'DSD': 1200.,
+                                'dDetector': (13., 12.)}, nVoxel=shape, dVoxel=dVoxel)
+
+
+def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
+    image, errors = project(abdomen, around(name, abdomen.shape, 6.)), []
+    for finer in (1, 2, 4):
+        shape = tuple(finer * (n - 1) + 1 for n in abdomen.shape)
+        volume = zoom(abdomen, np.divide(shape, abdomen.shape), order=1) if finer > 1 else abdomen
+        np.testing.assert_allclose(volume[::finer, ::finer, ::finer], abdomen, atol=1e-5)
+        expected = RTK(around(name, shape, 6. / finer), tmp_path).volume(volume)
+        errors.append(np.linalg.norm(image - expected) / np.linalg.norm(expected))
+    assert errors[0] < .003
+    assert errors[1] < .26 * errors[0] and errors[2] < .26 * errors[1]
+
+
+@pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, offset', 'parallel, offset'])
+def test_joseph_is_rtks(name, tmp_path, abdomen):
+    g = Geometry(**{**PLAIN, **GEOMETRIES[name], 'DSO': 800., 'DSD': 1200., 'dDetector': (13., 12.)}, nVoxel=abdomen.shape,
+                 dVoxel=6.)
+    expected = RTK(g, tmp_path).volume(abdomen)
+    found = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
+    found = found.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)
+    assert np.abs(found - expected).max() < 1e-5 * expected.max()
