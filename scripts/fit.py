@@ -79,8 +79,8 @@ def main():
         except KeyboardInterrupt:
             again = [a for a in sys.argv if a not in ('--resume', '--force')] + ['--resume']
             raise KeyboardInterrupt(f'go on with  python {shlex.join(again)}') from None
-    result = write_results(folder, fit, scan, title=args.volume or args.projections or scene.name, method=args.method,
-                           seed=args.seed, command='python ' + shlex.join(sys.argv))
+    result = write_results(folder, fit, scan, title=Path(args.volume or args.projections or scene.name).name,
+                           method=args.method, seed=args.seed, command='python ' + shlex.join(sys.argv))
     print(summary(result))
     written = ('report.html', 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'metrics.json')
     print(f'{folder}/: {", ".join(name for name in written if (folder / name).exists())}')
