@@ -8,12 +8,16 @@ from test_fdk import BALL, centres, ellipsoids, geometry
 from lingo_mi.geometry import circular
 from lingo_mi.recon.cgls import cgls
 from lingo_mi.recon.fdk import fdk
-from lingo_mi.recon.sart import sart
+from lingo_mi.recon.sart import sweep
 from lingo_mi.recon.system import System
 
 itk = pytest.importorskip('itk', reason="RTK is not installed: pip install -e '.[reference]'")
 if not hasattr(itk, 'RTK'):
     pytest.skip("ITK has no RTK: pip install -e '.[reference]'", allow_module_level=True)
+
+# RTK shuffles the views once, with a generator of fixed seed: what it makes of twenty.
+RTK_ORDER = 12, 7, 15, 6, 11, 0, 4, 9, 13, 17, 14, 16, 2, 5, 1, 19, 8, 18, 3, 10
+JOSEPH = 1  # RTK's number of the transpose of Joseph's projector; its default is a sum over voxels
 
 BODIES = BALL, (np.array([-25., 20., -10.]), np.array([12., 18., 15.]), 0.01)
 
@@ -28,21 +32,34 @@ def test_fdk_agrees_inside_the_field_of_view():
     assert theirs[seen].std() > 0.05 * 0.02
 
 
-@pytest.mark.parametrize('kind, settings, tolerances', [
-    ('SART', dict(Lambda=1., EnforcePositivity=True, NumberOfProjectionsPerSubset=1), {1: 0.2, 2: 0.06, 4: 0.03}),
-    ('ConjugateGradient', {}, {1: 0.001, 2: 0.01, 4: 0.02})])
-def test_residuals_fall_alike(kind, settings, tolerances):
-    """|A x - b| of both volumes under this package's A; tolerances, relative, by number of iterations.
+def residual(system, volume):
+    """|A x - b| / |b| with this package's A."""
+    return system.residual(mi.Float(volume.ravel()))[1]
 
-    Same order of views and relaxation. Each iterates with its own pair of projectors, so the volumes need not agree closer:
-    measured were 15 %, 4 % and 1.5 % for SART, 0.006 %, 0.6 % and 1.5 % for CGLS, and volumes 5 to 10 % apart (norm).
+
+def test_sart():
+    """Volumes and residuals pass by pass, with RTK's order of views and Joseph's transpose in both.
+
+    What is left, 0.7 % of the volume and 1.7 % of the residual after the first pass, is the length by which a ray's error is
+    divided: RTK's box ends at the outer voxels' centres, this one at their edges.
     """
     geo = geometry(angles=circular(20, start=3), offDetector=(0., 0.))
     scan = ellipsoids(geo, *BODIES)
     system = System(scan)
-    for niter, tolerance in tolerances.items():
-        ours = sart(scan, niter, lmbda_red=1., order='ordered') if kind == 'SART' else cgls(scan, niter)
-        volume = rtk.reconstruct(kind, scan, itk, NumberOfIterations=niter, **settings)
-        theirs = system.residual(mi.Float(volume.ravel()))[1]
-        assert abs(ours.residuals[-1] / theirs - 1) < tolerance
-        assert np.linalg.norm(volume - ours.volume) < 0.12 * np.linalg.norm(volume)
+    x = system.start(None)
+    for niter in range(1, 5):
+        x = sweep(system, x, 1., [[view] for view in RTK_ORDER], nonneg=True)
+        theirs = rtk.reconstruct('SART', scan, itk, Lambda=1., EnforcePositivity=True, NumberOfProjectionsPerSubset=1,
+                                 NumberOfIterations=niter, BackProjectionFilter=JOSEPH)
+        assert np.linalg.norm(system.volume(x) - theirs) < 0.01 * np.linalg.norm(theirs)
+        assert abs(system.residual(x)[1] / residual(system, theirs) - 1) < 0.02 / niter
+
+
+@pytest.mark.parametrize('niter, tolerance', [(1, 0.001), (2, 0.01), (4, 0.02)])
+def test_cgls(niter, tolerance):
+    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is no transpose."""
+    geo = geometry(angles=circular(20, start=3), offDetector=(0., 0.))
+    scan = ellipsoids(geo, *BODIES)
+    ours, theirs = cgls(scan, niter), rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter)
+    assert abs(ours.residuals[-1] / residual(System(scan), theirs) - 1) < tolerance
+    assert np.linalg.norm(theirs - ours.volume) < 0.08 * np.linalg.norm(theirs)
