@@ -15,7 +15,7 @@ itk = pytest.importorskip('itk', reason="RTK is not installed: pip install -e '.
 if not hasattr(itk, 'RTK'):
     pytest.skip("ITK has no RTK: pip install -e '.[reference]'", allow_module_level=True)
 
-# RTK shuffles the views once, with a generator of fixed seed: what it makes of twenty.
+# RTK shuffles the views once, by std::shuffle and a generator of fixed seed: what it makes of twenty on Linux.
 RTK_ORDER = 12, 7, 15, 6, 11, 0, 4, 9, 13, 17, 14, 16, 2, 5, 1, 19, 8, 18, 3, 10
 JOSEPH = 1  # RTK's number of the transpose of Joseph's projector; its default is a sum over voxels
 
