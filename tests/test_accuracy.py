@@ -13,8 +13,8 @@ from oracle import random_cloud, relative
 
 from lingo_mi.accuracy import Sizes, measure
 from lingo_mi.accuracy.compare import by_function, by_integrator, compare, deviation
-from lingo_mi.accuracy.workload import Workload
 from lingo_mi.accuracy.report import BACKWARD, GRADIENTS, TITLES, insert, make_tables, write
+from lingo_mi.accuracy.workload import Workload
 from lingo_mi.closed_form import NAMES, image_and_gradients, rays_and_gradients
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import Geometry
