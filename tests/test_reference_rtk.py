@@ -40,8 +40,8 @@ def residual(system, volume):
 def test_sart():
     """Volumes and residuals pass by pass, with RTK's order of views and Joseph's transpose in both.
 
-    What is left, 0.7 % of the volume and 1.7 % of the residual after the first pass, is the length by which a ray's error is
-    divided: RTK's box ends at the outer voxels' centres, this one at their edges.
+    What is left is 0.7 % of the volume and 1.7 % of the residual after the first pass. RTK divides a ray's error by its length
+    in a box that ends at the outer voxels' centres, this package in one that ends at their edges.
     """
     geo = geometry(angles=circular(20, start=3), offDetector=(0., 0.))
     scan = ellipsoids(geo, *BODIES)
