@@ -53,6 +53,8 @@ EXPERIMENTS = dict(
     psf=Experiment('point spread of 3 pixels'),
     aperture=Experiment('whole area of pixels of 6 mm'),
     gain=Experiment('gains that differ by 5 %', scene=dict(ignore=dict(corrected='false'))),
+    saturation=Experiment('saturation at .6 of the open beam'),
+    bits=Experiment('converter of 6 bits', dict(weights='noise')),
     dead_pixels=Experiment('every tenth pixel dead'),
     misalignment=Experiment('views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), turn=.5, shift=1.),
     scatter=Experiment('scatter and hardening of a chest, 120 kVp'),

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import metrics
+from .effects.detector import Detector
 from .files.images import write_exr
 from .files.ply import write_ply, write_radiance_ply
 from .files.volumes import first_voxel, write_volume
@@ -144,9 +145,8 @@ def write_scene(path: Path, geometry, extent: float, effects=None):
              '    </shape>', '    <sensor type="ct_scanner" id="scanner">']
     lines += _parameters(describe(geometry), 8)
     if effects is not None and effects.detector:
-        names = 'response', 'psf', 'aperture', 'aperture_order'
-        lines += ['        <film type="ct_detector">',
-                  *_parameters({k: getattr(effects.detector, k) for k in names}, 12), '        </film>']
+        given = {k: v for k, v in vars(effects.detector.expected).items() if v != Detector.DEFAULTS[k]}
+        lines += ['        <film type="ct_detector">', *_parameters(given, 12), '        </film>']
     lines += ['    </sensor>']
     if effects is not None and effects.tube:
         spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)

@@ -33,7 +33,7 @@ class CTDetector(mi.Film):
          which is a projection. (Default: 0, the ray through its centre; 3)
      * - saturation
        - |float|
-       - The largest signal, in units of the open beam's. (Default: none)
+       - The largest signal, in units of the open beam's. Derivatives by what is brighter are zero. (Default: none)
      * - bits
        - |int|
        - Bit depth of the converter, 1 to 24, whose largest number is `saturation`, or 1.25 without one. (Default: none)

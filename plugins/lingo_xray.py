@@ -107,8 +107,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
             total = self._ideal(find_objects(scene), view, primal)
         else:
             total = effects.line_integrals(find_objects(scene), view, self.quality)
-            if seed is not None:
-                total = effects.measured(total, view, seed)
+            total = effects.saturated(total, view) if seed is None else effects.measured(total, view, seed)
             if self.output == 'transmission':
                 total = dr.exp(-total)
         film = sensor.film()

@@ -25,6 +25,7 @@ from lingo_mi.fit.loss_scale import loss_scale
 from lingo_mi.fit.model import weights_of
 from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
+from lingo_mi.recon.corrections import linearised
 from lingo_mi.scan import Scan
 from lingo_mi.scanning import load_scene, take_scan
 from lingo_mi.xray.footprint import project
@@ -112,7 +113,8 @@ EFFECTS = {
     'two materials': lambda: Effects(tube('soft tissue + bone', '0.0002, 0.0006'), FocalSpot(), None),
     'spot': lambda: Effects(Tube.of(60., None, 12., '', None, '', '', 4, {}), SPOT, None),
     'blur': lambda: Effects(None, None, detector(psf=15.)),
-    'all': lambda: Effects(tube(), SPOT, detector(psf=15., aperture=1., aperture_order=2))}
+    'saturation': lambda: Effects(None, None, detector(saturation=.9, gain=.05)),
+    'all': lambda: Effects(tube(), SPOT, detector(psf=15., aperture=1., aperture_order=2, saturation=.99))}
 
 
 def rendered_from_files(stepper, state, effects, folder):
@@ -249,8 +251,41 @@ def test_noise_is_weighed():
     target = Stepper(scan, settings).targets[0]
     np.testing.assert_allclose(target.seen(target.pixels / target.weights).numpy(), target.pixels.numpy(), rtol=1e-6)
     for without in (None, Effects(None, None, detector(psf=1.))):
-        with pytest.raises(InputError, match='weights=noise needs a ct_detector with photons'):
+        with pytest.raises(InputError, match='weights=noise needs a ct_detector with photons or bits'):
             Stepper(replace(scan, effects=without), settings)
+
+
+def test_rounding_is_weighed():
+    """Weighted, the errors of rounding have the same standard deviation in bright and dark pixels."""
+    seen, p = detector(bits=8), np.random.default_rng(0).uniform(0, 3, (1, 400, 400))
+    scale = seen.deviation(np.exp(-p))
+    error = (seen.measure(np.exp(-p[0]), 0) - p[0]) / scale[0]
+    for low in range(3):
+        np.testing.assert_allclose(error[(p[0] > low) & (p[0] < low + 1)].std(), 1, rtol=.03)
+
+
+def test_saturated_pixels_pull_only_from_above():
+    """What is expected below the saturation counts as equal to it; what is above is drawn down; FDK takes them for air."""
+    g = geometry(3)
+    effects = Effects(None, None, detector(saturation=.8, gain=.05))
+    least = effects.detector.least(g.nDetector)
+    scan = replace(tiny_scan(g), effects=effects)
+    light = np.exp(-scan.projections / 50)
+    scan = replace(scan, projections=np.stack([effects.detector.measure(v, i) for i, v in enumerate(light)]))
+    dark = scan.projections > least + 1e-6
+    assert .1 < dark.mean() < .9
+    linear = linearised(scan, effects).projections
+    np.testing.assert_array_equal(linear[~dark], 0)
+    np.testing.assert_array_equal(linear[dark], scan.projections[dark])
+    model, view = Stepper(scan, SHORT).model, Stepper(scan, SHORT).targets[0].view
+    factor = model.factor.numpy()[0]
+    for shift, slope in ((-.01, 0), (.01, 1)):
+        p = mi.Float(((least + shift) / factor).ravel())
+        dr.enable_grad(p)
+        image = model.image(lambda _: [p], view)
+        np.testing.assert_allclose(image.numpy() * factor, (least + max(shift, 0)).ravel(), atol=1e-6)
+        dr.backward(dr.sum(image))
+        np.testing.assert_array_equal(p.grad.numpy(), slope)
 
 
 @physics

@@ -80,8 +80,9 @@ class Detector:
 
     @property
     def expected(self) -> Detector:
-        """The same, of which only what happens to the light is left."""
-        return replace(self, photons=0., electronic_noise=0., saturation=0., bits=0, dead=0., gain=0.)
+        """The same, of which only what happens to the light is left, and its saturation."""
+        gain = self.gain if self.saturation and self.corrected else 0.  # what is divided out moves the saturation
+        return replace(self, photons=0., electronic_noise=0., bits=0, dead=0., gain=gain, corrected=True)
 
     @property
     def floor(self) -> float:
@@ -124,11 +125,19 @@ class Detector:
             light = _filled(light / gains, dead)
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
 
+    def least(self, shape) -> np.ndarray:
+        """The line integrals at which pixels saturate, float64 [v, u]; less is not told from them."""
+        gains = self.maps(shape)[0] if self.corrected else 1
+        return np.broadcast_to(-np.log(self.saturation / gains), shape)
+
     def deviation(self, transmission) -> np.ndarray:
-        """Standard deviation of a line integral -ln(N / I0) by the noise of its counts, to first order, for transmissions of
-        any shape; at least that of half a count."""
-        counts = self.photons * np.maximum(transmission, self.floor)
-        return np.sqrt(counts + self.electronic_noise ** 2) / counts
+        """Standard deviation of a line integral -ln(N / I0) by the noise of its counts and the rounding to `bits`, to first
+        order, for transmissions of any shape; at least that of the floor."""
+        light = np.maximum(transmission, self.floor)
+        variance = self._step ** 2 / 12
+        if self.photons:
+            variance = variance + light / self.photons + (self.electronic_noise / self.photons) ** 2
+        return np.sqrt(variance) / light
 
     def maps(self, shape):
         """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""

@@ -34,7 +34,7 @@ class Effects:
     def ideal(self) -> bool:
         """Whether the expected signal is exp(-line integral) along the ray through a pixel's centre."""
         return not (self.tube and self.tube.hardens or self.spot and max(self.spot.size) or self.scatter
-                    or self.detector and (self.detector.aperture or self.detector.psf))
+                    or self.detector and (self.detector.aperture or self.detector.psf or self.detector.saturation))
 
     def scaled(self, factor: float) -> Effects:
         """The same for views whose lengths are mm times `factor`."""
@@ -96,6 +96,13 @@ class Effects:
         if psf:
             light = self.detector.blurred(light, view)
         return -dr.log(dr.maximum(light, DARKEST))
+
+    def saturated(self, integrals, view):
+        """Expected -ln(I / I0), Float [height * width], no less than the detector can tell; the derivative of what is less
+        is zero."""
+        if not (self.detector and self.detector.saturation):
+            return integrals
+        return dr.maximum(integrals, mi.Float(self.detector.least((view.height, view.width)).ravel()))
 
     def masked(self, scan: Scan) -> Scan:
         """A scan without the pixels that are dead."""

@@ -53,7 +53,7 @@ class Model:
         def seen(rays):
             parts = [self.factor * q for q in integrals(rays)]
             return hardened(parts, self.bands) if self.bands else parts[0]
-        return self.effects.averaged(seen, view, Quality(), scattered) / self.factor
+        return self.effects.saturated(self.effects.averaged(seen, view, Quality(), scattered), view) / self.factor
 
     def shares(self, volume, centres, half):
         """The second material's share in every Gaussian's density, Float [N]; None for one material.
@@ -87,13 +87,13 @@ def weights_of(scan: Scan, settings) -> np.ndarray | None:
     3 x 3 valid pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The largest
     projection stays as large as it was, for the sake of the loss's constants.
 
-    Raises InputError for a scan that does not say how many photons it has counted.
+    Raises InputError for a scan that says neither how many photons it has counted nor its bit depth.
     """
     if settings.weights == 'equal':
         return None
     detector = scan.effects.detector if scan.effects else None
-    if not (detector and detector.photons):
-        raise InputError('weights=noise needs a ct_detector with photons in the scene, or leave it out')
+    if not (detector and (detector.photons or detector.bits)):
+        raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
     p = scan.projections
     valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
     light, share = (ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))

@@ -33,12 +33,15 @@ def corrected(scan: Scan, effects: Effects, objects, extent: float = 8.) -> Scan
 
 
 def linearised(scan: Scan, effects: Effects) -> Scan:
-    """`Effects.linearised`, and where there is scatter, `corrected` by coarse FDK volumes of its own (Poludniowski et al.,
-    Phys. Med. Biol. 54, 2009): the first, of projections with their scatter, is too thin.
+    """`Effects.linearised`, with saturated pixels taken for air, and where there is scatter, `corrected` by coarse FDK volumes
+    of its own (Poludniowski et al., Phys. Med. Biol. 54, 2009): the first, of projections with their scatter, is too thin.
 
     A scan that FDK cannot reconstruct keeps its scatter, with a warning.
     """
     found = effects.linearised(scan)
+    if effects.detector and effects.detector.saturation:
+        least = effects.detector.least(scan.geometry.nDetector)
+        found = replace(found, projections=np.where(scan.projections <= least + 1e-6, np.float32(0), found.projections))
     if effects.scatter is None:
         return found
     if not on_circle(scan):
