@@ -46,7 +46,8 @@ VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_t
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
-ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10))}
+ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
+              'refined': (asd_pocs, dict(niter=6, alpha=.06))}
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Fit:
 class Volume:
     """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
 
-    Where the fit's method is 'none', from these views alone.
+    Where the fit's method is 'none', from these views alone; so is 'refined', which starts from the cloud's own volume.
     """
 
     fit: Fit
@@ -160,7 +161,7 @@ class Cells:
     def __init__(self, folder: Path, scale: Scale, seed: int = 0):
         self.folder, self.scale, self.seed = Path(folder), scale, seed
         self.dataset = functools.lru_cache(1)(self._dataset)
-        self._completed = functools.lru_cache(1)(self._completed)
+        self._fitted = functools.lru_cache(1)(self._fitted)
 
     def path(self, cell: Fit | Volume) -> Path:
         """Where a cell is stored."""
@@ -168,7 +169,9 @@ class Cells:
         of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
-            options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
+            options = dict(algorithm=ALGORITHMS[cell.algorithm][1])
+            if cell.algorithm != 'refined':
+                options |= dict(completed=COMPLETED)
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
@@ -229,25 +232,30 @@ class Cells:
             with replacing(checkpoint) as temporary:
                 temporary.write_bytes((checkpoint.parents[1] / str(shorter) / CHECKPOINT).read_bytes())
 
-    def _completed(self, fit: Fit):
+    def _fitted(self, fit: Fit):
+        """The views that a cloud completes, and its volume."""
         train = self._measured(fit).train
         fitted = run(train, recipe(fit, self.scale), None, self.seed, path=self.path(fit).with_name(CHECKPOINT), resume=True)
         state = DeviceState(fitted.state)
-        return filled(train, COMPLETED, lambda geometry: fitted.stepper.render(state, geometry))
+        return filled(train, COMPLETED, lambda geometry: fitted.stepper.render(state, geometry)), fitted.stepper.volume(state)
 
     def _volume(self, cell: Volume, path: Path, label: str) -> dict:
         function, options = ALGORITHMS[cell.algorithm]
         if cell.fit.method != 'none' and self.get(cell.fit) is None:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
-        views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
+        views = dataset.train
+        if cell.algorithm == 'refined':
+            options = options | dict(init=self._fitted(cell.fit)[1])
+        elif cell.fit.method != 'none':
+            views = self._fitted(cell.fit)[0]
         with Progress(label, options.get('niter', len(views))) as bar:
             def progress(done, _, residual=None):
                 bar.update(done, residual=residual)
             begun = time.perf_counter()
             result = function(views, **options, progress=progress)
         volume = result if isinstance(result, np.ndarray) else result.volume
-        return dict(algorithm=cell.algorithm, options=options, method=cell.fit.method, seconds=time.perf_counter() - begun,
+        return dict(algorithm=cell.algorithm, options=ALGORITHMS[cell.algorithm][1], method=cell.fit.method, seconds=time.perf_counter() - begun,
                     psnr_3d=metrics.psnr_3d(volume, dataset.volume), ssim_3d=metrics.ssim_3d(volume, dataset.volume))
 
 

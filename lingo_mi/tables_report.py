@@ -24,7 +24,8 @@ NOTES = dict(
     views=f'PSNR in dB and SSIM of the 50 views held out, each view divided by its own maximum; IPSD with the longest side as '
           f'2. A recipe whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
     ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
-       f'the cloud of each method; `voxelize` samples that cloud itself. {_PAPER_IS}',
+       f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts ASD-POCS there, from the '
+       f'measured views alone. {_PAPER_IS}',
     ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
              f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}')
 SECOND = dict(views='iterations', ct='algorithm', ablation='scale, start, voxels')
@@ -94,11 +95,12 @@ class Group:
     columns: tuple[Column, ...]
 
 
-def groups(table: str, views, iterations, methods) -> list[Group]:
+def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'voxelize')) -> list[Group]:
     """The groups of a table, by rows.
 
     iterations   of the fits; the last one counts for `ct` and `ablation`
     methods      columns of `views` and `ct`
+    algorithms   rows of `ct`
     """
     last = iterations[-1]
     if table == 'views':
@@ -107,7 +109,7 @@ def groups(table: str, views, iterations, methods) -> list[Group]:
     if table == 'ct':
         return [Group(n, a, tuple(Column(m, _volume(n, m, last, a), CT, _PAPER_CT.get((n, a), {}).get(m))
                                   for m in ('none', *methods)))
-                for n in views for a in (*ALGORITHMS, 'voxelize')]
+                for n in views for a in algorithms]
     out = []
     for n in views:
         for parts, method in ABLATION.items():
@@ -127,7 +129,9 @@ def _fit(views, method, iterations):
 def _volume(views, method, iterations, algorithm):
     """The cell of an object; of the volume that a fit samples itself, the fit."""
     if method == 'none':
-        return lambda name: None if algorithm == 'voxelize' else Volume(Fit(name, views, 'none'), algorithm)
+        return lambda name: None if algorithm in ('voxelize', 'refined') else Volume(Fit(name, views, 'none'), algorithm)
+    if algorithm == 'refined' and settings_of(method).render == 'alpha':  # opacities make no volume
+        return lambda name: None
     fit = _fit(views, method, iterations)
     return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 

@@ -5,11 +5,13 @@
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm asd-pocs --views 25 -D niter=20 --out foot.nii.gz
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --complete out/x3d_foot/result.xml --views 100
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm voxelize --complete out/x3d_foot/result.xml
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --start out/x3d_foot/result.xml -D niter=8
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
-are rendered from it, and the volume is made of both. Where the true volume is known, PSNR and SSIM are printed.
+are rendered from it, and the volume is made of both. With --start, it is made of the views that the cloud was fitted to, by an
+iterative algorithm that starts from the cloud's own volume. Where the true volume is known, PSNR and SSIM are printed.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
-given; with --complete, those that the fit has modelled.
+given; with --complete and --start, those that the fit has modelled.
 """
 import argparse
 import inspect
@@ -32,6 +34,7 @@ def arguments():
                    '--complete: measured and rendered ones together')
     p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered; '
                    'checkpoint.npz of one by 3dgs or xgaussian')
+    p.add_argument('--start', metavar='F', help='result.xml of a fit, whose volume an iterative algorithm starts from')
     p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -83,7 +86,7 @@ def main():
     from lingo_mi.recon.corrections import linearised
     from lingo_mi.recon.fdk import fdk
     from lingo_mi.recon.sart import os_sart, sart, sirt
-    from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud
+    from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, without_effects
     from lingo_mi.scanning import defaults, load_scene, voxelize_cloud
 
     check_input(args)
@@ -91,19 +94,22 @@ def main():
         raise InputError('--algorithm voxelize samples a fitted cloud: name its result.xml with --complete')
     if args.complete and not args.views and args.algorithm != 'voxelize':
         raise InputError('--complete needs --views, the number of measured and rendered views together')
+    if args.start and (args.complete or args.views or args.algorithm in ('fdk', 'voxelize')):
+        raise InputError('--start is for an iterative --algorithm and the views of its fit: leave out --complete and --views')
     run = {'fdk': fdk, 'sart': sart, 'os-sart': os_sart, 'sirt': sirt, 'cgls': cgls, 'asd-pocs': asd_pocs,
            'voxelize': voxelize_cloud}[args.algorithm]
     defined, own = definitions(args.define), defaults(args.scene)
     chosen = {k: v for k, v in defined.items() if k not in own}
     effects = chosen.pop('effects', 'model')
-    if effects not in ('model', 'ignore') or effects == 'ignore' and args.complete:
-        raise InputError(f"-D effects={effects}: must be 'model' or 'ignore', and with --complete goes by the fit")
+    if effects not in ('model', 'ignore') or effects == 'ignore' and (args.complete or args.start):
+        raise InputError(f"-D effects={effects}: must be 'model' or 'ignore', and with --complete or --start goes by the fit")
     given = options(run, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
-    cloud = load_cloud(args.complete) if args.complete else None
-    if args.algorithm == 'voxelize' and not hasattr(cloud, 'gaussians'):
-        raise InputError(f'{args.complete}: opacities and radiances make no volume; take another --algorithm')
+    cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
+    if (args.algorithm == 'voxelize' or args.start) and not hasattr(cloud, 'gaussians'):
+        raise InputError(f'{args.complete or args.start}: opacities and radiances make no volume; '
+                         + ('leave out --start' if args.start else 'take another --algorithm'))
     dataset = read_input(args, scene, 0 if args.complete else args.views)
     scan = dataset.train
     began = time.monotonic()
@@ -112,6 +118,9 @@ def main():
     else:
         if args.complete:
             scan = complete(fitted_views(dataset, cloud.geometry), cloud, args.views)
+        elif args.start:
+            scan = without_effects(fitted_views(dataset, cloud.geometry), cloud)
+            given['init'] = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
         began = time.monotonic()

@@ -24,6 +24,8 @@ from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.runtime import use_variant
 
+ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize'
+
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -34,6 +36,8 @@ def arguments():
                    '(default: small 5000, paper 5000 15000 30000)')
     p.add_argument('--methods', nargs='+', choices=METHODS, default=list(METHODS), metavar='METHOD',
                    help=f'columns of views and ct (default: {" ".join(METHODS)})')
+    p.add_argument('--algorithms', nargs='+', choices=ALGORITHMS, default=list(ALGORITHMS), metavar='A',
+                   help=f'rows of ct (default: {" ".join(ALGORITHMS)})')
     p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
     p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<scale>)')
@@ -58,7 +62,7 @@ def main():
         raise InputError(f'--seed must not be negative, but is {args.seed}')
     objects = available(dict.fromkeys(args.objects or (*PHANTOMS, *VOLUMES)), print)
     cells = Cells(args.out or Path('out/tables') / args.scale, scale, args.seed)
-    rows = groups(args.table, views, iterations, args.methods)
+    rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     missing = [cell for cell in plan(rows, objects) if cells.get(cell) is None]
     failed = {}
     try:

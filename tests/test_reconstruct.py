@@ -20,7 +20,7 @@ from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing_angles, without_effects
 from lingo_mi.results import write_scene
-from lingo_mi.scanning import load_scene, render_objects, take_scan
+from lingo_mi.scanning import load_scene, render_objects, take_scan, voxelize_cloud
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 
@@ -86,6 +86,18 @@ def test_voxelize(scene, dataset, fitted, tmp_path):
     assert code == 0, err
     result = load(fitted.with_name('volume.nii.gz'))
     assert np.linalg.norm(load(tmp_path / 'v.nii') - result) < 1e-4 * np.linalg.norm(result)
+
+
+def test_start(scene, dataset, fitted, tmp_path):
+    """An iterative algorithm goes on from the cloud's volume, with the views of its fit."""
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=3', '--start', fitted, '--out',
+                          tmp_path / 'v.nii')
+    assert code == 0 and 'of 4 views' in text, err
+    cloud = load_cloud(fitted)
+    scan = fitted_views(dataset, cloud.geometry)
+    own = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(scan, 3, init=own).volume)
+    assert psnr_3d(load(tmp_path / 'v.nii'), dataset.volume) > psnr_3d(own, dataset.volume) + .5
 
 
 # ---- effects ---------------------------------------------------------------------------------------------------------
@@ -158,7 +170,9 @@ def test_missing_angles(dataset):
     (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
     (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'), (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
-    (['--algorithm', 'voxelize'], '--complete'), (['--complete', 'no.xml'], '--views'),
+    (['--algorithm', 'voxelize'], '--complete'), (['--start', 'no.xml'], 'iterative'),
+    (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
+    (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),
     (['--algorithm', 'art'], 'art'), (['--projections', 'no.npy'], 'no.npy')])
 def test_bad_input_is_one_line(scene, tmp_path, args, message):

@@ -68,18 +68,23 @@ def test_two_stages(out):
     code, text, err = script('ct', out, '--views', '4', '--iterations', '20', '--methods', 'r2')
     assert code == 0, err
     rows = {r['second']: r['columns'] for r in json.loads((out / 'ct.json').read_text()) if r['object'] == 'foot'}
-    assert list(rows) == ['fdk', 'sart', 'asd-pocs', 'voxelize']
+    assert list(rows) == ['fdk', 'sart', 'asd-pocs', 'refined', 'voxelize']
     assert rows['voxelize']['none'] is None and '| voxelize | foot | – | – |' in text
     volumes = [rows[a][m]['psnr_3d'] for a in ('fdk', 'sart', 'asd-pocs') for m in ('none', 'r2')]
     assert len(set(volumes)) == 6 and min(volumes) > 0
     # The numbers are those of the functions, on views rendered from the stored cloud.
     cells = Cells(out, TINY)
-    whole = cells._completed(Fit('foot', 4, 'r2', 20))
+    whole, own = cells._fitted(Fit('foot', 4, 'r2', 20))
     assert len(whole) == 30
     train = cells.dataset('foot').train
     np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
     volume = tables.fdk(whole)
-    assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, make('foot', 16).data), abs=1e-3)
+    truth = make('foot', 16).data
+    assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
+    measured = train.subset([0, 6, 12, 18])
+    refined = tables.asd_pocs(measured, **tables.ALGORITHMS['refined'][1], init=own).volume
+    assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(refined, truth), abs=1e-3)
+    assert rows['refined']['none'] is None and groups('ct', [4], [20], ['3dgs'], ['refined'])[0].columns[1].cell('foot') is None
 
 
 def test_the_parts_of_lingo():
@@ -112,9 +117,9 @@ def test_paper_beside_ours():
 
 def test_the_order_of_cells():
     cells = plan(groups('ct', [25], [30], ['r2']), ['a', 'b'])
-    assert [c.object if isinstance(c, Fit) else c.fit.object for c in cells] == ['a'] * 7 + ['b'] * 7
+    assert [c.object if isinstance(c, Fit) else c.fit.object for c in cells] == ['a'] * 8 + ['b'] * 8
     fit = Fit('a', 25, 'r2', 30)
-    assert cells[cells.index(fit):][:4] == [fit, *(Volume(fit, a) for a in ('fdk', 'sart', 'asd-pocs'))]
+    assert cells[cells.index(fit):][:5] == [fit, *(Volume(fit, a) for a in tables.ALGORITHMS)]
 
 
 # ---- interruptions ---------------------------------------------------------------------------------------------------
