@@ -1,4 +1,7 @@
 """FDK, SART and CGLS against RTK on the same projections (needs the `reference` extra)."""
+import sys
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -55,9 +58,40 @@ def test_sart():
         assert abs(system.residual(x)[1] / residual(system, theirs) - 1) < 0.02 / niter
 
 
+class TheirSystem(System):
+    """A x = b by RTK's projector and its transpose."""
+
+    def __init__(self, scan):
+        super().__init__(scan)
+        self.scan, self.ours, self.A = scan, self.A, self
+
+    def forward(self, x, views):
+        return self.ours.images(np.ascontiguousarray(rtk.project(self.volume(x), self.geometry, itk))), None
+
+    def adjoint(self, images, views):
+        projections = images.numpy().reshape(len(views), *self.geometry.nDetector[::-1]).transpose(0, 2, 1)
+        return mi.Float(rtk.backproject(replace(self.scan, projections=projections), itk).ravel())
+
+    @property
+    def voxels(self):
+        return self.ours.voxels
+
+
+@pytest.mark.parametrize('niter', [1, 2, 4])
+def test_cgls_with_the_same_operators(monkeypatch, niter):
+    """With RTK's projector and its transpose, volumes are RTK's: 2e-7 to 2e-6 in float64, a little more in float32."""
+    geo = geometry(angles=circular(20, start=3), offDetector=(0., 0.))
+    scan = ellipsoids(geo, *BODIES)
+    monkeypatch.setattr(sys.modules['lingo_mi.recon.cgls'], 'System', TheirSystem)
+    ours = cgls(scan, niter).volume
+    theirs = rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter, BackProjectionFilter=JOSEPH)
+    assert np.linalg.norm(theirs - ours) < 1e-5 * np.linalg.norm(theirs)
+
+
 @pytest.mark.parametrize('niter, tolerance', [(1, 0.001), (2, 0.01), (4, 0.02)])
 def test_cgls(niter, tolerance):
-    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is no transpose."""
+    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is no transpose, and its
+    projector weighs the voxels at the border, which the first gradient fills, in its own way."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0., 0.))
     scan = ellipsoids(geo, *BODIES)
     ours, theirs = cgls(scan, niter), rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..scan import Scan
+from .circle import on_circle
 from .fdk import fdk
 from .sart import blocks, sweep
 from .system import Reconstruction, System, check_counts, check_range, dot, evaluated, norm, scalar
@@ -73,7 +74,8 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     alpha_red    factor on the step length where total variation changed more than `rmax` times what the data changed,
                  while the data are not met
     rmax         see `alpha_red`
-    maxl2err     |A x - b| at which the data count as met, density times mm (default: 0.2 |A fdk(b) - b|)
+    maxl2err     |A x - b| at which the data count as met, density times mm (default: 0.2 |A fdk(b) - b|; 0 for scans that FDK
+                 does not know, so that the step shortens wherever total variation changes too much)
     nonneg       whether negative densities are set to zero by the data step
     order        of the blocks, see `os_sart`
     init         start volume [x, y, z], density per mm (default: zero)
@@ -94,7 +96,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     blocks(angles, blocksize, order, rng)
     x = system.start(init)
     if maxl2err is None:
-        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b
+        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if on_circle(scan) else 0.
     residuals = [system.residual(x)[1]]
     step = None
     for k in range(niter):

@@ -10,7 +10,8 @@ import numpy as np
 from ..errors import InputError
 from ..scan import Scan
 from ..xray.joseph import Joseph
-from .circle import require_circle
+from ..xray.pair import ExactPair
+from .circle import on_circle
 
 PARTIAL = 4096  # terms of a sum that are added in float32
 
@@ -28,16 +29,17 @@ class Reconstruction:
 
 
 class System:
-    """A x = b of a scan: Joseph's projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm.
+    """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm.
 
-    Raises InputError for a scan that is no circle about z, or one with pixels that are not valid.
+    The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
+    are not valid, which count for nothing, it is the exact one, a few times slower.
     """
 
     def __init__(self, scan: Scan):
-        require_circle(scan, 'an iterative algorithm')
-        self.geometry, self.A = scan.geometry, Joseph(scan.geometry)
+        circle = on_circle(scan)
+        self.geometry, self.A = scan.geometry, Joseph(scan.geometry) if circle else ExactPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
-        self.b = self.A.images(scan.projections)
+        self.b = self.A.images(scan.projections if scan.valid is None else np.where(scan.valid, scan.projections, 0))
         self.size_b = norm(self.b) or 1.
 
     def start(self, init):

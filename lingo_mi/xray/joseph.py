@@ -62,7 +62,27 @@ def column_table(geometry: Geometry) -> np.ndarray:
     return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
 
 
-class Joseph:
+class Stack:
+    """Volumes and stacks of images of a scan on the device. Raises InputError for 2^32 voxels or more."""
+
+    def __init__(self, geometry: Geometry):
+        self.geometry, self.size, self.panel = geometry, geometry.nVoxel, geometry.nDetector
+        self.voxels, self.pixels = int(np.prod(self.size)), int(np.prod(self.panel))
+        if self.voxels >= 2 ** 32:
+            raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
+
+    def images(self, projections):
+        """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
+        return mi.Float(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1).ravel()) + dr.opaque(mi.Float, 0)
+
+    def select(self, images, views):
+        """The images of the views `views` out of those of all views."""
+        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
+        block = index // self.pixels
+        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen, block) - block) * self.pixels)
+
+
+class Joseph(Stack):
     """The matrix A of a circular scan, view by view; `adjoint` is its transpose to rounding.
 
     The compiled kernels, one forward and two back, serve all blocks of views, whatever their number.
@@ -71,12 +91,9 @@ class Joseph:
     """
 
     def __init__(self, geometry: Geometry):
-        self.geometry, self.size, self.panel = geometry, geometry.nVoxel, geometry.nDetector
-        self.voxels, self.pixels = int(np.prod(self.size)), int(np.prod(self.panel))
+        super().__init__(geometry)
         if geometry.poses is not None:
             raise InputError('this projector needs a source on a circle about z and an upright panel')
-        if self.voxels >= 2 ** 32:
-            raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
         half = np.hypot(*(abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2])))
         if geometry.mode == 'cone' and geometry.DSO <= half:
             raise InputError(f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
@@ -98,16 +115,6 @@ class Joseph:
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
         from ..recon.fdk import voxel_matrices
         return voxel_matrices(self.geometry)[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
-
-    def images(self, projections):
-        """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
-        return mi.Float(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1).ravel()) + dr.opaque(mi.Float, 0)
-
-    def select(self, images, views):
-        """The images of the views `views` out of those of all views."""
-        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
-        block = index // self.pixels
-        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen, block) - block) * self.pixels)
 
     def forward(self, volume, views):
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
