@@ -25,9 +25,9 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          =============  =======  ========  =================  =============
          preset         extent   image     worst derivative   relative time
          =============  =======  ========  =================  =============
-         `draft`        3        6e-3      5e-2               0.8
+         `draft`        3        6e-3      5e-2               0.7
          `default`      5        2e-6      4e-5               1
-         `reference`    7        8e-8      2e-7               1.2
+         `reference`    7        8e-8      2e-7               1.3
          =============  =======  ========  =================  =============
 
          (Default: `default`)
