@@ -54,7 +54,7 @@ def _corners(cell, size):
 
 
 @dr.syntax
-def _gather(data, size, origin, d, inv, t_first, t_last):
+def gather(data, size, origin, d, inv, t_first, t_last):
     """Sum over the segments of a ray, in units of t."""
     t = mi.Float(t_first)
     total = mi.Float(0)
@@ -114,8 +114,8 @@ def _leave_cell(target, weight, plane, step, size, on_x, on_y):
 
 
 @dr.syntax
-def _scatter(target, value, size, origin, d, inv, t_first, t_last):
-    """The transpose of `_gather`: adds `value` times the weight of every corner to `target`.
+def scatter(target, value, size, origin, d, inv, t_first, t_last):
+    """The transpose of `gather`: adds `value` times the weight of every corner to `target`.
 
     The weights of the current cell stay in registers: a step through a face writes the four corners it leaves
     behind and hands the other four to the next cell, which halves the memory traffic.
@@ -147,14 +147,14 @@ class _LineIntegrals(dr.CustomOp):
 
     def eval(self, data, size, *walk):
         self.size, self.walk, self.width = size, walk, dr.width(data)
-        return _gather(data, size, *walk)
+        return gather(data, size, *walk)
 
     def forward(self):
-        self.set_grad_out(_gather(self.grad_in('data'), self.size, *self.walk))
+        self.set_grad_out(gather(self.grad_in('data'), self.size, *self.walk))
 
     def backward(self):
         target = dr.zeros(mi.Float, self.width)
-        _scatter(target, self.grad_out(), self.size, *self.walk)
+        scatter(target, self.grad_out(), self.size, *self.walk)
         self.set_grad_in('data', target)
 
     def name(self):
@@ -171,7 +171,8 @@ def _walk(size, box_min, box_max, origin, direction, t_min, t_max, low, high):
     return (origin, d, inv, first, last), length
 
 
-def _box(size):
+def whole_box(size):
+    """Opposite corners of the grid, in grid coordinates."""
     return mi.Vector3f(-0.5), mi.Vector3f(*size) - 0.5
 
 
@@ -194,7 +195,7 @@ def line_integrals(data, size, box_min, box_max, origin, direction, t_min=-dr.in
     size = tuple(int(n) for n in size)
     if dr.width(data) != size[0] * size[1] * size[2]:
         raise InputError(f'the volume holds {dr.width(data)} values, but its shape says {size}')
-    walk, length = _walk(size, box_min, box_max, origin, direction, t_min, t_max, *_box(size))
+    walk, length = _walk(size, box_min, box_max, origin, direction, t_min, t_max, *whole_box(size))
     return length * dr.custom(_LineIntegrals, data, size, *dr.detach(walk))
 
 
@@ -251,7 +252,11 @@ def _occupied(volume):
     return low, high
 
 
-def _view_walk(geometry, row, low, high):
+def view_walk(geometry, row, low, high):
+    """The arguments of `gather` and `scatter` for the rays of a view between `low` and `high`, and the length of a unit of t.
+
+    row is one row of `view_table` as an evaluated mi.Float [19].
+    """
     half = mi.Vector3f(*(s / 2 for s in geometry.sVoxel))
     origin, direction, t_min = view_rays(row, *geometry.nDetector)
     return _walk(geometry.nVoxel, -half, half, origin, direction, t_min, dr.inf, low, high)
@@ -283,8 +288,8 @@ def project(volume, geometry: Geometry, progress=None) -> np.ndarray:
     low, high = mi.Vector3f(*low), mi.Vector3f(*high)
     data = mi.Float(volume.ravel())
     for i, row in enumerate(view_table(geometry)):
-        walk, length = _view_walk(geometry, mi.Float(row), low, high)
-        out[i] = (length * _gather(data, geometry.nVoxel, *walk)).numpy().reshape(geometry.nDetector[::-1]).T
+        walk, length = view_walk(geometry, mi.Float(row), low, high)
+        out[i] = (length * gather(data, geometry.nVoxel, *walk)).numpy().reshape(geometry.nDetector[::-1]).T
         if progress:
             progress(i + 1, len(geometry))
     return out
@@ -309,8 +314,8 @@ def backproject(projections, geometry: Geometry, progress=None) -> np.ndarray:
         # A gather, because a plain read of a NumPy buffer bakes the buffer's alignment into the kernel.
         index = dr.arange(mi.UInt, n_v * n_u)
         image = dr.gather(mi.Float, mi.Float(projections[i].ravel()), index % n_v * n_u + index // n_v)
-        walk, length = _view_walk(geometry, mi.Float(row), *_box(geometry.nVoxel))
-        _scatter(target, length * image, geometry.nVoxel, *walk)
+        walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))
+        scatter(target, length * image, geometry.nVoxel, *walk)
         dr.eval(target)
         if progress:
             progress(i + 1, len(geometry))

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import Geometry
-from .grid import _box, _gather, _scatter, _view_walk, view_table
+from .grid import gather, scatter, view_table, view_walk, whole_box
 from .joseph import Stack
 
 
@@ -37,7 +37,7 @@ class ExactPair(Stack):
             length *= self._of(self._valid, view)
             target = dr.arange(mi.UInt, self.pixels) + dr.opaque(mi.UInt, block * self.pixels)
             path = dr.maximum(walk[-1] - walk[-2], 0)
-            for image, value in zip(out, (_gather(volume, self.size, *walk), path)):
+            for image, value in zip(out, (gather(volume, self.size, *walk), path)):
                 dr.scatter(image, length * value, target, mode=dr.ReduceMode.Permute)
             dr.eval(out)
         return tuple(out)
@@ -53,12 +53,12 @@ class ExactPair(Stack):
             walk, length = self._walk(view)
             length *= self._of(self._valid, view)
             for target, value in zip(sums, (self._of(images, block), 1)):
-                _scatter(target, length * value, self.size, *walk)
+                scatter(target, length * value, self.size, *walk)
                 dr.eval(target)
         return sums[0] if rule is None else rule(dr.arange(mi.UInt, self.voxels), *sums)
 
     def _walk(self, view):
-        return _view_walk(self.geometry, self._rays[view], *_box(self.size))
+        return view_walk(self.geometry, self._rays[view], *whole_box(self.size))
 
     def _of(self, images, block):
         """One of several images; 1 where there are none."""
