@@ -49,8 +49,7 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
         raise InputError(f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
                          f'it has {", ".join(sorted(defaults(path))) or "none"}')
     try:
-        # One thread: with several, Mitsuba has failed to make a plugin, once in a thousand loads.
-        scene = mi.load_file(str(path), parallel=False, **(parameters or {}))
+        scene = mi.load_file(str(path), **(parameters or {}))
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
         raise InputError(f'{path}: {plain(error)}') from None
     if not isinstance(scene, mi.Scene):
