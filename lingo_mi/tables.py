@@ -38,7 +38,7 @@ from .recon.fdk import fdk
 from .recon.sart import sart
 from .recon.two_stage import filled
 from .results import CHECKPOINT, measure, versions
-from .scan import Dataset
+from .scan import Dataset, Scan
 from .scanning import choose_views
 
 PHANTOMS = 'foot', 'chest'
@@ -162,7 +162,8 @@ class Cells:
     def __init__(self, folder: Path, scale: Scale, seed: int = 0):
         self.folder, self.scale, self.seed = Path(folder), scale, seed
         self.dataset = functools.lru_cache(1)(self._dataset)
-        self._fitted = functools.lru_cache(1)(self._fitted)
+        self._cloud = functools.lru_cache(1)(self._cloud)
+        self._completed = functools.lru_cache(1)(self._completed)
 
     def path(self, cell: Fit | Volume) -> Path:
         """Where a cell is stored."""
@@ -233,12 +234,16 @@ class Cells:
             with replacing(checkpoint) as temporary:
                 temporary.write_bytes((checkpoint.parents[1] / str(shorter) / CHECKPOINT).read_bytes())
 
-    def _fitted(self, fit: Fit):
-        """The views that a cloud completes, and its volume."""
-        train = self._measured(fit).train
-        fitted = run(train, recipe(fit, self.scale), None, self.seed, path=self.path(fit).with_name(CHECKPOINT), resume=True)
-        state = DeviceState(fitted.state)
-        return filled(train, COMPLETED, lambda geometry: fitted.stepper.render(state, geometry)), fitted.stepper.volume(state)
+    def _cloud(self, fit: Fit):
+        """A stored fit's stepper, and its state on the device."""
+        fitted = run(self._measured(fit).train, recipe(fit, self.scale), None, self.seed,
+                     path=self.path(fit).with_name(CHECKPOINT), resume=True)
+        return fitted.stepper, DeviceState(fitted.state)
+
+    def _completed(self, fit: Fit) -> Scan:
+        """The fitted views, completed from the cloud."""
+        stepper, state = self._cloud(fit)
+        return filled(self._measured(fit).train, COMPLETED, lambda geometry: stepper.render(state, geometry))
 
     def _volume(self, cell: Volume, path: Path, label: str) -> dict:
         function, options = ALGORITHMS[cell.algorithm]
@@ -247,16 +252,18 @@ class Cells:
         dataset = self._measured(cell.fit)
         views = dataset.train
         if cell.algorithm == 'refined':
-            options = options | dict(init=self._fitted(cell.fit)[1])
+            stepper, state = self._cloud(cell.fit)
+            options = options | dict(init=stepper.volume(state))
         elif cell.fit.method != 'none':
-            views = self._fitted(cell.fit)[0]
+            views = self._completed(cell.fit)
         with Progress(label, options.get('niter', len(views))) as bar:
             def progress(done, _, residual=None):
                 bar.update(done, residual=residual)
             begun = time.perf_counter()
             result = function(views, **options, progress=progress)
+        seconds = time.perf_counter() - begun
         volume = result if isinstance(result, np.ndarray) else result.volume
-        return dict(algorithm=cell.algorithm, options=ALGORITHMS[cell.algorithm][1], method=cell.fit.method, seconds=time.perf_counter() - begun,
+        return dict(algorithm=cell.algorithm, options=ALGORITHMS[cell.algorithm][1], method=cell.fit.method, seconds=seconds,
                     psnr_3d=metrics.psnr_3d(volume, dataset.volume), ssim_3d=metrics.ssim_3d(volume, dataset.volume))
 
 

@@ -181,6 +181,27 @@ def test_derivative_through_a_scene():
     assert abs(found[2] - expected) < 1e-3 * np.abs(found).max()
 
 
+@pytest.mark.parametrize('output', ['line_integral', 'transmission'])
+def test_what_saturates_has_no_derivative(output):
+    """Derivatives are those without saturation where pixels are darker, and zero elsewhere, in both modes."""
+    weights = np.random.default_rng(2).normal(size=(23, 30, 1)).astype(np.float32)
+    dark = render(scene_of()) > -np.log(.95)
+    assert .05 < dark.mean() < .95
+
+    def derivatives(weights, film):
+        scene = scene_of(None, None, film, output=output)
+        params = mi.traverse(scene)
+        dr.enable_grad(params['cloud.density'])
+        params.update()
+        dr.backward(mi.render(scene, params) * mi.TensorXf(weights))
+        reverse = dr.grad(params['cloud.density']).numpy()
+        dr.set_grad(params['cloud.density'], 1)
+        return reverse, dr.forward_to(mi.render(scene, params)).numpy() * weights
+    found = derivatives(weights, detector(saturation=.95))
+    expected = derivatives(weights * dark.reshape(weights.shape), None)
+    for f, e in zip(found, expected):
+        np.testing.assert_allclose(f, e, atol=1e-6 * np.abs(e).max())
+
 # ---- focal spot and aperture -----------------------------------------------------------------------------------------
 
 def edge_moments(tube, film, size=.0025, columns=1600):

@@ -74,7 +74,8 @@ def test_two_stages(out):
     assert len(set(volumes)) == 6 and min(volumes) > 0
     # The numbers are those of the functions, on views rendered from the stored cloud.
     cells = Cells(out, TINY)
-    whole, own = cells._fitted(Fit('foot', 4, 'r2', 20))
+    fit = Fit('foot', 4, 'r2', 20)
+    whole = cells._completed(fit)
     assert len(whole) == 30
     train = cells.dataset('foot').train
     np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
@@ -82,7 +83,8 @@ def test_two_stages(out):
     truth = make('foot', 16).data
     assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
     measured = train.subset([0, 6, 12, 18])
-    refined = tables.asd_pocs(measured, **tables.ALGORITHMS['refined'][1], init=own).volume
+    stepper, state = cells._cloud(fit)
+    refined = tables.asd_pocs(measured, **tables.ALGORITHMS['refined'][1], init=stepper.volume(state)).volume
     assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(refined, truth), abs=1e-3)
     assert rows['refined']['none'] is None and groups('ct', [4], [20], ['3dgs'], ['refined'])[0].columns[1].cell('foot') is None
 

@@ -36,10 +36,10 @@ class System:
     """
 
     def __init__(self, scan: Scan):
-        circle = on_circle(scan)
-        self.geometry, self.A = scan.geometry, Joseph(scan.geometry) if circle else ExactPair(scan.geometry, scan.valid)
+        self.geometry = scan.geometry
+        self.A = Joseph(scan.geometry) if on_circle(scan) else ExactPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
-        self.b = self.A.images(scan.projections if scan.valid is None else np.where(scan.valid, scan.projections, 0))
+        self.b = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.
 
     def start(self, init):
