@@ -30,13 +30,14 @@ class Work:
         dr.eval(self.blocks, self.block_cost, self.ends)
 
     def shares(self) -> dict:
-        """The arguments of a kernel that walks the items: see `first_item` and `block_range`."""
+        """The arguments of a kernel for `each_item`: lane, the begin and end of its share as (item, block), and blocks."""
         total = dr.gather(mi.UInt64, self.ends, self.count - 1)
         lane = dr.arange(mi.UInt32, self.teams * LANES)
         share = total // self.teams + 1
         begin = mi.UInt64(lane // LANES) * share
-        return dict(lane=lane, begin=begin, end=dr.minimum(begin + share, total), blocks=self.blocks,
-                    block_cost=self.block_cost, ends=self.ends, count=dr.opaque(mi.UInt32, self.count))
+        begin, end = (_cut(dr.minimum(x, total), self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
+                      for x in (begin, begin + share))
+        return dict(lane=lane, begin=begin, end=end, blocks=self.blocks)
 
     def add_up(self, kernel, size: int, **arguments):
         """Run a kernel that adds to an array of `size` packets; returns the sum, Float [size * PACKET].
@@ -57,28 +58,33 @@ class Work:
         return result
 
 
-@dr.syntax
-def first_item(begin, end, ends, count):
-    """The item in which a team's share begins, and where that item's own work begins."""
-    g = mi.UInt32(0)
-    size = dr.select(begin < end, count, 0)
-    while size > 0:
-        middle = g + size // 2
-        if dr.gather(mi.UInt64, ends, middle) <= begin:
-            g = middle + 1
-            size -= size // 2 + 1
-        else:
-            size //= 2
-    return g, dr.gather(mi.UInt64, ends, g - 1, (g > 0) & (begin < end))
+def _cut(position, ends, block_cost, count):
+    """The first block that begins at a position of the costs or behind it, as (item, block)."""
+    def halve(g, size):
+        half = size // 2
+        behind = dr.gather(mi.UInt64, ends, g + half) <= position
+        return dr.select(behind, g + half + 1, g), dr.select(behind, size - half - 1, half)
+    g, _ = dr.while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
+    start = dr.gather(mi.UInt64, ends, g - 1, g > 0)
+    # A masked lane reads 0, and an integer division by it would kill the process.
+    cost = dr.maximum(mi.UInt64(dr.gather(mi.UInt32, block_cost, g, g < count)), 1)
+    return g, mi.UInt32((position - start + cost - 1) // cost)
 
 
-def block_range(g, start, begin, end, blocks, block_cost):
-    """The blocks of eight rows of item g that begin within a team's share."""
-    cost = mi.UInt64(dr.gather(mi.UInt32, block_cost, g))
-    cost = dr.maximum(cost, 1)  # a masked lane reads 0, and an integer division by it would kill the process
-    first = dr.select(begin > start, (dr.maximum(begin, start) - start + cost - 1) // cost, 0)
-    last = (dr.maximum(end, start) - start + cost - 1) // cost
-    return mi.UInt32(first), mi.UInt32(dr.minimum(mi.UInt64(dr.gather(mi.UInt32, blocks, g)), last))
+def each_item(begin, end, blocks, visit):
+    """Call visit(g, block, stop) with each item of a share and the range of its blocks in the share; the kernel's result.
+
+    Loops carry what they change and no more: Dr.Jit traces others twice, and nested ones four and eight times.
+    """
+    def step(g, block):
+        visit(g, block, dr.select(g < end[0], dr.gather(mi.UInt32, blocks, g), end[1]))
+        return g + 1, mi.UInt32(0)
+    return dr.while_loop(begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
+
+
+def repeat(first, last, body, *state):
+    """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state."""
+    return dr.while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *body(i, *state)))[1:]
 
 
 def pack(Packet, Element, columns):
@@ -143,10 +149,6 @@ def position(packet, column, offset):
     return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)
 
 
-@dr.syntax
 def deposit(target, value, index, private):
     """Add a packet to a target, without atomics where the target is the team's own."""
-    if dr.hint(private, mode='scalar'):
-        dr.scatter(target, dr.gather(mi.Vector4f, target, index) + value, index)
-    else:
-        dr.scatter_add(target, value, index)
+    dr.scatter_add(target, value, index, mode=dr.ReduceMode.NoConflicts if private else dr.ReduceMode.Auto)

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
-from .balance import LANES, PACKET, Work, block_range, deposit, first_item, pack
+from .balance import LANES, PACKET, Work, deposit, each_item, pack, repeat
 from .frame import vector64
 
 SETUP = 6    # cost of a team's visit to eight rows, in packets
@@ -244,30 +244,27 @@ def _row(long, lower, upper, parity, row, row_end, width):
     return first, last, sign, anchor, mi.Float(q), mi.Float(slope)
 
 
-@dr.syntax
-def _fill(lane, begin, end, blocks, block_cost, ends, count, vertices, triangles, height, width, packets, bend, target,
-          base, private):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+def _fill(lane, begin, end, blocks, vertices, triangles, height, width, packets, bend, target, base, private):
+    def draw(g, block, stop):
         i = dr.gather(mi.Vector4i, triangles, g)
         a, b, c = _corners(vertices, i)
         long, lower, upper = _edge(a, c), _edge(a, b), _edge(b, c)
         row_begin, row_end = _first_centre(a.y, height), _first_centre(c.y, height)
-        while block < stop:
+
+        def rows(block):
             row = row_begin + mi.Int32(block * LANES + lane % LANES)
             first, last, sign, anchor, q0, slope = _row(long, lower, upper, i.w, row, row_end, width)
-            packet = first // PACKET
-            while packet * PACKET < last:
+
+            def pixels(packet):
                 column = packet * PACKET + mi.Vector4i(0, 1, 2, 3)
                 q = dr.fma(slope, mi.Vector4f(column - anchor), q0)
                 value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-bend, q, 1), 0)
                 deposit(target, value, base + row * packets + packet, private)
-                packet += 1
-            block += 1
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+                return ()
+            repeat(first // PACKET, (last + (PACKET - 1)) // PACKET, pixels)
+            return ()
+        repeat(block, stop, rows)
+    return each_item(begin, end, blocks, draw)
 
 
 def _corners(vertices, i):

@@ -19,13 +19,12 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, high_low, load, pack, pair, position, span,
-                      times, unpair, whole)
+from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pair, position, repeat, span, times,
+                      unpair, whole)
+from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
-
-LOG2E = 1.4426950408889634
 
 
 def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True):
@@ -132,78 +131,67 @@ def _row(c, w, y, extent2, packets):
     return dy, m, d0, d1, column, offset, begin, end
 
 
-def _shape(t, mx, m, d0, d1, e11):
-    """The footprint without its amplitude: 1/den, num/den and den^(-1/2) exp(-num / (2 den))."""
-    u = mx * t
-    num = dr.fma(u, u, m)
-    root = dr.rsqrt(dr.fma(t, dr.fma(e11, t, d1), d0))
+def _shape(t, c, m, d0, d1):
+    """The footprint without its amplitude: 1/den, its binary logarithm -num/den log2(e)/2, and its value."""
+    u = c[1] * HALF_LOG2E ** .5 * t
+    num = dr.fma(-u, u, m * -HALF_LOG2E)
+    root = dr.rsqrt(dr.fma(t, dr.fma(c[6], t, d1), d0))
     inverse = root * root
-    ratio = num * inverse
-    return inverse, ratio, root * dr.exp2(ratio * (-.5 * LOG2E))
+    exponent = num * inverse
+    return inverse, exponent, root * exp2_of_negative(exponent)
 
 
-@dr.syntax
-def _forward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, target, base, private):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
-        c = load(packed, g)
-        w = dr.gather(mi.Vector4i, whole, g)
-        while block < stop:
+def _forward(lane, begin, end, blocks, packed, whole, extent2, packets, target, base, private):
+    def draw(g, block, stop):
+        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+
+        def rows(block):
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
+            _, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
-            while packet < last:
-                t = position(packet, column, offset)
-                _, _, shape = _shape(t, c[1], m, d0, d1, c[6])
-                value = c[0] * shape
-                deposit(target, value, line + packet, private)
-                packet += 1
-            block += 1
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+
+            def pixels(packet):
+                _, _, shape = _shape(position(packet, column, offset), c, m, d0, d1)
+                deposit(target, c[0] * shape, line + packet, private)
+                return ()
+            repeat(first, last, pixels)
+            return ()
+        repeat(block, stop, rows)
+    return each_item(begin, end, blocks, draw)
 
 
-@dr.syntax
-def _backward(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, upstream, out):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
-        c = load(packed, g)
-        w = dr.gather(mi.Vector4i, whole, g)
-        sums = [mi.Float(0) for _ in NAMES]
-        while block < stop:
+def _backward(lane, begin, end, blocks, packed, whole, extent2, packets, upstream, out):
+    def gather(g, block, stop):
+        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+
+        def rows(block, *sums):
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
             line = y * packets
-            s, n0, n1, n2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
-            h0, h1, h2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
-            while packet < last:
-                t = position(packet, column, offset)
-                inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
-                # dL/d(num) = -1/2 n and dL/d(den) = -1/2 h, but for the amplitude
+
+            def pixels(packet, *moments):
+                ts = position(packet, column, offset)
+                inverse, exponent, shape = _shape(ts, c, m, d0, d1)
+                # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), but for the amplitude
                 value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
                 n = value * inverse
-                h = n * (1 - ratio)
-                s, n0, h0 = s + value, n0 + n, h0 + h
-                nt, ht = n * t, h * t
-                n1, h1 = n1 + nt, h1 + ht
-                n2, h2 = dr.fma(nt, t, n2), dr.fma(ht, t, h2)
-                packet += 1
-            sums = _chain(sums, c, dy, *(dr.sum(x) for x in (s, n0, n1, n2, h0, h1, h2)))
-            block += 1
-        for i in range(len(out)):
-            dr.scatter_add(out[i], sums[i], g, mode=dr.ReduceMode.Local)
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+                s, n0, n1, n2, q0, q1, q2 = moments
+                q, t = n * exponent, ts
+                nt, qt = n * t, q * t
+                moments = (s + dr.sum(value), n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t), q0 + dr.sum(q), q1 + dr.sum(qt), q2 + dr.dot(qt, t))
+                return moments
+            return _chain(sums, c, dy, *repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
+        sums = repeat(block, stop, rows, *(mi.Float(0) for _ in NAMES))
+        for target, value in zip(out, sums):
+            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+    return each_item(begin, end, blocks, gather)
 
 
-def _chain(sums, c, dy, s, n0, n1, n2, h0, h1, h2):
+def _chain(sums, c, dy, s, n0, n1, n2, q0, q1, q2):
     """Add a row's part to the eleven sums, from its moments in t."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     half = -.5 * amplitude
+    h0, h1, h2 = (dr.fma(1 / HALF_LOG2E, q, n) for q, n in zip((q0, q1, q2), (n0, n1, n2)))
     n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
     # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy. The last number is the
     # derivative by the centre's y along the ridge, at constant t.
@@ -212,34 +200,31 @@ def _chain(sums, c, dy, s, n0, n1, n2, h0, h1, h2):
     ddy = 2 * dr.square(my) * dy * n0 + dr.fma(2 * e22, dy, e2) * h0 + 2 * e12 * h1
     parts = (s, 2 * mx * n2, 2 * my * dr.square(dy) * n0, dy * dt, h1, dy * h0, h2, 2 * dy * h1, dr.square(dy) * h0,
              -dt, -ddy)
-    return [a + b for a, b in zip(sums, parts)]
+    return tuple(a + b for a, b in zip(sums, parts))
 
 
-@dr.syntax
-def _tangent(lane, begin, end, packed, whole, blocks, block_cost, ends, count, extent2, packets, moved, target, base,
-             private):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
-        c, dc = load(packed, g), load(moved, g)
-        w = dr.gather(mi.Vector4i, whole, g)
-        while block < stop:
+def _tangent(lane, begin, end, blocks, packed, whole, extent2, packets, moved, target, base, private):
+    def draw(g, block, stop):
+        c, dc, w = load(packed, g), load(moved, g), dr.gather(mi.Vector4i, whole, g)
+
+        def rows(block):
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, packet, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
-            while packet < last:
+
+            def pixels(packet):
                 t = position(packet, column, offset)
-                inverse, ratio, shape = _shape(t, c[1], m, d0, d1, c[6])
-                value = shape * _tangent_factor(c, dc, t, dy, d1, inverse, ratio)
+                inverse, exponent, shape = _shape(t, c, m, d0, d1)
+                value = shape * _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
                 deposit(target, value, line + packet, private)
-                packet += 1
-            block += 1
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+                return ()
+            repeat(first, last, pixels)
+            return ()
+        repeat(block, stop, rows)
+    return each_item(begin, end, blocks, draw)
 
 
-def _tangent_factor(c, dc, t, dy, d1, inverse, ratio):
+def _tangent_factor(c, dc, t, dy, d1, inverse, exponent):
     """The footprint's directional derivative over its shape."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_ridge, d_y, _ = dc
@@ -247,4 +232,4 @@ def _tangent_factor(c, dc, t, dy, d1, inverse, ratio):
     num_dot = 2 * mx * t * (d_mx * t + mx * t_dot) + 2 * my * dy * (d_my * dy - my * d_y)
     den_dot = (t * (d_e1 + d_e11 * t) + dy * (d_e2 + 2 * d_e12 * t + d_e22 * dy)
                + (d1 + 2 * e11 * t) * t_dot - (e2 + 2 * e12 * t + 2 * e22 * dy) * d_y)
-    return d_amplitude - .5 * amplitude * inverse * (num_dot + (1 - ratio) * den_dot)
+    return d_amplitude - .5 * amplitude * inverse * (num_dot + dr.fma(1 / HALF_LOG2E, exponent, 1) * den_dot)

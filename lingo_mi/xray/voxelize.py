@@ -18,10 +18,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .balance import (LANES, PACKET, Work, block_range, deposit, first_item, high_low, load, pack, position, span,
-                      times, whole)
+from .balance import LANES, PACKET, Work, deposit, each_item, high_low, load, pack, position, repeat, span, times, whole
+from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import rotate_inverse
-from .splat import LOG2E, SETUP
+from .splat import SETUP
 
 NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s2, s3, x, y, z, the last six in float64
 
@@ -143,52 +143,47 @@ def _sum(a, b):
     return total, (a - (total - part)) + (b - part)
 
 
-@dr.syntax
-def _fill(lane, begin, end, blocks, block_cost, ends, count, packed, places, extent2, packets, rows, target, base, private):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+def _fill(lane, begin, end, blocks, packed, places, extent2, packets, rows, target, base, private):
+    def draw(g, block, stop):
         c = load(packed, g, 4)
         w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
-        while block < stop:
+
+        def lines(block):
             index = mi.Int32(block * LANES + lane % LANES)
-            _, _, m, column, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
-            while packet < last:
+            _, _, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+
+            def voxels(packet):
                 u = c[1] * position(packet, column, offset)
-                deposit(target, c[0] * dr.exp2(dr.fma(u, u, m) * (-.5 * LOG2E)), base + line + packet, private)
-                packet += 1
-            block += 1
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+                value = c[0] * exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
+                deposit(target, value, base + line + packet, private)
+                return ()
+            repeat(first, last, voxels)
+            return ()
+        repeat(block, stop, lines)
+    return each_item(begin, end, blocks, draw)
 
 
-@dr.syntax
-def _collect(lane, begin, end, blocks, block_cost, ends, count, packed, places, extent2, packets, rows, upstream, out):
-    g, start = first_item(begin, end, ends, count)
-    while (g < count) & (start < end):
-        block, stop = block_range(g, start, begin, end, blocks, block_cost)
+def _collect(lane, begin, end, blocks, packed, places, extent2, packets, rows, upstream, out):
+    def gather(g, block, stop):
         c = load(packed, g, 4)
         w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
-        sums = [mi.Float(0) for _ in range(NUMBERS)]
-        while block < stop:
+
+        def lines(block, *sums):
             index = mi.Int32(block * LANES + lane % LANES)
-            dz, r, m, column, offset, packet, last, line = _line(c, w, v, index, extent2, packets, rows)
-            n0, n1, n2 = mi.Vector4f(0), mi.Vector4f(0), mi.Vector4f(0)
-            while packet < last:
+            dz, r, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+
+            def voxels(packet, n0, n1, n2):
                 t = position(packet, column, offset)
                 u = c[1] * t
-                n = dr.gather(mi.Vector4f, upstream, line + packet) * dr.exp2(dr.fma(u, u, m) * (-.5 * LOG2E))
+                shape = exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
+                n = dr.gather(mi.Vector4f, upstream, line + packet) * shape
                 nt = n * t
-                n0, n1, n2 = n0 + n, n1 + nt, dr.fma(nt, t, n2)
-                packet += 1
-            sums = _chain(sums, c, dz, r, dr.sum(n0), dr.sum(n1), dr.sum(n2))
-            block += 1
-        for i in range(len(out)):
-            dr.scatter_add(out[i], sums[i], g, mode=dr.ReduceMode.Local)
-        start = dr.gather(mi.UInt64, ends, g)
-        g += 1
-    return g
+                return n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t)
+            return _chain(sums, c, dz, r, *repeat(first, last, voxels, *(mi.Float(0) for _ in range(3))))
+        sums = repeat(block, stop, lines, *(mi.Float(0) for _ in range(NUMBERS)))
+        for target, value in zip(out, sums):
+            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+    return each_item(begin, end, blocks, gather)
 
 
 def _chain(sums, c, dz, r, n0, n1, n2):
@@ -199,4 +194,4 @@ def _chain(sums, c, dz, r, n0, n1, n2):
     d_r = dr.square(m2) * r * a0
     parts = (n0, m1 * a2, m2 * dr.square(r) * a0, m3 * dr.square(dz) * a0, r * dt, dz * dt, dz * d_r,
              -dt, -d_r, -dr.square(m3) * dz * a0)
-    return [a + b for a, b in zip(sums, parts)]
+    return tuple(a + b for a, b in zip(sums, parts))
