@@ -11,6 +11,7 @@ from oracle import Cloud, Pose, random_cloud, relative
 
 from lingo_mi.geometry import Frames, Geometry
 from lingo_mi.xray.cloud import line_integrals
+from lingo_mi.xray.exponential import exp2_of_negative
 from lingo_mi.xray.footprint import NAMES, project
 from lingo_mi.xray.frame import View
 from lingo_mi.xray.splat import splat
@@ -299,3 +300,12 @@ def test_same_bits_every_time(mode, variant):
         np.testing.assert_array_equal(image, again)
         for name in PARAMETERS:
             np.testing.assert_array_equal(grads[name], grads_again[name])
+
+
+def test_powers_of_two():
+    """To float32's rounding, exact for whole numbers, and nothing but small where float32 ends."""
+    x = np.concatenate([np.linspace(-125.9, 0, 100_001), -np.logspace(-40, 0, 1000), np.arange(-125, 1)]).astype(np.float32)
+    found = exp2_of_negative(mi.Float(x)).numpy()
+    np.testing.assert_allclose(found, np.exp2(x.astype(float)), rtol=1.2e-7)
+    np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
+    assert np.all(exp2_of_negative(mi.Float([-126, -127, -200, -1e30, -np.inf])).numpy() <= 2. ** -126)

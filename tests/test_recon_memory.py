@@ -1,0 +1,42 @@
+"""Peak memory of reconstructions: some volumes and sets of projections, never a matrix or a view's whole history."""
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = '''
+import resource, sys
+import numpy as np
+from lingo_mi.runtime import use_variant
+use_variant('llvm_ad_mono')
+import mitsuba as mi
+from lingo_mi.geometry import Geometry, circular
+from lingo_mi.recon.asd_pocs import asd_pocs
+from lingo_mi.recon.cgls import cgls
+from lingo_mi.recon.fdk import fdk
+from lingo_mi.recon.sart import sart
+from lingo_mi.scan import Scan
+from lingo_mi.xray.joseph import Joseph
+
+size, pixels, views = map(int, sys.argv[2:])
+geometry = Geometry(1000., 1500., (pixels, pixels), 512 / pixels, (size,) * 3, 256 / size, circular(views))
+project = Joseph(geometry).forward(mi.Float(np.ones(size ** 3, np.float32)), np.arange(views))[0]
+scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
+del project
+dict(fdk=lambda: fdk(scan), sart=lambda: sart(scan, niter=1), cgls=lambda: cgls(scan, niter=1),
+     asd_pocs=lambda: asd_pocs(scan, niter=1, tviter=2))[sys.argv[1]]()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+'''
+
+
+@pytest.mark.parametrize('size, pixels, views', [(64, 128, 20), pytest.param(512, 1024, 100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize('algorithm', ['fdk', 'sart', 'cgls', 'asd_pocs'])
+def test_peak_memory(algorithm, size, pixels, views):
+    """512^3 voxels and 100 views of 1024^2 pixels within 8 GB; small ones in proportion, above what libraries take."""
+    pytest.importorskip('resource', reason='peak memory is asked of a Unix kernel')
+    out = subprocess.run([sys.executable, '-c', PROGRAM, algorithm, *map(str, (size, pixels, views))], capture_output=True,
+                         text=True, check=True).stdout
+    data = 4 * (size ** 3 + views * pixels ** 2)
+    peak = 1024 * int(out)
+    print(f'{algorithm}: {peak / 1e9:.2f} GB')
+    assert peak < 6e8 + 7.5 * data
