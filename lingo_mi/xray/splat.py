@@ -76,7 +76,7 @@ class _Plan:
                               packets=dr.opaque(mi.Int32, self.packets))
 
     def image(self):
-        return self._crop(self.work.add_up(_forward, self.packets * self.height, **self.arguments))
+        return self._crop(self.work.add_up(_draw, self.packets * self.height, **self.arguments))
 
     def tangent(self, tangents):
         *others, x, y = tangents
@@ -85,7 +85,7 @@ class _Plan:
         zeros = dr.zeros(mi.Float, self.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self._crop(self.work.add_up(_tangent, self.packets * self.height, **self.arguments, moved=moved))
+        return self._crop(self.work.add_up(_draw, self.packets * self.height, **self.arguments, moved=moved))
 
     def _crop(self, padded):
         """Drop the padding of rows to whole packets."""
@@ -100,7 +100,7 @@ class _Plan:
         upstream = dr.gather(mi.Float, grad_image, row * width + column, column < width)
         out = [dr.zeros(mi.Float, self.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
-        dr.eval(_backward(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
+        dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
         # The kernel's derivative by y leaves the ridge where it is.
         out[-1] = type(self.shear)(out[-1]) + self.shear * type(self.shear)(out[-2])
         return tuple(kind(v) for kind, v in zip(self.types, out))
@@ -141,18 +141,22 @@ def _shape(t, c, m, d0, d1):
     return inverse, exponent, root * exp2_of_negative(exponent)
 
 
-def _forward(lane, begin, end, blocks, packed, whole, extent2, packets, target, base, private):
+def _draw(lane, begin, end, blocks, packed, whole, extent2, packets, target, base, private, moved=None):
+    """Add all footprints to the target; with `moved`, packed like them, their derivatives in that direction."""
     def draw(g, block, stop):
         c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+        dc = None if moved is None else load(moved, g)
 
         def rows(block):
             y = w.z + mi.Int32(block * LANES + lane % LANES)
-            _, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
             line = base + y * packets
 
             def pixels(packet):
-                _, _, shape = _shape(position(packet, column, offset), c, m, d0, d1)
-                deposit(target, c[0] * shape, line + packet, private)
+                t = position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, c, m, d0, d1)
+                factor = c[0] if moved is None else _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
+                deposit(target, factor * shape, line + packet, private)
                 return ()
             repeat(first, last, pixels)
             return ()
@@ -160,7 +164,8 @@ def _forward(lane, begin, end, blocks, packed, whole, extent2, packets, target, 
     return each_item(begin, end, blocks, draw)
 
 
-def _backward(lane, begin, end, blocks, packed, whole, extent2, packets, upstream, out):
+def _gather(lane, begin, end, blocks, packed, whole, extent2, packets, upstream, out):
+    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `out`."""
     def gather(g, block, stop):
         c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
 
@@ -169,17 +174,17 @@ def _backward(lane, begin, end, blocks, packed, whole, extent2, packets, upstrea
             dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
             line = y * packets
 
-            def pixels(packet, *moments):
-                ts = position(packet, column, offset)
-                inverse, exponent, shape = _shape(ts, c, m, d0, d1)
+            def pixels(packet, s, n0, n1, n2, q0, q1, q2):
+                t = position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, c, m, d0, d1)
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), but for the amplitude
                 value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
                 n = value * inverse
-                s, n0, n1, n2, q0, q1, q2 = moments
-                q, t = n * exponent, ts
+                q = n * exponent
                 nt, qt = n * t, q * t
-                moments = (s + dr.sum(value), n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t), q0 + dr.sum(q), q1 + dr.sum(qt), q2 + dr.dot(qt, t))
-                return moments
+                # Summed at once: packets of sums do not fit the CPU's registers.
+                return (s + dr.sum(value), n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t),
+                        q0 + dr.sum(q), q1 + dr.sum(qt), q2 + dr.dot(qt, t))
             return _chain(sums, c, dy, *repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
         sums = repeat(block, stop, rows, *(mi.Float(0) for _ in NAMES))
         for target, value in zip(out, sums):
@@ -201,27 +206,6 @@ def _chain(sums, c, dy, s, n0, n1, n2, q0, q1, q2):
     parts = (s, 2 * mx * n2, 2 * my * dr.square(dy) * n0, dy * dt, h1, dy * h0, h2, 2 * dy * h1, dr.square(dy) * h0,
              -dt, -ddy)
     return tuple(a + b for a, b in zip(sums, parts))
-
-
-def _tangent(lane, begin, end, blocks, packed, whole, extent2, packets, moved, target, base, private):
-    def draw(g, block, stop):
-        c, dc, w = load(packed, g), load(moved, g), dr.gather(mi.Vector4i, whole, g)
-
-        def rows(block):
-            y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
-            line = base + y * packets
-
-            def pixels(packet):
-                t = position(packet, column, offset)
-                inverse, exponent, shape = _shape(t, c, m, d0, d1)
-                value = shape * _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
-                deposit(target, value, line + packet, private)
-                return ()
-            repeat(first, last, pixels)
-            return ()
-        repeat(block, stop, rows)
-    return each_item(begin, end, blocks, draw)
 
 
 def _tangent_factor(c, dc, t, dy, d1, inverse, exponent):
