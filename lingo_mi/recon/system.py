@@ -32,7 +32,7 @@ class System:
     """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm.
 
     The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
-    are not valid, which count for nothing, it is the exact one, a few times slower.
+    are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
     """
 
     def __init__(self, scan: Scan):
