@@ -39,11 +39,13 @@ class Work:
                       for x in (begin, begin + share))
         return dict(lane=lane, begin=begin, end=end, blocks=self.blocks)
 
-    def add_up(self, kernel, size: int, **arguments):
-        """Run a kernel that adds to an array of `size` packets; returns the sum, Float [size * PACKET].
+    def add_up(self, kernel, rows: int, width: int, /, **arguments):
+        """Run a kernel that adds to rows of so many elements, padded to whole packets; returns them, Float [rows * width].
 
         The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
         """
+        packets = -(-width // PACKET)
+        size = rows * packets
         private = self.on_cpu and self.teams * size <= MOST_COPIED
         copies = self.teams if private else 1
         target = dr.zeros(mi.Float, copies * size * PACKET)
@@ -51,8 +53,9 @@ class Work:
         shares, stride = self.shares(), dr.opaque(mi.UInt32, size)
         base = mi.Int32(shares['lane'] // LANES * stride if private else mi.UInt32(0))
         dr.eval(kernel(**shares, **arguments, target=target, base=base, private=private), target)
-        i = dr.arange(mi.UInt32, size * PACKET)
-        result = dr.zeros(mi.Float, size * PACKET)
+        i, columns = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width)
+        i = i // columns * dr.opaque(mi.UInt32, packets * PACKET) + i % columns
+        result = dr.zeros(mi.Float, rows * width)
         for copy in range(copies):
             result += dr.gather(mi.Float, target, i + copy * PACKET * stride)
         return result

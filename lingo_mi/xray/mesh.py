@@ -113,11 +113,8 @@ class MeshPaths:
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
         dr.eval(triangles)
         work = Work(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn))
-        padded = work.add_up(_fill, packets * view.height, vertices=vertices, triangles=triangles, **size,
-                             packets=dr.opaque(mi.Int32, packets),
-                             bend=dr.opaque(mi.Float, 0. if view.parallel else 1.))
-        i, width = dr.arange(mi.UInt32, view.height * view.width), dr.opaque(mi.UInt32, view.width)
-        return dr.gather(mi.Float, padded, i // width * dr.opaque(mi.UInt32, packets * PACKET) + i % width)
+        return work.add_up(_fill, view.height, view.width, vertices=vertices, triangles=triangles, **size,
+                           packets=dr.opaque(mi.Int32, packets), bend=dr.opaque(mi.Float, 0. if view.parallel else 1.))
 
 
 def from_mitsuba(shape) -> MeshPaths:

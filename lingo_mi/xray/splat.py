@@ -76,7 +76,7 @@ class _Plan:
                               packets=dr.opaque(mi.Int32, self.packets))
 
     def image(self):
-        return self._crop(self.work.add_up(_draw, self.packets * self.height, **self.arguments))
+        return self.work.add_up(_draw, self.height, self.width, **self.arguments)
 
     def tangent(self, tangents):
         *others, x, y = tangents
@@ -85,12 +85,7 @@ class _Plan:
         zeros = dr.zeros(mi.Float, self.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self._crop(self.work.add_up(_draw, self.packets * self.height, **self.arguments, moved=moved))
-
-    def _crop(self, padded):
-        """Drop the padding of rows to whole packets."""
-        i, width = dr.arange(mi.UInt32, self.height * self.width), dr.opaque(mi.UInt32, self.width)
-        return dr.gather(mi.Float, padded, i // width * dr.opaque(mi.UInt32, self.packets * PACKET) + i % width)
+        return self.work.add_up(_draw, self.height, self.width, **self.arguments, moved=moved)
 
     def gradient(self, grad_image):
         """Derivatives of the footprints' numbers, a tuple of Float [N], from that of the image."""

@@ -90,10 +90,7 @@ class _Voxelize(dr.CustomOp):
         dr.eval(packed, places)
         self.arguments = dict(packed=packed, places=places, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets), rows=dr.opaque(mi.Int32, ny))
-        padded = self.work.add_up(_fill, self.packets * ny * nz, **self.arguments)
-        i = dr.arange(mi.UInt32, nx * ny * nz)
-        n = dr.opaque(mi.UInt32, nx)
-        return dr.gather(mi.Float, padded, i // n * dr.opaque(mi.UInt32, self.packets * PACKET) + i % n)
+        return self.work.add_up(_fill, ny * nz, nx, **self.arguments)
 
     def backward(self):
         nx, ny, nz = self.shape
