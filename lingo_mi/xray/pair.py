@@ -1,6 +1,7 @@
 """The exact projector of `grid` and its transpose as a matrix to iterate with: any poses, pixels left out (Dr.Jit).
 
-`joseph` is two to three times as fast (128^3 voxels, 20 views, CPU), where the source moves on a circle before an upright panel and all pixels are valid.
+`joseph` is two to three times as fast (128^3 voxels, 20 views, CPU), where the source moves on a circle before an upright
+panel and all pixels are valid.
 """
 from __future__ import annotations
 

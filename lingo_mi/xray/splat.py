@@ -127,7 +127,7 @@ def _row(c, w, y, extent2, packets):
 
 
 def _shape(t, c, m, d0, d1):
-    """The footprint without its amplitude: 1/den, its binary logarithm -num/den log2(e)/2, and its value."""
+    """The footprint without its amplitude: 1/den, the exponent of 2, which is -num/den log2(e)/2, and the value."""
     u = c[1] * HALF_LOG2E ** .5 * t
     num = dr.fma(-u, u, m * -HALF_LOG2E)
     root = dr.rsqrt(dr.fma(t, dr.fma(c[6], t, d1), d0))
