@@ -48,7 +48,7 @@ SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults). From a
 # cloud's volume the data change little, so steps on total variation start longer, and become shorter while they undo that.
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (asd_pocs, dict(niter=20, alpha=.12, alpha_red=.8, rmax=.5, maxl2err=0.))}
+              'refined': (asd_pocs, dict(niter=30, alpha=.12, alpha_red=.8, rmax=.5, maxl2err=0.))}
 
 
 @dataclass(frozen=True)
