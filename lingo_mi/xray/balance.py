@@ -24,7 +24,7 @@ class Work:
     def __init__(self, blocks, block_cost):
         self.count = dr.width(blocks)
         self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        self.teams = 4 * dr.thread_count() if self.on_cpu else 4096
+        self.teams = 2 * dr.thread_count() if self.on_cpu else 4096
         self.blocks, self.block_cost = blocks, block_cost
         self.ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
         dr.eval(self.blocks, self.block_cost, self.ends)
@@ -53,12 +53,13 @@ class Work:
         shares, stride = self.shares(), dr.opaque(mi.UInt32, size)
         base = mi.Int32(shares['lane'] // LANES * stride if private else mi.UInt32(0))
         dr.eval(kernel(**shares, **arguments, target=target, base=base, private=private), target)
-        i, columns = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width)
-        i = i // columns * dr.opaque(mi.UInt32, packets * PACKET) + i % columns
-        result = dr.zeros(mi.Float, rows * width)
-        for copy in range(copies):
-            result += dr.gather(mi.Float, target, i + copy * PACKET * stride)
-        return result
+        if copies > 1:
+            i, total = dr.arange(mi.UInt32, size), dr.zeros(mi.Vector4f, size)
+            for copy in range(copies):
+                total += dr.gather(mi.Vector4f, target, i + copy * stride)
+            target = dr.empty(mi.Float, size * PACKET)
+            dr.scatter(target, total, i, mode=dr.ReduceMode.Permute)
+        return crop(target, rows, width)
 
 
 def _cut(position, ends, block_cost, count):
@@ -88,6 +89,24 @@ def each_item(begin, end, blocks, visit):
 def repeat(first, last, body, *state):
     """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state."""
     return dr.while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *body(i, *state)))[1:]
+
+
+def pad(image, rows: int, width: int):
+    """Float [rows * width] with zeros at the end of each row, up to whole packets."""
+    if width % PACKET == 0:
+        return image
+    i = dr.arange(mi.UInt32, rows * -(-width // PACKET) * PACKET)
+    padded, width = (dr.opaque(mi.UInt32, n) for n in (-(-width // PACKET) * PACKET, width))
+    row, column = i // padded, i % padded
+    return dr.gather(mi.Float, image, row * width + column, column < width)
+
+
+def crop(padded, rows: int, width: int):
+    """The image that `pad` padded."""
+    if width % PACKET == 0:
+        return padded
+    i, columns = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width)
+    return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, -(-width // PACKET) * PACKET) + i % columns)
 
 
 def pack(Packet, Element, columns):

@@ -19,8 +19,8 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pair, position, repeat, span, times,
-                      unpair, whole)
+from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pad, pair, position, repeat, span,
+                      times, unpair, whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import NAMES, Footprints
 
@@ -89,10 +89,7 @@ class _Plan:
 
     def gradient(self, grad_image):
         """Derivatives of the footprints' numbers, a tuple of Float [N], from that of the image."""
-        i = dr.arange(mi.UInt32, self.packets * PACKET * self.height)
-        padded, width = dr.opaque(mi.UInt32, self.packets * PACKET), dr.opaque(mi.UInt32, self.width)
-        row, column = i // padded, i % padded
-        upstream = dr.gather(mi.Float, grad_image, row * width + column, column < width)
+        upstream = pad(grad_image, self.height, self.width)
         out = [dr.zeros(mi.Float, self.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
         dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)

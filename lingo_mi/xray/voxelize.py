@@ -18,7 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .balance import LANES, PACKET, Work, deposit, each_item, high_low, load, pack, position, repeat, span, times, whole
+from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pad, position, repeat, span, times,
+                      whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import rotate_inverse
 from .splat import SETUP
@@ -94,9 +95,7 @@ class _Voxelize(dr.CustomOp):
 
     def backward(self):
         nx, ny, nz = self.shape
-        i = dr.arange(mi.UInt32, self.packets * PACKET * ny * nz)
-        padded, n = dr.opaque(mi.UInt32, self.packets * PACKET), dr.opaque(mi.UInt32, nx)
-        upstream = dr.gather(mi.Float, self.grad_out(), i // padded * n + i % padded, i % padded < n)
+        upstream = pad(self.grad_out(), ny * nz, nx)
         out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
         dr.make_opaque(upstream, out)
         dr.eval(_collect(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
