@@ -87,8 +87,9 @@ def each_item(begin, end, blocks, visit):
 
 
 def repeat(first, last, body, *state):
-    """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state."""
-    return dr.while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *body(i, *state)))[1:]
+    """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state, if there is any."""
+    return dr.while_loop((first, *state), lambda i, *state: i < last,
+                         lambda i, *state: (i + 1, *(body(i, *state) or ())))[1:]
 
 
 def pad(image, rows: int, width: int):

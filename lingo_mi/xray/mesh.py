@@ -257,9 +257,7 @@ def _fill(lane, begin, end, blocks, vertices, triangles, height, width, packets,
                 q = dr.fma(slope, mi.Vector4f(column - anchor), q0)
                 value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-bend, q, 1), 0)
                 deposit(target, value, base + row * packets + packet, private)
-                return ()
             repeat(first // PACKET, (last + (PACKET - 1)) // PACKET, pixels)
-            return ()
         repeat(block, stop, rows)
     return each_item(begin, end, blocks, draw)
 

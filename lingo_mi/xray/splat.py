@@ -149,9 +149,7 @@ def _draw(lane, begin, end, blocks, packed, whole, extent2, packets, target, bas
                 inverse, exponent, shape = _shape(t, c, m, d0, d1)
                 factor = c[0] if moved is None else _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
                 deposit(target, factor * shape, line + packet, private)
-                return ()
             repeat(first, last, pixels)
-            return ()
         repeat(block, stop, rows)
     return each_item(begin, end, blocks, draw)
 

@@ -152,9 +152,7 @@ def _fill(lane, begin, end, blocks, packed, places, extent2, packets, rows, targ
                 u = c[1] * position(packet, column, offset)
                 value = c[0] * exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
                 deposit(target, value, base + line + packet, private)
-                return ()
             repeat(first, last, voxels)
-            return ()
         repeat(block, stop, lines)
     return each_item(begin, end, blocks, draw)
 
