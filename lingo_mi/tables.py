@@ -35,6 +35,7 @@ from .phantoms.scanning import scan
 from .progress import Progress
 from .recon.asd_pocs import asd_pocs
 from .recon.fdk import fdk
+from .recon.refined import refined
 from .recon.sart import sart
 from .recon.two_stage import filled
 from .results import CHECKPOINT, measure, versions
@@ -45,10 +46,9 @@ PHANTOMS = 'foot', 'chest'
 VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
 
-# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults). From a
-# cloud's volume the data change little, so steps on total variation start longer, and become shorter while they undo that.
+# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (asd_pocs, dict(niter=30, alpha=.12, alpha_red=.8, rmax=.5, maxl2err=0.))}
+              'refined': (refined, dict(completed_niter=2, niter=25))}
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Fit:
 class Volume:
     """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
 
-    Where the fit's method is 'none', from these views alone; so is 'refined', which starts from the cloud's own volume.
+    Where the fit's method is 'none', from these views alone; 'refined' starts from the cloud's own volume.
     """
 
     fit: Fit
@@ -171,9 +171,7 @@ class Cells:
         of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
-            options = dict(algorithm=ALGORITHMS[cell.algorithm][1])
-            if cell.algorithm != 'refined':
-                options |= dict(completed=COMPLETED)
+            options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
@@ -250,13 +248,12 @@ class Cells:
         if cell.fit.method != 'none' and self.get(cell.fit) is None:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
-        views = dataset.train
+        views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
+        total = sum(n for name, n in options.items() if name.endswith('niter')) or len(views)
         if cell.algorithm == 'refined':
             stepper, state = self._cloud(cell.fit)
-            options = options | dict(init=stepper.volume(state))
-        elif cell.fit.method != 'none':
-            views = self._completed(cell.fit)
-        with Progress(label, options.get('niter', len(views))) as bar:
+            views, options = dataset.train, options | dict(completed=views, init=stepper.volume(state))
+        with Progress(label, total) as bar:
             def progress(done, _, residual=None):
                 bar.update(done, residual=residual)
             begun = time.perf_counter()

@@ -5,11 +5,13 @@
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm asd-pocs --views 25 -D niter=20 --out foot.nii.gz
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --complete out/x3d_foot/result.xml --views 100
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm voxelize --complete out/x3d_foot/result.xml
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm refined --complete out/x3d_foot/result.xml --views 100
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --start out/x3d_foot/result.xml -D niter=8
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
-are rendered from it, and the volume is made of both. With --start, it is made of the views that the cloud was fitted to, by an
-iterative algorithm that starts from the cloud's own volume. Where the true volume is known, PSNR and SSIM are printed.
+are rendered from it, and the volume is made of both; refined, which is the best for few clean views, starts from the cloud's own
+volume, meets all views first and the measured ones then. With --start, it is made of the views that the cloud was fitted to, by
+an iterative algorithm that starts from the cloud's own volume. Where the true volume is known, PSNR and SSIM are printed.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 """
@@ -19,11 +21,13 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
+
 from lingo_mi.cli import Parser, check_input, definitions, guard, input_arguments, read_input
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
-ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'voxelize')
+ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'refined', 'voxelize')
 
 
 def arguments():
@@ -85,19 +89,21 @@ def main():
     from lingo_mi.recon.cgls import cgls
     from lingo_mi.recon.corrections import linearised
     from lingo_mi.recon.fdk import fdk
+    from lingo_mi.recon.refined import refined
     from lingo_mi.recon.sart import os_sart, sart, sirt
     from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, without_effects
     from lingo_mi.scanning import defaults, load_scene, voxelize_cloud
 
     check_input(args)
-    if args.algorithm == 'voxelize' and not args.complete:
-        raise InputError('--algorithm voxelize samples a fitted cloud: name its result.xml with --complete')
+    from_cloud = args.algorithm in ('refined', 'voxelize')
+    if from_cloud and not args.complete:
+        raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete')
     if args.complete and not args.views and args.algorithm != 'voxelize':
         raise InputError('--complete needs --views, the number of measured and rendered views together')
-    if args.start and (args.complete or args.views or args.algorithm in ('fdk', 'voxelize')):
+    if args.start and (args.complete or args.views or args.algorithm == 'fdk' or from_cloud):
         raise InputError('--start is for an iterative --algorithm and the views of its fit: leave out --complete and --views')
     run = {'fdk': fdk, 'sart': sart, 'os-sart': os_sart, 'sirt': sirt, 'cgls': cgls, 'asd-pocs': asd_pocs,
-           'voxelize': voxelize_cloud}[args.algorithm]
+           'refined': refined, 'voxelize': voxelize_cloud}[args.algorithm]
     defined, own = definitions(args.define), defaults(args.scene)
     chosen = {k: v for k, v in defined.items() if k not in own}
     effects = chosen.pop('effects', 'model')
@@ -107,7 +113,7 @@ def main():
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
-    if (args.algorithm == 'voxelize' or args.start) and not hasattr(cloud, 'gaussians'):
+    if (from_cloud or args.start) and not hasattr(cloud, 'gaussians'):
         raise InputError(f'{args.complete or args.start}: opacities and radiances make no volume; '
                          + ('leave out --start' if args.start else 'take another --algorithm'))
     dataset = read_input(args, scene, 0 if args.complete else args.views)
@@ -117,7 +123,11 @@ def main():
         volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), []
     else:
         if args.complete:
-            scan = complete(fitted_views(dataset, cloud.geometry), cloud, args.views)
+            measured = fitted_views(dataset, cloud.geometry)
+            scan = complete(measured, cloud, args.views)
+            if args.algorithm == 'refined':
+                given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent))
+                scan = scan.subset(np.arange(len(measured)))
         elif args.start:
             scan = without_effects(fitted_views(dataset, cloud.geometry), cloud)
             given['init'] = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
@@ -139,7 +149,8 @@ def main():
 
 def reconstruct(run, scan, given, Progress):
     """Volume and residual history of an algorithm, with a progress bar."""
-    total = len(scan) if run.__name__ == 'fdk' else given.get('niter', inspect.signature(run).parameters['niter'].default)
+    passes = {name: p.default for name, p in inspect.signature(run).parameters.items() if name.endswith('niter')}
+    total = sum((passes | {name: given[name] for name in passes if name in given}).values()) or len(scan)
     with Progress(run.__name__, total) as bar:
         def progress(done, _, residual=None):
             bar.update(done, residual=residual)

@@ -16,6 +16,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d
+from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing_angles, without_effects
@@ -100,6 +101,20 @@ def test_start(scene, dataset, fitted, tmp_path):
     assert psnr_3d(load(tmp_path / 'v.nii'), dataset.volume) > psnr_3d(own, dataset.volume) + .5
 
 
+def test_refined(scene, dataset, fitted, tmp_path):
+    """From the cloud's volume: passes over all views, then total variation and the measured ones."""
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=4', '--complete', fitted, '--views', 12,
+                          '--out', tmp_path / 'v.nii')
+    assert code == 0 and 'refined of 4 views' in text and '6/6 (100%)' in err, err
+    cloud = load_cloud(fitted)
+    measured = fitted_views(dataset, cloud.geometry)
+    own = voxelize_cloud(cloud.gaussians, measured.geometry, cloud.extent)
+    first = sart(complete(measured, cloud, 12), 2, init=own).volume
+    then = asd_pocs(measured, 4, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, init=first)
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), then.volume)
+    assert psnr_3d(then.volume, dataset.volume) > psnr_3d(own, dataset.volume) + .5
+
+
 # ---- effects ---------------------------------------------------------------------------------------------------------
 
 @physics
@@ -170,7 +185,7 @@ def test_missing_angles(dataset):
     (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
     (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'), (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
-    (['--algorithm', 'voxelize'], '--complete'), (['--start', 'no.xml'], 'iterative'),
+    (['--algorithm', 'voxelize'], '--complete'), (['--algorithm', 'refined'], '--complete'), (['--start', 'no.xml'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),
