@@ -27,7 +27,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          =============  =======  ========  =================  =============
          `draft`        3        6e-3      5e-2               0.7
          `default`      5        2e-6      4e-5               1
-         `reference`    7        8e-8      2e-7               1.5
+         `reference`    7        1e-7      2e-7               1.4
          =============  =======  ========  =================  =============
 
          (Default: `default`)
