@@ -47,7 +47,7 @@ def load(path):
     if not Path(path).is_file():
         raise InputError(f'{path}: there is no such file')
     try:
-        return mi.load_file(str(path))
+        return mi.load_file(str(path), parallel=False)  # as in `scanning.load_scene`
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
         raise InputError(f'{path}: {plain(error)}') from None
 

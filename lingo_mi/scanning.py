@@ -49,7 +49,8 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
         raise InputError(f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
                          f'it has {", ".join(sorted(defaults(path))) or "none"}')
     try:
-        scene = mi.load_file(str(path), **(parameters or {}))
+        # By one thread: with several, Mitsuba has failed to make a plugin (bad_alloc in a gridvolume) once in thousands.
+        scene = mi.load_file(str(path), parallel=False, **(parameters or {}))
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
         raise InputError(f'{path}: {plain(error)}') from None
     if not isinstance(scene, mi.Scene):
