@@ -67,7 +67,7 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
         end = [mi.Int32(dr.clip(dr.floor(at[i] + half[i] - .5) + 1, 0, grid.shape[i])) for i in range(3)]
         size = [dr.maximum(end[i] - begin[i], 0) for i in range(3)]
         lines = dr.select(size[0] > 0, size[1] * size[2], 0)
-        rest = (*middle, lines, begin[1], begin[2], dr.maximum(size[1], 1))
+        rest = (*middle, lines, begin[1], begin[2], size[1])
     values = (*(mi.Float(v) for v in (rho, m1, m2, m3)), s1, s2, s3,
               *(at[i] - (Float64(middle[i]) + .5) for i in range(3)))
     return dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), grid.shape, extent)
@@ -113,7 +113,8 @@ def _line(c, w, v, index, extent2, packets, rows):
     """A line of voxels of a Gaussian: what is constant along it, where t is 0 (a column and a fraction), its span in
     packets and its first packet."""
     _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
-    y, z = v.x + index % v.z, v.y + index // v.z
+    rows_of_slice = dr.maximum(v.z, 1)  # a lane whose team is done reads 0, and an integer division by it kills the process
+    y, z = v.x + index % rows_of_slice, v.y + index // rows_of_slice
     ny, nz = mi.Float(y - w.y), mi.Float(z - w.z)
     dz = nz - fz
     along, low = times(s3, s3_low, nz)
