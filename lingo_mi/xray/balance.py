@@ -44,8 +44,7 @@ class Work:
 
         The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
         """
-        packets = -(-width // PACKET)
-        size = rows * packets
+        size = rows * packets_of(width)
         private = self.on_cpu and self.teams * size <= MOST_COPIED
         copies = self.teams if private else 1
         target = dr.zeros(mi.Float, copies * size * PACKET)
@@ -92,12 +91,18 @@ def repeat(first, last, body, *state):
                          lambda i, *state: (i + 1, *(body(i, *state) or ())))[1:]
 
 
+def packets_of(width: int) -> int:
+    """Packets that a row of so many elements takes."""
+    return -(-width // PACKET)
+
+
 def pad(image, rows: int, width: int):
     """Float [rows * width] with zeros at the end of each row, up to whole packets."""
     if width % PACKET == 0:
         return image
-    i = dr.arange(mi.UInt32, rows * -(-width // PACKET) * PACKET)
-    padded, width = (dr.opaque(mi.UInt32, n) for n in (-(-width // PACKET) * PACKET, width))
+    padded = packets_of(width) * PACKET
+    i = dr.arange(mi.UInt32, rows * padded)
+    padded, width = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
     row, column = i // padded, i % padded
     return dr.gather(mi.Float, image, row * width + column, column < width)
 
@@ -106,8 +111,8 @@ def crop(padded, rows: int, width: int):
     """The image that `pad` padded."""
     if width % PACKET == 0:
         return padded
-    i, columns = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width)
-    return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, -(-width // PACKET) * PACKET) + i % columns)
+    i, columns, pitch = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width), packets_of(width) * PACKET
+    return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, pitch) + i % columns)
 
 
 def pack(Packet, Element, columns):

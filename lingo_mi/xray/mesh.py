@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import InputError
-from .balance import LANES, PACKET, Work, deposit, each_item, pack, repeat
+from .balance import LANES, PACKET, Work, deposit, each_item, pack, packets_of, repeat
 from .frame import vector64
 
 SETUP = 6    # cost of a team's visit to eight rows, in packets
@@ -104,7 +104,7 @@ class MeshPaths:
 
     def _draw(self, vertices, view):
         """The sum over triangles of sign (t - t0) / t0, or of sign (t - t0) for a parallel beam."""
-        packets = -(-view.width // PACKET)
+        packets = packets_of(view.width)
         size = dict(height=dr.opaque(mi.Int32, view.height), width=dr.opaque(mi.Int32, view.width))
         triangles, blocks, cost = _plan(vertices, self._faces, **size)
         drawn = dr.compress(blocks > 0)  # fine meshes have many triangles that fall between the pixel centres

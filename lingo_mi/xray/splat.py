@@ -19,8 +19,8 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pad, pair, position, repeat, span,
-                      times, unpair, whole)
+from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, pair, position,
+                      repeat, span, times, unpair, whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import NAMES, Footprints
 
@@ -56,7 +56,7 @@ class _Plan:
 
     def __init__(self, values, rest, height, width, extent):
         self.count, self.height, self.width = dr.width(values[0]), height, width
-        self.packets = -(-width // PACKET)
+        self.packets = packets_of(width)
         amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
         Float64 = dr.float64_array_t(mi.Float)
         self.types = [type(v) for v in values]

@@ -18,8 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, pad, position, repeat, span, times,
-                      whole)
+from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, position, repeat,
+                      span, times, whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import rotate_inverse
 from .splat import SETUP
@@ -76,7 +76,7 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
 class _Voxelize(dr.CustomOp):
     def eval(self, values, rest, length, shape, extent):
         self.shape, (nx, ny, nz) = shape, shape
-        self.packets = -(-nx // PACKET)
+        self.packets = packets_of(nx)
         self.work = Work((mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP)
         rho, m1, m2, m3, s1, s2, s3, x, y, z = values
         self.slopes = s1, s2, s3
