@@ -48,7 +48,7 @@ SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made 
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (refined, dict(completed_niter=2, niter=25))}
+              'refined': (refined, dict(completed_niter=2, niter=25, exact_every=5))}
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import blocks, os_sart, sart, sirt
 from lingo_mi.recon.two_stage import complete
 from lingo_mi.scan import Scan
+from lingo_mi.xray.grid import project
 from lingo_mi.xray.joseph import Joseph
 
 ALGORITHMS = dict(sart=sart, os_sart=os_sart, sirt=sirt, cgls=cgls, asd_pocs=asd_pocs)
@@ -141,6 +142,19 @@ def test_asd_pocs_is_the_transcription(system):
     np.testing.assert_allclose(result.volume.ravel(), x, atol=2e-3 * np.abs(x).max())
 
 
+def test_asd_pocs_meets_exact_line_integrals():
+    """Corrected for what Joseph's projector is off, the volume's exact line integrals meet the projections; else Joseph's do."""
+    geo, rng = small(n=12), np.random.default_rng(0)
+    truth = rng.random(geo.nVoxel)
+    scan = Scan(geo, project(truth, geo))
+    missed = [np.linalg.norm(project(asd_pocs(scan, 40, alpha=1e-6, exact_every=n).volume, geo) - scan.projections)
+              for n in (0, 2)]
+    assert missed[1] < .2 * missed[0]
+    valid = rng.random(scan.projections.shape) > .01
+    masked = Scan(geo, scan.projections, valid)  # of which the projector is the exact one
+    np.testing.assert_array_equal(asd_pocs(masked, 2, exact_every=1).volume, asd_pocs(masked, 2).volume)
+
+
 def test_asd_pocs_stops(system):
     scan, _, _ = system
     assert len(asd_pocs(scan, 50, 5, 0.01, 0.8, maxl2err=1.).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
@@ -192,6 +206,9 @@ def test_bad_input(name):
     if name in ('os_sart', 'asd_pocs'):
         with pytest.raises(InputError, match='order'):
             run(scan, order='sorted')
+    if name == 'asd_pocs':
+        with pytest.raises(InputError, match='exact_every'):
+            run(scan, exact_every=-1)
     calls = []
     run(scan, niter=2, progress=lambda *a: calls.append(a))
     assert [c[:2] for c in calls] == [(1, 2), (2, 2)] and all(np.isfinite(c[2]) for c in calls)

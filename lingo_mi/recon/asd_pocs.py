@@ -62,7 +62,8 @@ def minimise_tv(volume, size, step: float, tviter: int):
 
 def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1., lmbda_red: float = 0.99, tviter: int = 20,
              alpha: float = 0.002, alpha_red: float = 0.95, rmax: float = 0.95, maxl2err: float | None = None,
-             nonneg: bool = True, order: str = 'random', init=None, seed: int = 0, progress=None) -> Reconstruction:
+             nonneg: bool = True, order: str = 'random', exact_every: int = 0, init=None, seed: int = 0,
+             progress=None) -> Reconstruction:
     """Adaptive steepest descent, projection onto convex sets.
 
     scan         projections and geometry
@@ -78,6 +79,8 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
                  does not know, so that the step shortens wherever total variation changes too much)
     nonneg       whether negative densities are set to zero by the data step
     order        of the blocks, see `os_sart`
+    exact_every  passes between corrections of the projections for what Joseph's projector is off (`System.correct`), before the
+                 first pass and after every so many; 0 for none
     init         start volume [x, y, z], density per mm (default: zero)
     seed         of the random order
     progress     called as progress(passes done, niter, residual)
@@ -87,7 +90,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
 
     Raises InputError for a parameter out of its range and a start volume that does not fit.
     """
-    check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
+    check_counts(niter=niter, blocksize=blocksize, tviter=tviter, **(dict(exact_every=exact_every) if exact_every else {}))
     for name, value, high in (('lmbda', lmbda, 2), ('lmbda_red', lmbda_red, 1), ('alpha', alpha, np.inf),
                               ('alpha_red', alpha_red, 1), ('rmax', rmax, np.inf)):
         check_range(name, value, 0, high)
@@ -100,6 +103,8 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     residuals = [system.residual(x)[1]]
     step = None
     for k in range(niter):
+        if exact_every and k % exact_every == 0:
+            system.correct(x)
         start = x
         x = sweep(system, x, lmbda, blocks(angles, blocksize, order, rng), nonneg)
         residuals.append(system.residual(x)[1])

@@ -8,8 +8,8 @@ from .system import Reconstruction, check_counts
 
 
 def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
-            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., seed: int = 0, *, completed: Scan, init,
-            progress=None) -> Reconstruction:
+            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, seed: int = 0, *,
+            completed: Scan, init, progress=None) -> Reconstruction:
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
@@ -19,7 +19,7 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
     scan              measured projections and geometry
     niter             passes over the measured views
     completed_niter   passes over the completed views before
-    tviter, alpha, alpha_red, rmax, maxl2err
+    tviter, alpha, alpha_red, rmax, maxl2err, exact_every
                       of `asd_pocs`. The defaults are for clean projections; with noise, maxl2err says how well to meet them
     seed              of the random orders
     completed         measured views and those between (`two_stage.filled`)
@@ -35,4 +35,4 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
         return progress and (lambda done, _, residual: progress(before + done, passes, residual))
     first = sart(completed, completed_niter, init=init, seed=seed, progress=of_stage(0))
     return asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
-                    init=first.volume, seed=seed, progress=of_stage(completed_niter))
+                    exact_every=exact_every, init=first.volume, seed=seed, progress=of_stage(completed_niter))
