@@ -14,7 +14,10 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
     wrong is put right by the measured ones. Total variation is smoothed away in long steps, which shorten until they change
-    the volume by `rmax` of what the data do.
+    the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
+
+    Of projections that hold more than the voxels can, for instance of an object with finer structure, this makes streaks in the
+    end: `niter=5`, or `asd_pocs` of the completed views (docs/results.md).
 
     scan              measured projections and geometry
     niter             passes over the measured views
