@@ -41,7 +41,6 @@ class System:
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.
-        self.exact = self.A if isinstance(self.A, ExactPair) else ExactPair(scan.geometry)
 
     def start(self, init):
         """The start volume on the device: zero, or `init` [x, y, z], density per mm.
@@ -69,10 +68,11 @@ class System:
         """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
 
         Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .4 % (docs/results.md), which an
-        algorithm that meets the projections to less would otherwise turn into streaks. Costs two projections.
+        algorithm that meets the projections to less would otherwise turn into streaks. Costs two projections; nothing where
+        the projector is the exact one.
         """
-        if self.exact is not self.A:
-            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, self.exact))
+        if isinstance(self.A, Joseph):
+            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, ExactPair(self.geometry)))
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x) -> np.ndarray:
