@@ -16,8 +16,8 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
     wrong is put right by the measured ones. Total variation is smoothed away in long steps, which shorten until they change
     the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
 
-    Of projections that hold more than the voxels can, for instance of an object with finer structure, this makes streaks in the
-    end: `niter=5`, or `asd_pocs` of the completed views (docs/results.md).
+    Of an object whose structure is finer than the voxels this makes streaks in the end: choose voxels as fine as the panel
+    resolves, fewer passes, or `asd_pocs` of the completed views (docs/results.md, "The paper's two stages").
 
     scan              measured projections and geometry
     niter             passes over the measured views
