@@ -176,7 +176,7 @@ def test_loss_scale():
 def test_other_content_compiles_nothing():
     def step(seed):
         rng = np.random.default_rng(seed)
-        image, truth, cube = (mi.Float(rng.random(n).astype(np.float32)) for n in (600, 600, 60))
+        image, truth, cube = (mi.Float(rng.random(n).tolist()) for n in (600, 600, 60))
         dr.enable_grad(image, cube)
         loss = loss_scale(image) * (combined(image, truth, 20, 30, .25) + .05 * tv(cube, (3, 4, 5)))
         dr.backward(loss)
