@@ -1,4 +1,4 @@
-"""Teams of lanes that are narrower than the processor's vectors, as teams of 8 are with AVX-512."""
+"""Teams of lanes that are narrower than the processor's vectors, as teams of 8 are with AVX-512, or wider."""
 import subprocess
 import sys
 from pathlib import Path

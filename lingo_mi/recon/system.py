@@ -29,7 +29,8 @@ class Reconstruction:
 
 
 class System:
-    """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm.
+    """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm: `measured`, or as
+    `correct` has shifted them.
 
     The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
     are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
@@ -67,7 +68,7 @@ class System:
     def correct(self, x):
         """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
 
-        Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .4 % (docs/results.md), which an
+        Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .45 % (docs/results.md), which an
         algorithm that meets the projections to less would otherwise turn into streaks. Costs two projections; nothing where
         the projector is the exact one.
         """
