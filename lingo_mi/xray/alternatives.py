@@ -9,7 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .footprint import SQRT_2PI, rotate_inverse
+from .footprint import SQRT_2PI
+from .rotation import rotate_inverse, rows_of
 
 
 def rays(view, distance: float):
@@ -50,9 +51,8 @@ def per_ray(centre, scale, rotation, density, view, precision: str = 'float32'):
     start, direction = (point, source) if view.parallel else (source, point - source)
     p, s, rho = Vector(centre), Vector(scale), Float(density)
     q = rotation if precision != 'float64' else dr.float64_array_t(type(rotation))(rotation)
-    q = q * dr.rsqrt(dr.squared_norm(q))
-    # Rows of diag(1/s) R^T: turning every ray by every quaternion would cost more than all the rest.
-    axes = [rotate_inverse(q, Vector(*(float(k == j) for j in range(3)))) / s for k in range(3)]
+    # Columns of diag(1/s) R^T: turning every ray by every quaternion would cost more than all the rest.
+    axes = [row / s for row in rows_of(q, Vector)]
     columns = [*p, *(a for axis in axes for a in axis), rho * SQRT_2PI]
     dr.eval(columns)
     total = _sum_gaussians(columns, start, direction, dr.opaque(mi.UInt32, dr.width(rho)), Float, Vector,
@@ -178,10 +178,9 @@ def _walk(scene, o, d, data, density, epsilon, upstream, backward):
 def _closed_form(o, d, data, density, index, active):
     """The line integral through Gaussian `index`; 0 where not active. d is of length 1."""
     c = [dr.gather(mi.Float, data, index * 10 + j, active) for j in range(10)]
-    q = mi.Vector4f(*c[6:])
-    q = dr.select(active, q * dr.rsqrt(dr.squared_norm(q)), mi.Vector4f(0, 0, 0, 1))
+    rows = rows_of(dr.select(active, mi.Vector4f(*c[6:]), mi.Vector4f(0, 0, 0, 1)), mi.Vector3f)
     s = dr.select(active, mi.Vector3f(*c[3:6]), 1)
-    w, v = rotate_inverse(q, mi.Vector3f(*c[:3]) - mi.Vector3f(o)) / s, rotate_inverse(q, d) / s
+    w, v = rotate_inverse(rows, mi.Vector3f(*c[:3]) - mi.Vector3f(o)) / s, rotate_inverse(rows, d) / s
     inverse = 1 / dr.squared_norm(v)
     nearest = w - dr.dot(w, v) * inverse * v
     rho = dr.gather(mi.Float, density, index, active)

@@ -32,6 +32,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .rotation import rotate_inverse, rows_of
+
 SQRT_2PI = 2.5066282746310002
 
 # Names of the differentiable numbers, in the order in which the kernels keep them.
@@ -68,13 +70,6 @@ class Footprints:
         return self.row_end > self.row_begin
 
 
-def rotate_inverse(q, v):
-    """R^T v for the unit quaternion q = (x, y, z, w), a 4-vector (`mi.Quaternion4f` would multiply as one)."""
-    u = type(v)(-q.x, -q.y, -q.z)
-    c = 2 * dr.cross(u, v)
-    return v + q.w * c + dr.cross(u, c)
-
-
 def project(centre, scale, rotation, density, view, extent: float, widen: float = 0.) -> Footprints:
     """Footprints of N Gaussians in a view.
 
@@ -87,77 +82,82 @@ def project(centre, scale, rotation, density, view, extent: float, widen: float 
     Vector3d = mi.Vector3d
     Float64 = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    q = dr.float64_array_t(type(rotation))(rotation)
-    q = q * dr.rsqrt(dr.squared_norm(q))
+    rows = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    inverse = 1 / s
     a, b = view.u, view.v
     n = dr.cross(a, b)
 
     if view.parallel:
         to_plane = p - view.corner
-        hit = to_plane - view.source * (dr.dot(n, to_plane) / dr.dot(n, view.source))
-        w = rotate_inverse(q, view.source) / s
+        depth = dr.dot(n, view.source)
+        hit = to_plane - view.source * (dr.dot(n, to_plane) / depth)
+        w = inverse * rotate_inverse(rows, view.source)
         visible = dr.isfinite(dr.detach(dr.squared_norm(w) + dr.squared_norm(hit) + rho))
         straddles = ~visible
         norm = dr.rsqrt(dr.squared_norm(w))
         what = w * norm
-        amplitude = rho * SQRT_2PI * norm
-        wa, wb = rotate_inverse(q, a) / s, rotate_inverse(q, b) / s
-        na, nb = dr.cross(what, wa), dr.cross(what, wb)
+        na, nb = (dr.cross(what, inverse * rotate_inverse(rows, step)) for step in (a, b))
         e1 = e2 = e11 = e12 = e22 = dr.zeros(Float64, dr.width(p))
-        with dr.suspend_grad():
-            area = dr.norm(dr.cross(na, nb))
-            high_x, high_y = extent * dr.norm(nb) / area, extent * dr.norm(na) / area
-            low_x, low_y = -high_x, -high_y
+        factor = norm
     else:
         r = p - view.source
         axis = view.corner - view.source
-        plane, depth = dr.dot(n, axis), dr.dot(n, r)
+        plane = dr.dot(n, axis)
         with dr.suspend_grad():
             # Half the depth that the kappa-ellipsoid spans: its support function along the panel's normal.
-            half = extent * dr.norm(s * rotate_inverse(q, n))
-            near, far = depth * dr.sign(plane) - half, depth * dr.sign(plane) + half
+            support = s * rotate_inverse(rows, n)
+            depth, half = dr.dot(n, r) * dr.sign(plane), extent * dr.norm(support)
+            near, far = depth - half, depth + half
             hidden = far <= 0
             straddles = near < 0.01 * far
             if view.panel:
                 hidden |= near >= dr.abs(plane)
                 straddles |= far > dr.abs(plane)
-            sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(1 / s) + rho)
+            sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(inverse) + rho)
             straddles = straddles & ~hidden | ~sound
             visible = ~hidden & ~straddles
-        k = plane / dr.select(visible, depth, plane)
+        r = dr.select(visible, r, n)  # along the panel's normal nothing below vanishes
+        depth = dr.dot(n, r)
+        k = plane / depth
         hit = k * r - axis
-        w = dr.select(visible, rotate_inverse(q, r) / s, Vector3d(1, 0, 0))
+        w = inverse * rotate_inverse(rows, r)
         length = dr.norm(w)
-        what = w / length
         norm = 1 / (k * length)
-        amplitude = rho * SQRT_2PI * norm
-        wa, wb = rotate_inverse(q, a) * (norm / s), rotate_inverse(q, b) * (norm / s)
+        wa, wb = (inverse * norm * rotate_inverse(rows, step) for step in (a, b))
         na, nb = dr.cross(w, wa), dr.cross(w, wb)
+        what = w / length
         e1, e2 = 2 * dr.dot(what, wa), 2 * dr.dot(what, wb)
         e11, e12, e22 = dr.squared_norm(wa), dr.dot(wa, wb), dr.squared_norm(wb)
-        with dr.suspend_grad():
-            # Detector rows and columns are planes through the source; whitened, the outermost touch the kappa-sphere.
-            c = dr.cross(wb, wa)
-            kk = extent * extent
-            quad = dr.square(dr.dot(w, c)) - kk * dr.squared_norm(c)
-            low_y, high_y = _roots(quad, kk * dr.dot(na, c) / length, kk * dr.squared_norm(na) / dr.square(length))
-            low_x, high_x = _roots(quad, -kk * dr.dot(nb, c) / length, kk * dr.squared_norm(nb) / dr.square(length))
+        factor = length * dr.square(norm)
 
-    nn = dr.squared_norm(n)
-    x, y = dr.dot(dr.cross(hit, b), n) / nn, dr.dot(dr.cross(a, hit), n) / nn
-    mx = dr.norm(na)
-    shear = dr.dot(na, nb) / dr.square(mx)
-    my = dr.norm(dr.cross(na, nb)) / mx
+    amplitude = rho * SQRT_2PI * norm
+    # |na x nb|, from the determinant of the whitening: a needle's na and nb are all but parallel.
+    det = factor * dr.abs(depth) * inverse.x * inverse.y * inverse.z
+    aa, ab, bb = dr.squared_norm(na), dr.dot(na, nb), dr.squared_norm(nb)
+    with dr.suspend_grad():
+        if view.parallel:
+            high_x, high_y = extent * dr.sqrt(bb) / det, extent * dr.sqrt(aa) / det
+            low_x, low_y = -high_x, -high_y
+        else:
+            # Detector rows and columns are planes through the source; whitened, the outermost touch the kappa-sphere.
+            reach = extent * dr.abs(depth) / det
+            quad, offset = near * far, extent * reach
+            low_y, high_y = _roots(quad, -offset * dr.dot(na, support), dr.square(reach) * aa)
+            low_x, high_x = _roots(quad, offset * dr.dot(nb, support), dr.square(reach) * bb)
     if widen:
         # The inverse of num's matrix is the footprint's covariance, which grows by `widen` on its diagonal.
-        det, xx, yy = dr.squared_norm(dr.cross(na, nb)), dr.squared_norm(na), dr.squared_norm(nb)
-        shrink = dr.rsqrt(1 + widen * (xx + yy + widen * det))
-        wide_x = xx + widen * det
-        amplitude = amplitude * shrink
-        mx, shear, my = dr.sqrt(wide_x) * shrink, dr.dot(na, nb) / wide_x, dr.sqrt(det / wide_x)
+        wide = aa + widen * dr.square(det)
+        shrink = dr.rsqrt(1 + widen * (bb + wide))
         with dr.suspend_grad():
-            grow_x, grow_y = dr.sqrt(1 + widen * det / yy), dr.sqrt(wide_x / xx)
+            grow_x, grow_y = dr.sqrt(1 + widen * dr.square(det) / bb), dr.sqrt(wide / aa)
             low_x, high_x, low_y, high_y = low_x * grow_x, high_x * grow_x, low_y * grow_y, high_y * grow_y
+        amplitude, aa = amplitude * shrink, wide
+    root = dr.sqrt(aa)
+    mx, my, shear = root, det / root, ab / aa
+    if widen:
+        mx = mx * shrink
+    nn = dr.squared_norm(n)
+    x, y = dr.dot(hit, dr.cross(b, n) / nn), dr.dot(hit, dr.cross(n, a) / nn)
     # The denominator in the sheared coordinate, dx = t - shear dy.
     e22 = e22 + shear * (shear * e11 - 2 * e12)
     e12 = e12 - shear * e11

@@ -11,9 +11,12 @@ import numpy as np
 from ..errors import AccuracyWarning, InputError
 from . import cloud, grid
 
-# Shapes hold no Python attributes of ours, so what was learnt of a shape (a mesh's edges) is kept here, the latest ones.
+# Shapes hold no Python attributes of ours, so what was learnt of a shape is kept here, the latest ones: a mesh's edges, and
+# that a cloud is usable. While an array is kept alive no other one has its index, so what has changed is not taken for it.
 _MESHES: dict = {}
 MOST_MESHES = 64
+_USABLE: dict = {}
+MOST_USABLE = 2
 
 # Of Gaussians, in the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
 MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
@@ -65,6 +68,15 @@ class Ellipsoids:
         self.centre = mi.Point3f(*(column(j) for j in range(3)))
         self.scale = mi.Vector3f(*(column(j) for j in range(3, 6)))
         self.rotation = mi.Vector4f(*(column(j) for j in range(6, 10)))
+        key = data.index, self.density.index
+        if key not in _USABLE and self._usable():
+            while len(_USABLE) >= MOST_USABLE:
+                _USABLE.pop(next(iter(_USABLE)))
+            _USABLE[key] = dr.detach(data), dr.detach(self.density)
+
+    def _usable(self) -> bool:
+        """Whether all Gaussians can be integrated accurately; AccuracyWarning where they can, but not accurately, InputError
+        where they cannot. Waits for the device."""
         with dr.suspend_grad():
             shortest, longest = dr.min(self.scale), dr.max(self.scale)
             turn = dr.squared_norm(self.rotation)
@@ -73,18 +85,19 @@ class Ellipsoids:
                      & (shortest >= 1 / MOST_LENGTH) & (dr.abs(self.density) <= MOST_DENSITY)
                      & (turn > 1e-30) & (longest <= MOST_ASPECT * shortest))
             thin = longest > SAFE_ASPECT * shortest
-            worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if count else 0
+            worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if dr.width(sound) else 0
             if worst == 2:
                 first = int(dr.compress(~sound)[0])
                 raise InputError(
-                    f'Gaussian {first} of the ellipsoids {shape.id()!r} is not usable: centre, density and rotation must '
+                    f'Gaussian {first} of the ellipsoids {self.name!r} is not usable: centre, density and rotation must '
                     f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
                     f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}')
             if worst == 1:
                 first = int(dr.compress(thin)[0])
                 warnings.warn(AccuracyWarning(
-                    f'the scales of Gaussian {first} of the ellipsoids {shape.id()!r} are more than {SAFE_ASPECT:.0e} '
+                    f'the scales of Gaussian {first} of the ellipsoids {self.name!r} are more than {SAFE_ASPECT:.0e} '
                     'apart: its image may be off by 1e-4 and its derivatives by 1e-3'), stacklevel=2)
+        return worst == 0
 
     @classmethod
     def of(cls, centre, scale, rotation, density, second, name: str) -> Ellipsoids:

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from .footprint import rotate_inverse
+from .rotation import rows_of
 from .frame import vector64
 from .objects import Ellipsoids, GridInCube, HomogeneousMesh
 from .voxelize import Grid, voxelize
@@ -63,9 +63,7 @@ def _box(thing):
     if isinstance(thing, HomogeneousMesh):
         points = thing.triangles().reshape(-1, 3)
         return points.min(0), points.max(0)
-    q = thing.rotation * dr.rsqrt(dr.squared_norm(thing.rotation))
-    reach = mi.Vector3f(*(BOUND * dr.norm(thing.scale * rotate_inverse(q, mi.Vector3f(*(float(i == j) for j in range(3)))))
-                          for i in range(3)))
+    reach = mi.Vector3f(*(BOUND * dr.norm(thing.scale * row) for row in rows_of(thing.rotation, mi.Vector3f)))
     low, high = thing.centre - reach, thing.centre + reach
     return (np.array([float(dr.min(low[i])[0]) for i in range(3)]),
             np.array([float(dr.max(high[i])[0]) for i in range(3)]))

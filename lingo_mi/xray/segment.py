@@ -14,7 +14,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .footprint import rotate_inverse
+from .rotation import rotate_inverse, rows_of
 
 
 def add_straddling(image, centre, scale, rotation, density, view, straddles):
@@ -35,13 +35,12 @@ def _integrate(centre, scale, rotation, density, view):
     Vector3d = mi.Vector3d
     Float64 = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    q = dr.float64_array_t(type(rotation))(rotation)
-    q = q * dr.rsqrt(dr.squared_norm(q))
+    rows = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)
     x, y = Float64(i % width) + .5, Float64(i // width) + .5
     D = view.corner - view.source + x * view.u + y * view.v
-    w, d = rotate_inverse(q, p - view.source) / s, rotate_inverse(q, D) / s
+    w, d = rotate_inverse(rows, p - view.source) / s, rotate_inverse(rows, D) / s
     dd = dr.squared_norm(d)
     length = dr.sqrt(dd)
     middle = dr.dot(w, d) / dd

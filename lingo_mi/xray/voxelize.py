@@ -21,7 +21,7 @@ import numpy as np
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, position, repeat,
                       span, times, whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
-from .footprint import rotate_inverse
+from .rotation import rows_of
 from .splat import SETUP
 
 NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s2, s3, x, y, z, the last six in float64
@@ -49,9 +49,7 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
     Vector3d = mi.Vector3d
     Float64 = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    q = dr.float64_array_t(type(rotation))(rotation)
-    q = q * dr.rsqrt(dr.squared_norm(q))
-    axes = [rotate_inverse(q, Vector3d(*(float(i == j) for j in range(3)))) for i in range(3)]
+    axes = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
     cx, cy, cz = (axis * (grid.step[i] / s) for i, axis in enumerate(axes))
     m1 = dr.norm(cx)
     s1, s2 = dr.dot(cx, cy) / dr.square(m1), dr.dot(cx, cz) / dr.square(m1)
