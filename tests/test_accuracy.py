@@ -23,7 +23,7 @@ from lingo_mi.xray.quality import PRESETS
 
 ROOT = Path(__file__).parents[1]
 TINY = Sizes(gaussians=40, few=20, pixels=32, box=60., grids=(16,), rounds=1, seconds=.1, pairs=(1e3, 1e4),
-             counts=(10, 100), panels=(16, 32), phantoms=(16,), points=(50, 100), iterations=(3, 6), views=4)
+             counts=(10, 100), panels=(16, 32), crowd=30, phantoms=(16,), points=(50, 100), iterations=(3, 6), views=4)
 
 
 @pytest.fixture(scope='module')

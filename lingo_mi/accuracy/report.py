@@ -121,7 +121,9 @@ _SCALING = [
     ('sweep', _number('sweep', '{}')), ('Gaussians', _number('gaussians', '{:,}')), ('panel', _number('side', '{0}²')),
     ('pairs', _number('pairs', '{:.1e}')), ('forward, ms', _time('forward')),
     ('ns a pair', _number('forward_ns_per_pair', '{:.2f}')),
+    ('of kernels', _number('forward_kernels_ns_per_pair', '{:.2f}')),
     ('with gradients, ms', _time(BACKWARD)), ('ns a pair', _number(f'{BACKWARD}_ns_per_pair', '{:.2f}')),
+    ('of kernels', _number(f'{BACKWARD}_kernels_ns_per_pair', '{:.2f}')),
     ('memory, MB', _number('memory_mb', '{:.1f}')), ('with gradients, MB', _number('memory_gradients_mb', '{:.1f}'))]
 _QUALITY = [('views, dB', _number('psnr_2d', '{:.2f}')), ('volume, dB', _number('psnr_3d', '{:.2f}'))]
 _INITIAL = [('initial cloud', _number('name', '{}')), ('Gaussians', _number('points', '{:,}')),
@@ -138,7 +140,7 @@ _FITS = [('recipe', _number('name', '{}')), ('phantom', _number('side', '{0}³')
 
 def draw(found: dict, folder: Path):
     """The plots: pareto.png, scaling.png, fits.png."""
-    for name, plot, size in (('pareto', _pareto, (11, 5)), ('scaling', _scaling, (11, 6)), ('fits', _fits, (11, 4.5))):
+    for name, plot, size in (('pareto', _pareto, (11, 5)), ('scaling', _scaling, (13, 6)), ('fits', _fits, (11, 4.5))):
         _save(folder / f'{name}.png', plot, found, size)
 
 
@@ -194,22 +196,25 @@ def _worst(row) -> float:
 
 
 def _scaling(fig, found):
-    """Time a pair and memory, in the three sweeps."""
-    axes = fig.subplots(2, 3, sharey='row')
-    labels = dict(pairs='pairs of a pixel and a Gaussian', gaussians='Gaussians, same pairs',
-                  pixels='pixels along a side')
-    for column, (sweep, rows) in zip(axes.T, found['scaling'].items()):
-        x = [r['pairs' if sweep == 'pairs' else 'x'] for r in rows]
-        for key, memory, colour, label in (('forward', 'memory_mb', BLUE, 'forward'),
-                                           (BACKWARD, 'memory_gradients_mb', RED, 'with gradients')):
-            column[0].loglog(x, [r[f'{key}_ns_per_pair'] for r in rows], 'o-', color=colour, label=label)
-            column[1].loglog(x, [r[memory] for r in rows], 'o-', color=colour, label=label)
+    """Time a pair, of calls and of their kernels alone, and memory, in four sweeps."""
+    sweeps = dict(pairs=('pairs', 'pairs of a pixel and a Gaussian'), small=('pairs', 'the same, small Gaussians'),
+                  gaussians=('gaussians', 'Gaussians, same pairs'), pixels=('side', 'pixels along a side'))
+    axes = fig.subplots(2, len(sweeps), sharey='row')
+    for column, (sweep, (along, label)) in zip(axes.T, sweeps.items()):
+        rows = found['scaling'][sweep]
+        x = [r[along] for r in rows]
+        for key, memory, colour, name in (('forward', 'memory_mb', BLUE, 'forward'),
+                                          (BACKWARD, 'memory_gradients_mb', RED, 'with gradients')):
+            column[0].loglog(x, [r[f'{key}_ns_per_pair'] for r in rows], 'o-', color=colour, label=name)
+            column[0].loglog(x, [r[f'{key}_kernels_ns_per_pair'] for r in rows], '--', color=colour,
+                             label=f'{name}, kernels alone')
+            column[1].loglog(x, [r[memory] for r in rows], 'o-', color=colour)
         for axis in column:
             axis.grid(alpha=.3)
-            axis.set_xlabel(labels[sweep])
+            axis.set_xlabel(label)
     axes[0, 0].set_ylabel('time a pair [ns]')
     axes[1, 0].set_ylabel('peak memory [MB]')
-    axes[0, 0].legend()
+    axes[0, 0].legend(fontsize=8)
 
 
 def _fits(fig, found):

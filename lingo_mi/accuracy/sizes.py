@@ -12,7 +12,8 @@ class Sizes:
     few                      Gaussians of the same kind where slow methods take part
     grids                    voxels along a side of the grids
     rounds, seconds          repeats of a method, fewer once it has taken so long altogether
-    pairs, counts, panels    the three sweeps: pairs of a pixel and a Gaussian, Gaussians, pixels along a side
+    pairs, counts, panels    the sweeps: pairs of a pixel and a Gaussian, Gaussians, pixels along a side
+    crowd                    Gaussians among which one as large as the scene is put
     phantoms                 voxels and pixels along a side of the fits' phantom
     points                   Gaussians a fit starts with
     iterations               of a fit
@@ -29,6 +30,7 @@ class Sizes:
     pairs: tuple = (1e4, 1e5, 1e6, 1e7, 1e8)
     counts: tuple = (100, 1_000, 10_000, 100_000, 1_000_000)
     panels: tuple = (64, 128, 256, 512, 1024, 2048)
+    crowd: int = 50_000
     phantoms: tuple = (64, 128)
     points: tuple = (1_000, 4_000, 16_000)
     iterations: tuple = (150, 400, 1_000)
@@ -37,5 +39,5 @@ class Sizes:
 
 FULL = Sizes()
 QUICK = Sizes(gaussians=4_000, few=1_000, pixels=256, grids=(64, 128), rounds=5, seconds=.7, pairs=(1e4, 1e5, 1e6, 1e7),
-              counts=(100, 1_000, 10_000, 100_000), panels=(64, 256, 1024), phantoms=(64,), points=(1_000, 4_000),
+              counts=(100, 1_000, 10_000, 100_000), panels=(64, 256, 1024), crowd=10_000, phantoms=(64,), points=(1_000, 4_000),
               iterations=(50, 150), views=16)

@@ -19,9 +19,10 @@ class Workload:
     """A random cloud before a scanner: as arrays, as a scene, and as float64 truth.
 
     order   of the Gauss-Legendre rule for pixel means; 0 for the rays through pixel centres
+    giant   whether the first Gaussian is as large as the whole ball
     """
 
-    def __init__(self, gaussians: int, pixels: int, box: float, order: int = 0, mode: str = 'cone'):
+    def __init__(self, gaussians: int, pixels: int, box: float, order: int = 0, mode: str = 'cone', giant: bool = False):
         rng = np.random.default_rng(0)
         n = gaussians
         sigma = np.sqrt(box) / 6 / SPREAD * (PANEL / pixels) * DSO / DSD
@@ -30,6 +31,8 @@ class Workload:
         rotation = rng.normal(size=(n, 4))
         rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
         columns = centre, sigma * np.exp(rng.normal(0, .35, (n, 3))), rotation, rng.uniform(.1, 1, n)
+        if giant:
+            columns[0][0], columns[1][0] = 0, BALL / 3
         self.columns = [x.astype(np.float32) for x in columns]
         self.pixels, self.order = pixels, order
         self.weights = rng.normal(size=(pixels, pixels)).astype(np.float32)
