@@ -87,7 +87,7 @@ def use_variant(name: str | None = None) -> str:
             import drjit as dr
             dr.eval(mi.Float(0) + dr.opaque(mi.Float, 1))  # an unusable backend fails at the first kernel
             return variant
-        except Exception as error:  # Dr.Jit raises plain RuntimeErrors for a missing driver or library
+        except (ImportError, RuntimeError) as error:  # what Mitsuba raises for a missing driver or library
             reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
 

@@ -91,8 +91,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     Raises InputError for a parameter out of its range and a start volume that does not fit.
     """
     check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
-    if exact_every:
-        check_counts(exact_every=exact_every)
+    check_counts(least=0, exact_every=exact_every)
     for name, value, high in (('lmbda', lmbda, 2), ('lmbda_red', lmbda_red, 1), ('alpha', alpha, np.inf),
                               ('alpha_red', alpha_red, 1), ('rmax', rmax, np.inf)):
         check_range(name, value, 0, high)

@@ -100,11 +100,11 @@ def norm(a) -> float:
     return dot(a, a) ** 0.5
 
 
-def check_counts(**counts):
-    """Raises InputError for a count that is not a positive integer."""
+def check_counts(least: int = 1, **counts):
+    """Raises InputError for a count that is not an integer, or below `least`."""
     for name, value in counts.items():
-        if value != int(value) or value < 1:
-            raise InputError(f'{name} must be a positive integer, not {value}')
+        if value != int(value) or value < least:
+            raise InputError(f'{name} must be an integer from {least} on, not {value}')
 
 
 def check_range(name: str, value: float, low: float, high: float):
