@@ -12,14 +12,14 @@ import sys
 import time
 from pathlib import Path
 
-from lingo_mi.cli import guard
+from lingo_mi.cli import Parser, guard
 from lingo_mi.runtime import use_variant
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 
 
 def arguments():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
     p.add_argument('--docs', action='store_true', help='renew docs/ after a quick run, too')

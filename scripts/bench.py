@@ -10,7 +10,7 @@ that both see the same machine; the best of five counts for both, and the median
 in the bounding box of a Gaussian's footprint. The limit needs g++.
 
 Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
-against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out.
+against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out. What was not measured is null in the JSON.
 """
 import argparse
 import json
@@ -22,16 +22,19 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.cli import guard
+from lingo_mi.cli import Parser, guard
+from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
 EPSILON = .0128     # mm, 1e-4 of half the volume's side: where the tree errs least
 TRIES = 5           # in a turn, of which the best counts, as in limit.cpp
 PIXELS = 400        # of which errors are measured
+MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
+TREE = 'bvh_forward_ms', 'bvh_backward_ms', 'bvh_image_error', 'bvh_gradient_error'
 
 
 def arguments():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--gaussians', type=int, default=50_000)
     p.add_argument('--size', type=int, default=512, help='pixels along a side of the square panel')
     p.add_argument('--pixels', type=float, default=234, help="mean pixels in a Gaussian's box")
@@ -39,8 +42,13 @@ def arguments():
     p.add_argument('--repeats', type=int, default=15, help='turns')
     p.add_argument('--no-bvh', dest='bvh', action='store_false', help="leave out Mitsuba's tree")
     p.add_argument('--json', type=Path, help='write the numbers there')
-    p.add_argument('--variant')
-    return p.parse_args()
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    args = p.parse_args()
+    for name, low, high in (('gaussians', 1, 10_000_000), ('size', 8, 8192), ('pixels', 1, MOST_PIXELS), ('extent', 1, 20),
+                            ('repeats', 1, 10_000)):
+        if not low <= getattr(args, name) <= high:
+            raise InputError(f'--{name} must be from {low} to {high}, not {getattr(args, name):g}')
+    return args
 
 
 def build_limit(folder):
@@ -72,7 +80,7 @@ def cloud(args):
     return data.astype(np.float32), rng.uniform(.1, 1, (n, 1)).astype(np.float32)
 
 
-def against_tree(scene, sensor, data, density, args) -> dict:
+def against_tree(scene, sensor, data, density, args, ours_ms) -> dict:
     """Time one image and its derivatives by marching through Mitsuba's tree; errors of both ways on a few pixels."""
     import drjit as dr
     import mitsuba as mi
@@ -118,6 +126,8 @@ def against_tree(scene, sensor, data, density, args) -> dict:
     out |= dict(zip(('bvh_image_error', 'bvh_gradient_error'), worst))
     print(f'tree      {out["bvh_forward_ms"]:7.0f} ms forward, {out["bvh_backward_ms"]:.0f} ms backward '
           f'(epsilon {EPSILON:g} mm)')
+    print(f'          {out["bvh_forward_ms"] / ours_ms["forward"]:.0f} and {out["bvh_backward_ms"] / ours_ms["backward"]:.0f} '
+          'times ours')
     print(f'errors    image {out["image_error"]:.1e}, worst derivative {out["gradient_error"]:.1e}; '
           f'tree {out["bvh_image_error"]:.1e}, {out["bvh_gradient_error"]:.1e}; on {len(chosen)} pixels')
     return out
@@ -183,6 +193,7 @@ def main():
     print(f'{variant}, {args.gaussians} Gaussians, {args.size} x {args.size} pixels, cut-off {args.extent:g} sigma, '
           f'{pairs / 1e6:.1f} M pairs; medians of {args.repeats} turns')
     for k, name in enumerate(times):
+        result[f'limit_{name}_ns_per_pair'] = None
         line = f'{name:9} {result[name + "_ms"]:7.1f} ms  {result[name + "_ns_per_pair"]:5.2f} ns a pair'
         if limits:
             limit = float(np.median([x[k] for x in limits]))
@@ -192,8 +203,9 @@ def main():
     if limits:
         total = sum(result[f'{n}_ns_per_pair'] for n in times) / sum(result[f'limit_{n}_ns_per_pair'] for n in times)
         print(f'together ratio {total:.2f}')
+    result |= dict.fromkeys(TREE)
     if args.bvh:
-        result |= against_tree(scene, sensors[0], data, density, args)
+        result |= against_tree(scene, sensors[0], data, density, args, {k: result[f'{k}_ms'] for k in times})
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + '\n')
 

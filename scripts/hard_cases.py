@@ -29,7 +29,7 @@ def main():
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'tests'))
     from hard_cases import cases, check, markdown, measure
     results, missed = [], 0
-    for case in cases():
+    for case in cases(steps=10_000):
         try:
             results.append((case, check(case)))
         except AssertionError:

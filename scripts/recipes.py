@@ -17,7 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lingo_mi.cli import guard
+from lingo_mi.cli import Parser, guard
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS, VOLUMETRIC
 
@@ -38,7 +38,7 @@ def method(text):
 
 
 def arguments():
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path)
     p.add_argument('--methods', nargs='+', type=method, default=list(VOLUMETRIC), metavar='METHOD[:name=value,...]',
                    help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})')

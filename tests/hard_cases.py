@@ -23,6 +23,7 @@ from oracle import Cloud, Pose, random_cloud
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
+from lingo_mi.closed_form import rays_and_gradients
 from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.fit.loop import run as fit
 from lingo_mi.fit.settings import FAST
@@ -51,6 +52,8 @@ class Case:
     panel             whether integrals end at the panel
     copies            how often the cloud is there, at the same place
     warned            whether an AccuracyWarning must come with it
+    analytic          whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64
+                      are too coarse; only for Gaussians far from the ends of the rays
     note              what limits the accuracy, where it is less than usual
     """
 
@@ -63,6 +66,7 @@ class Case:
     panel: bool = True
     copies: int = 1
     warned: bool = False
+    analytic: bool = False
     note: str = ''
 
 
@@ -178,17 +182,22 @@ def _measure_view(case):
     ends = (-np.inf, np.inf) if pose.parallel else (0., 1. if case.panel else np.inf)
     many = case.cloud[np.tile(np.arange(len(case.cloud)), case.copies)] if case.copies > 1 else case.cloud
     image, gradients = run(many, case.frames, case.shape, weights, case.panel)
-    expected = case.copies * image_of(case.cloud, pose, *ends)
-    # A Gaussian's derivatives do not depend on the others: of a large cloud a few are enough.
-    few = np.arange(min(len(case.cloud), MOST_COMPARED))
+    expected, few = image_of(case.cloud, pose, *ends)
     gradients = {name: g[few] for name, g in gradients.items()}
-    return errors(case.cloud[few], image, gradients, expected, oracle.gradients(case.cloud[few], pose, weights, *ends))
+    cloud = case.cloud[few]
+    if case.analytic:
+        _, truth = rays_and_gradients([getattr(cloud, name) for name in PARAMETERS], *pose.rays(), weights)
+    else:
+        truth = oracle.gradients(cloud, pose, weights, *ends)
+    return errors(cloud, image, gradients, case.copies * expected, truth)
 
 
 def image_of(cloud, pose, *ends):
-    """`oracle.line_integrals`, for large clouds a ray at a time."""
+    """`oracle.line_integrals`, for large clouds a ray at a time, and the Gaussians of which derivatives are to be compared: as
+    those do not depend on the others, of a large cloud the MOST_COMPARED that give most to the image."""
     if len(cloud) <= MOST_COMPARED:
-        return oracle.line_integrals(cloud, pose, *ends)
+        return oracle.line_integrals(cloud, pose, *ends), np.arange(len(cloud))
+    given = np.zeros(len(cloud))
     turn = Rotation.from_quat(cloud.rotation).inv()
     out = []
     for start, direction in zip(*pose.rays()):
@@ -197,8 +206,10 @@ def image_of(cloud, pose, *ends):
         m = (w * d).sum(1) / dd
         share = .5 * (erf((ends[1] - m) * np.sqrt(dd / 2)) - erf((ends[0] - m) * np.sqrt(dd / 2)))
         peak = cloud.density * np.sqrt(2 * np.pi / dd) * np.linalg.norm(direction)
-        out.append((peak * np.exp(-.5 * ((w - m[:, None] * d) ** 2).sum(1)) * share).sum())
-    return np.array(out)
+        each = peak * np.exp(-.5 * ((w - m[:, None] * d) ** 2).sum(1)) * share
+        out.append(each.sum())
+        given += each
+    return np.array(out), np.argsort(-given)[:MOST_COMPARED]
 
 
 def _measure_voxels(case):
@@ -232,15 +243,25 @@ def check(case) -> Result:
 
 
 def markdown(results) -> str:
-    """A table of cases and their results."""
-    lines = ['| case | image | ' + ' | '.join(PARAMETERS) + ' | remark |', '|---' * 7 + '|']
+    """A page with a table of cases and their results."""
+    lines = [INTRODUCTION, '| case | image | at most | ' + ' | '.join(PARAMETERS) + ' | at most | remark |', '|---' * 9 + '|']
     for case, result in results:
-        numbers = [result.image, *(result.gradients.get(name) for name in PARAMETERS)]
+        limits = [None] * 2 if result.image is None else [case.image, case.gradient]
+        numbers = [result.image, limits[0], *(result.gradients.get(name) for name in PARAMETERS), limits[1]]
         remark = '; '.join(filter(None, (result.refused and f'refused: {result.refused}',
                                          result.warned and f'warned: {result.warned}', case.note)))
         cells = [case.name, *('' if x is None else f'{x:.0e}' for x in numbers), remark]
         lines.append(f'| {" | ".join(cells)} |')
     return '\n'.join(lines) + '\n'
+
+
+INTRODUCTION = '''# Hard cases
+
+Written by `python scripts/hard_cases.py --markdown docs/hard_cases.md`; asserted by `tests/test_hard_cases.py`. Errors in float32
+against float64 on the same input, relative: of the image, its root mean square deviation over its own; of derivatives by the
+Gaussians' parameters, the worst Gaussian's, each kind over the length of all of that Gaussian's derivatives, made numbers of one
+unit (`tests/hard_cases.py` says how). *At most* is what the tests allow.
+'''
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -278,9 +299,10 @@ def close_up(mode, shape=(24, 32), pixel=1.5e-4, **changes):
     return scanner(mode, shape, size=(shape[0] * pixel, shape[1] * pixel), **changes)
 
 
-def cases() -> list:
+def cases(steps: int = 300) -> list:
+    """All cases. steps   of the fit to adversarial data"""
     return [*_shapes(), *_sizes(), *_densities(), *_places(), *_numbers(), *_geometries(), *_voxels(), *_unusable(),
-            *_scans()]
+            *_scans(steps)]
 
 
 def _shapes():
@@ -312,9 +334,8 @@ def _sizes():
         for power in (-6, -4, -2, -1, 0):
             rng = np.random.default_rng(10 + power)
             size = pixel * 10. ** power
-            coarse = dict(gradient=4e-5, note="the differences of the oracle's own float64") if power == -6 else {}
             cloud = _on_pixel_centres(rng, frames, shape, size, 16)
-            yield Case(f'scale 1e{power} pixels, {mode}', cloud, frames, shape, **coarse)
+            yield Case(f'scale 1e{power} pixels, {mode}', cloud, frames, shape, analytic=power == -6)
         for size in (2., 20.):
             rng = np.random.default_rng(5)
             scale = size * rng.uniform(.7, 1.3, (3, 3))
@@ -378,8 +399,13 @@ def _places():
     for panel in (True, False):
         for name, (centre, size) in places.items():
             cloud = Cloud([centre], size * np.array(one['scale']), one['rotation'], one['density'])
-            tail = dict(image=4e-6, note='a far tail only') if name.startswith('centre outside the fan, r') else {}
+            tail = dict(image=2e-6, note='a far tail only') if name.startswith('centre outside the fan, r') else {}
             yield Case(name if panel else f'{name}, no panel', cloud, frames, shape, panel=panel, **tail)
+    frames, shape = scanner('parallel')
+    for name in ('centre outside the fan, reaching in', 'behind the source', 'centre on the panel', 'behind the panel'):
+        centre, size = places[name]
+        cloud = Cloud([centre], size * np.array(one['scale']), one['rotation'], one['density'])
+        yield Case(f'{name}, parallel: never cut'.replace('the fan', 'the beam'), cloud, frames, shape)
     frames, shape = scanner(shape=(25, 33))
     turn = Rotation.from_euler('z', 33 + 1e-4, degrees=True).as_quat()[None]
     for kind, scale in dict(needle=(.3, 3e-5, 3e-5), pancake=(.3, .3, 3e-5)).items():
@@ -387,20 +413,19 @@ def _places():
 
 
 def _numbers():
-    note = 'added one by one in float32; derivatives are not affected'
+    note = 'added one by one in float32, a thousand at a time'
     for mode in ('cone', 'parallel'):
         frames, shape = scanner(mode)
         cloud = random_cloud(np.random.default_rng(6), 1)
         yield Case(f'one Gaussian, {mode}', cloud, frames, shape)
         yield Case(f'30 coincident Gaussians, {mode}', cloud, frames, shape, copies=30)
-        yield Case(f'3000 coincident Gaussians, {mode}', cloud, frames, shape, image=1e-5, copies=3000, note=note)
+        yield Case(f'3000 coincident Gaussians, {mode}', cloud, frames, shape, image=3e-6, copies=3000, note=note)
         sharp, _ = scanner(mode, size=(.4, .5))
         small = Cloud([[0, 0, 0]], [[.004, .005, .006]], [[.1, .4, -.3, .8]], [1.])
         yield Case(f'pixels 30 standard deviations out, {mode}', small, sharp, shape)
     frames, shape = scanner(shape=(4, 4), size=(.4, .4))
     cloud = random_cloud(np.random.default_rng(6), 1, spread=.1, size=.1)
-    yield Case('1 million coincident Gaussians', cloud, frames, shape, image=5e-3, copies=1_000_000, warned=True,
-               note=note)
+    yield Case('1 million coincident Gaussians', cloud, frames, shape, image=3e-6, copies=1_000_000, note=note)
     cloud = random_cloud(np.random.default_rng(6), 1_000_000, size=.005)
     yield Case('1 million Gaussians', cloud, *scanner(shape=(3, 3)), image=5e-6, note=note)
 
@@ -518,16 +543,18 @@ def fit_to(scan, iterations, **changes):
 
 
 def adversarial():
-    """Eight views, one of them empty, one saturated, one with negative noise."""
-    scan = measured(circular(8))
+    """Eight views: two of them empty, one saturated, one with negative noise, one there twice."""
+    angles = circular(8)
+    angles[4] = angles[2]
+    scan = measured(angles)
     p = scan.projections.copy()
-    p[1] = 0
+    p[[1, 6]] = 0
     p[3] = p.max() * 30
     p[5] += np.random.default_rng(11).normal(size=p[5].shape) * p.max()
     return Scan(scan.geometry, p)
 
 
-def _scans():
+def _scans(steps):
     def changed(change):
         scan = measured(circular(3))
         return Scan(scan.geometry, np.broadcast_to(change(scan.projections), scan.projections.shape))
@@ -543,3 +570,5 @@ def _scans():
     yield ScanCase('2 views', lambda: fit_to(measured(circular(2)), 20), note=finite)
     yield ScanCase('1000 views', lambda: fit_to(measured(circular(1000), (8, 8)), 20), note=finite)
     yield ScanCase('views 1e-6 rad apart', lambda: fit_to(measured(np.arange(3) * 1e-6), 40), note=finite)
+    yield ScanCase(f'{steps} steps: views empty, saturated, noisy, repeated; Gaussians coincident',
+                   lambda: fit_to(adversarial(), steps), note=finite)

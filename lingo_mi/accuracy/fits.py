@@ -11,6 +11,7 @@ from ..fit.settings import METHODS, VOLUMETRIC
 from ..fit.state import start
 from ..fit.step import Stepper
 from ..geometry import Geometry, circular
+from ..lingo.ipsd import ipsd
 from ..phantoms.scanning import simulate
 from ..results import quick_measure
 from ..scan import Dataset, Scan
@@ -18,47 +19,64 @@ from .images import EXTENT
 from .sizes import Sizes
 
 
-def dataset(side: int, views: int) -> Dataset:
-    """The foot phantom on side^3 voxels, before panels of side^2 pixels."""
+def dataset(side: int, pixels: int, views: int) -> Dataset:
+    """The foot phantom on side^3 voxels, before panels of pixels^2."""
     phantom = phantoms.make('foot', side)
     angles = np.concatenate([circular(views, 180.), np.sort(np.random.default_rng(0).uniform(0, np.pi, views))])
-    geometry = Geometry(1000., 1500., side, 512 / side, phantom.data.shape, phantom.spacing, angles)
+    geometry = Geometry(1000., 1500., pixels, 512 / pixels, phantom.data.shape, phantom.spacing, angles)
     both = Scan(geometry, simulate(phantom, geometry))
     return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)
 
 
 def initialisations(sizes: Sizes) -> list[dict]:
-    """Quality of initial clouds, before any iteration."""
-    data = dataset(sizes.phantoms[0], sizes.views)
+    """Quality of initial clouds, before any iteration, and their IPSD: from the Gaussians that are born in a fit from there."""
+    side = sizes.phantoms[0]
+    data = dataset(side, side, sizes.views)
     rows = []
     kinds = {'lingo': dict(init='lingo'), 'lingo, paper density': dict(init='lingo', init_density='paper'),
              'r2': dict(init='r2')}
-    initial_cloud(data.train, METHODS['fast'].changed(n_points=sizes.points[0]))  # compiles
+    fast = METHODS['fast'].changed(values_per_gaussian=0, iterations=sizes.iterations[-2])  # as many points as asked for
+    initial_cloud(data.train, fast.changed(n_points=sizes.points[0]))  # compiles
     for name, changes in kinds.items():
         for n in sizes.points:
-            settings = METHODS['fast'].changed(n_points=n, **changes)
+            settings = fast.changed(n_points=n, **changes)
             cloud = initial_cloud(data.train, settings)
             stepper = Stepper(data.train, settings)
             state = DeviceState(start(cloud.points, cloud.spacing, cloud.density / stepper.unit, settings))
+            fitted = run(data.train, settings, cloud)
+            born = fitted.state.values['centre'][fitted.state.born]
             rows.append(dict(name=name, points=len(cloud), seconds=cloud.info['seconds'],
+                             ipsd=ipsd(fitted.initial, born) if len(born) else None,
                              **quick_measure(data)(stepper, state)))
     return rows
 
 
 def curves(sizes: Sizes) -> list[dict]:
-    """Quality against seconds: recipes, iterations, cut-off, Gaussians to start with, size of the phantom."""
-    small, most, points = sizes.phantoms[0], sizes.iterations[-1], sizes.points[1]
-    plans = [(name, small, n, points, 3.) for name in VOLUMETRIC for n in sizes.iterations]
-    plans += [('fast', small, sizes.iterations[-2], points, e) for e in (2., 4., EXTENT)]
-    plans += [('fast', small, sizes.iterations[-2], p, 3.) for p in sizes.points if p != points]
-    plans += [('fast', side, most, points, 3.) for side in sizes.phantoms[1:]]
+    """Quality against seconds: recipes, iterations, cut-off, Gaussians, size of the phantom and of the panel."""
+    small, middle = sizes.phantoms[0], sizes.iterations[-2]
+    plans = [dict(name=name, iterations=n) for name in VOLUMETRIC for n in sizes.iterations]
+    plans += [dict(extent=e) for e in (2., 4., EXTENT)]
+    plans += [dict(points=p) for p in sizes.points if p != sizes.points[1]]
+    plans += [dict(values_per_gaussian=v) for v in (3.5, 56.)]
+    plans += [dict(pixels=2 * small), dict(pixels=small // 2)]
+    for side in sizes.phantoms[1:]:
+        plans += [dict(side=side, pixels=p, iterations=sizes.iterations[-1]) for p in (small, side)]
     scans, rows = {}, []
-    for name, side, iterations, points, extent in plans:
-        data = scans.setdefault(side, dataset(side, sizes.views))
-        settings = METHODS[name].changed(iterations=iterations, n_points=points, extent=extent)
-        fitted = run(data.train, settings, initial_cloud(data.train, settings), measure=quick_measure(data))
-        rows.append(dict(name=name, side=side, iterations=iterations, points=points, extent=extent,
-                         gaussians=len(fitted.state), seconds=fitted.info['seconds'] + fitted.seconds,
-                         seconds_init=fitted.info['seconds'], history=fitted.history,
-                         **{k: v for k, v in fitted.history[-1].items() if k.startswith('psnr')}))
+    usual = dict(name='fast', side=small, pixels=small, iterations=middle, points=sizes.points[1], extent=3.,
+                 values_per_gaussian=METHODS['fast'].values_per_gaussian)
+    for changes in plans:
+        plan = usual | changes
+        side, pixels = plan['side'], plan['pixels']
+        if (side, pixels) not in scans:
+            scans[side, pixels] = dataset(side, pixels, sizes.views)
+        data, method = scans[side, pixels], METHODS[plan['name']]
+        given = plan['values_per_gaussian'] if plan['name'] == 'fast' else method.values_per_gaussian
+        settings = method.changed(iterations=plan['iterations'], n_points=plan['points'], extent=plan['extent'],
+                                  values_per_gaussian=given)
+        cloud = initial_cloud(data.train, settings)
+        fitted = run(data.train, settings, cloud, measure=quick_measure(data))
+        rows.append(plan | dict(
+            asked=plan['points'], points=len(cloud), gaussians=len(fitted.state),
+            seconds=fitted.info['seconds'] + fitted.seconds, seconds_init=fitted.info['seconds'], history=fitted.history,
+            **{k: v for k, v in fitted.history[-1].items() if k.startswith('psnr')}))
     return rows

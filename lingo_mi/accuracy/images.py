@@ -90,24 +90,30 @@ def by_tree(work: Workload, extent: float, epsilon: float) -> Method:
 
 
 def pixel(sizes: Sizes) -> list[dict]:
-    """Rays a pixel, against the mean over the pixel."""
-    work = Workload(sizes.few // 2, sizes.pixels, sizes.box, order=4)
-    return compare(work, [by_integrator(f'{n} × {n}' if isinstance(n, int) else n, work, extent=7., pixel=n)
-                          for n in ('centre', 2, 4, 'area')], sizes)
+    """Rays a pixel, against the mean over the pixel, for Gaussians of some pixels and of half a pixel."""
+    rows = []
+    for box in (sizes.box, sizes.box / 20):
+        work = Workload(sizes.few // 2, sizes.pixels, box, order=4)
+        rows += compare(work, [by_integrator(f'{f"{n} × {n}" if isinstance(n, int) else n}, σ of {work.sigma:.1f} pixels', work,
+                                             extent=7., pixel=n) for n in ('centre', 2, 4, 'area')], sizes)
+    return rows
 
 
 def teams(work: Workload, sizes: Sizes) -> list[dict]:
-    """Into how many shares the work is cut, in parts of the usual number."""
-    return compare(work, [by_integrator(f'{factor:g}', work, lambda f=factor: _teams(f), extent=EXTENT)
-                          for factor in (.25, .5, 1, 2, 4, 16)], sizes)
+    """Into how many shares the work is cut, in parts of the usual number, and how many lanes work on one."""
+    found = [by_integrator(f'{factor:g}', work, lambda f=factor: _teams(f, balance.LANES), extent=EXTENT)
+             for factor in (.25, .5, 1, 2, 4, 16)]
+    found += [by_integrator(f'{balance.LANES / lanes:g}, of {lanes} lanes', work,
+                            lambda n=lanes: _teams(balance.LANES / n, n), extent=EXTENT) for lanes in (4, 16)]
+    return compare(work, found, sizes)
 
 
 @contextmanager
-def _teams(factor: float):
-    """The splat's work cut into `factor` times as many shares as usual."""
+def _teams(factor: float, lanes: int):
+    """The splat's work cut into `factor` times as many shares as usual, each for so many lanes."""
     class Work(balance.Work):
         def __init__(self, *args):
             super().__init__(*args)
             self.teams = max(round(factor * self.teams), 1)
-    with mock.patch.object(splat, 'Work', Work):
+    with mock.patch.multiple(splat, Work=Work, LANES=lanes), mock.patch.object(balance, 'LANES', lanes):
         yield

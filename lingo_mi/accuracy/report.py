@@ -94,12 +94,19 @@ def _error(key):
     return lambda row: f'{row[key]:.1e}' if key in row else '–'
 
 
+def _worst_max(row):
+    """The largest deviation in any of the four derivatives, over the largest value of that derivative."""
+    return f'{max(row[f"{key}_max"] for key in GRADIENTS):.1e}' if f'{GRADIENTS[0]}_max' in row else '–'
+
+
 def _time(key):
     def cell(row):
         if f'{key}_ms' not in row:
             return '–'
         low, high = row[f'{key}_quartiles_ms']
         digits = max(0, min(2, 1 - int(np.floor(np.log10(row[f'{key}_ms'])) - 1)))
+        if row[f'{key}_repeats'] == 1:
+            return f'{row[f"{key}_ms"]:.{digits}f}, once'
         return f'{row[f"{key}_ms"]:.{digits}f} ± {(high - low) / 2:.{digits}f}'
     return cell
 
@@ -110,7 +117,7 @@ def _number(key, form):
 
 _COMPARE = [
     ('', _number('name', '{}')), ('image, L2', _error('image')), ('image, max', _error('image_max')),
-    *((f'∂ {key}', _error(key)) for key in GRADIENTS), ('forward, ms', _time('forward')),
+    *((f'∂ {key}', _error(key)) for key in GRADIENTS), ('∂, max', _worst_max), ('forward, ms', _time('forward')),
     ('with gradients, ms', _time(BACKWARD)), ('memory, MB', _number('memory_mb', '{:.1f}')),
     ('with gradients, MB', _number('memory_gradients_mb', '{:.1f}'))]
 _PRESETS = [
@@ -127,8 +134,8 @@ _SCALING = [
     ('memory, MB', _number('memory_mb', '{:.1f}')), ('with gradients, MB', _number('memory_gradients_mb', '{:.1f}'))]
 _QUALITY = [('views, dB', _number('psnr_2d', '{:.2f}')), ('volume, dB', _number('psnr_3d', '{:.2f}'))]
 _INITIAL = [('initial cloud', _number('name', '{}')), ('Gaussians', _number('points', '{:,}')),
-            ('seconds', _number('seconds', '{:.2f}')), *_QUALITY]
-_FITS = [('recipe', _number('name', '{}')), ('phantom', _number('side', '{0}³')),
+            ('seconds', _number('seconds', '{:.2f}')), ('IPSD', _number('ipsd', '{:.3f}')), *_QUALITY]
+_FITS = [('recipe', _number('name', '{}')), ('phantom', _number('side', '{0}³')), ('panel', _number('pixels', '{0}²')),
          ('iterations', _number('iterations', '{:,}')),
          ('Gaussians, first', _number('points', '{:,}')), ('last', _number('gaussians', '{:,}')),
          ('cut-off, σ', _number('extent', '{:g}')), ('seconds', _number('seconds', '{:.1f}')), *_QUALITY]
@@ -219,17 +226,17 @@ def _scaling(fig, found):
 
 def _fits(fig, found):
     """Quality against seconds while fits run, and of initial clouds."""
-    runs = [r for r in found['fits'] if r['extent'] == 3. and r['side'] == found['fits'][0]['side']]
+    first = found['fits'][0]  # the others are variations of the same
+    alike = 'extent', 'side', 'pixels', 'asked', 'values_per_gaussian'
+    runs = [r for r in found['fits'] if all(r[key] == first[key] for key in alike)]
     most = max(r['iterations'] for r in runs)
-    usual = runs[0]['points']
     colours = dict(fast=GREEN, lingo=BLUE, r2=RED)
     for axis, key, title in zip(fig.subplots(1, 2), ('psnr_2d', 'psnr_3d'), ('Held-out views', 'Volume')):
         for r in runs:
-            if r['points'] == usual:
-                points = [(r['seconds_init'] + h['seconds'], h[key]) for h in r['history']]
-                axis.semilogx(*zip(*points), '-', color=colours[r['name']], alpha=1 if r['iterations'] == most else .4)
-                axis.semilogx(*points[-1], 'o', color=colours[r['name']],
-                              label=f'{r["name"]}, up to {most} iterations' if r['iterations'] == most else None)
+            points = [(r['seconds_init'] + h['seconds'], h[key]) for h in r['history']]
+            axis.semilogx(*zip(*points), '-', color=colours[r['name']], alpha=1 if r['iterations'] == most else .4)
+            axis.semilogx(*points[-1], 'o', color=colours[r['name']],
+                          label=f'{r["name"]}, up to {most} iterations' if r['iterations'] == most else None)
         for name, marker in zip(dict.fromkeys(r['name'] for r in found['initialisations']), 'sD^'):
             rows = [r for r in found['initialisations'] if r['name'] == name]
             axis.semilogx([r['seconds'] for r in rows], [r[key] for r in rows], marker, color=ORANGE, fillstyle='none',

@@ -25,7 +25,8 @@ class Workload:
     def __init__(self, gaussians: int, pixels: int, box: float, order: int = 0, mode: str = 'cone', giant: bool = False):
         rng = np.random.default_rng(0)
         n = gaussians
-        sigma = np.sqrt(box) / 6 / SPREAD * (PANEL / pixels) * DSO / DSD
+        self.sigma = np.sqrt(box) / 6 / SPREAD  # pixels, of the median scale
+        sigma = self.sigma * (PANEL / pixels) * DSO / DSD
         direction = rng.normal(size=(n, 3))
         centre = direction / np.linalg.norm(direction, axis=1, keepdims=True) * BALL * rng.random((n, 1)) ** (1 / 3)
         rotation = rng.normal(size=(n, 4))

@@ -163,7 +163,8 @@ class Stepper:
             return None
         g = self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        return grid.volume(voxelize(*state.gaussians(self.settings), grid, self.settings.extent)) * np.float32(self.unit)
+        values = voxelize(*state.gaussians(self.settings), grid, self.settings.extent, deep=True)
+        return grid.volume(values) * np.float32(self.unit)
 
     def shares(self, state: DeviceState):
         """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""

@@ -39,11 +39,21 @@ class Work:
                       for x in (begin, begin + share))
         return dict(lane=lane, begin=begin, end=end, blocks=self.blocks)
 
-    def add_up(self, kernel, rows: int, width: int, /, **arguments):
+    def add_up(self, kernel, rows: int, width: int, parts: int = 1, /, **arguments):
         """Run a kernel that adds to rows of so many elements, padded to whole packets; returns them, Float [rows * width].
 
         The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
+        With more than one of the `parts`, items are dealt out to them and each part is added up by itself, their sums in
+        float64.
         """
+        if parts > 1:
+            # By a hash (Knuth's): clouds may be periodic.
+            which, total = dr.arange(mi.UInt32, self.count) * 2654435761 // 65536 % dr.opaque(mi.UInt32, parts), 0
+            for part in range(parts):
+                some = Work(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
+                total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
+                dr.eval(total)
+            return mi.Float(total)
         size = rows * packets_of(width)
         private = self.on_cpu and self.teams * size <= MOST_COPIED
         copies = self.teams if private else 1

@@ -15,8 +15,6 @@ from .splat import splat
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
 PIXEL_VARIANCE = 1 / 12  # of a square of side 1, along either side
-MANY = 10_000   # Gaussians in a cloud from which on their overlap is looked at
-DEEP = 5_000    # Gaussians in a pixel whose sum float32 still holds to 1e-5
 
 
 def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True,
@@ -34,17 +32,20 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
                     Gaussian of the pixel's variance
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
-    no extent or no rotation leaves no finite pixel. AccuracyWarning where too many overlap for sums in float32.
+    no extent or no rotation leaves no finite pixel.
     """
     footprints = project(centre, scale, rotation, density, view, extent, PIXEL_VARIANCE if area else 0.)
     if affine:
         footprints = _frozen(footprints)
-    image = splat(footprints, view.height, view.width, extent, primal) * view.lengths()
-    if primal and dr.width(footprints.column) > MANY:
-        _warn_of_overlap(footprints, view)
+    image = splat(footprints, view.height, view.width, extent, primal, deep=True) * view.lengths()
     if view.parallel:
         return image + dr.sum(dr.select(footprints.straddles, dr.nan, mi.Float(0)))
-    return add_straddling(image, centre, scale, rotation, density, view, footprints.straddles)
+    straddling = dr.compress(footprints.straddles)  # waits for the device
+    if (affine or area) and dr.width(straddling):
+        warnings.warn(AccuracyWarning(
+            f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
+            f'the pixel\'s centre is taken, whatever "pixel" and "footprint" say'), stacklevel=3)
+    return add_straddling(image, centre, scale, rotation, density, view, straddling)
 
 
 def _frozen(footprints):
@@ -52,16 +53,3 @@ def _frozen(footprints):
     zero = dr.opaque(mi.Float, 0, dr.width(footprints.column))
     values = (zero if name in DENOMINATOR else value for name, value in zip(NAMES, footprints.values))
     return replace(footprints, values=tuple(values))
-
-
-def _warn_of_overlap(footprints, view):
-    """Warn where the mean over the image, or over one of 64 x 64 tiles, is more than DEEP Gaussians a pixel."""
-    with dr.suspend_grad():
-        tile = dr.maximum(view.width / 64, 1.), dr.maximum(view.height / 64, 1.)
-        x, y = (mi.UInt32(dr.clip(mi.Float(c) / t, 0, 63)) for c, t in zip((footprints.column, footprints.row), tile))
-        tiles = dr.zeros(mi.Float, 64 * 64)
-        dr.scatter_add(tiles, dr.minimum(footprints.area / (tile[0] * tile[1]), 1), y * 64 + x)
-        depth = max(dr.max(tiles)[0], dr.sum(footprints.area)[0] / (view.width * view.height))
-    if depth > DEEP:
-        warnings.warn(AccuracyWarning(f'about {depth:.0e} Gaussians overlap in a pixel: their sum in float32 may be off '
-                                      f'by {depth * 2e-9:.0e}'), stacklevel=3)

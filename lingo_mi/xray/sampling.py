@@ -26,7 +26,7 @@ def on_grid(thing, corner, step, shape, extent: float = 6.) -> np.ndarray:
     """
     if isinstance(thing, Ellipsoids):
         cells = Grid(vector64(corner), vector64(step), tuple(shape))
-        return cells.volume(voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent))
+        return cells.volume(voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent, deep=True))
     if isinstance(thing, HomogeneousMesh):
         from ..phantoms.mesh import voxelise
         sigma = np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0]

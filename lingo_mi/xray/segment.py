@@ -17,12 +17,11 @@ import mitsuba as mi
 from .rotation import rotate_inverse, rows_of
 
 
-def add_straddling(image, centre, scale, rotation, density, view, straddles):
-    """Add to a cone-beam image, Float [height * width], the Gaussians that `straddles` selects. Differentiable.
+def add_straddling(image, centre, scale, rotation, density, view, indices):
+    """Add to a cone-beam image, Float [height * width], the Gaussians of some indices, UInt32. Differentiable.
 
-    Other arguments as for `footprint.project`. Waits for the device to learn how many there are.
+    Other arguments as for `footprint.project`.
     """
-    indices = dr.compress(straddles)
     for k in range(dr.width(indices)):
         i = dr.gather(mi.UInt32, indices, dr.opaque(mi.UInt32, k))
         one = [dr.gather(type(x), x, i) for x in (centre, scale, rotation, density)]

@@ -21,24 +21,28 @@ import mitsuba as mi
 
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, pair, position,
                       repeat, span, times, unpair, whole)
+from .depth import parts_of
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True):
+def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True, deep: bool = False):
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
     Differentiable in `footprints.values`, in forward and in reverse mode. With `primal` off the image itself is left at
-    zero, for who only wants derivatives.
+    zero, for who only wants derivatives. With `deep` on, thousands of footprints on top of each other are added up in parts
+    (`depth`), which waits for the device once.
     """
-    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal)
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal, deep)
 
 
 class _Splat(dr.CustomOp):
-    def eval(self, values, rest, height, width, extent, primal):
+    def eval(self, values, rest, height, width, extent, primal, deep):
         self.plan = _Plan(values, rest, height, width, extent)
+        if deep and primal:
+            self.plan.parts = parts_of((rest.column, rest.row), rest.area, (width, height))
         return self.plan.image() if primal else dr.zeros(mi.Float, height * width)
 
     def forward(self):
@@ -55,7 +59,7 @@ class _Plan:
     """The work of one image: packed footprints, shared out by their pixels."""
 
     def __init__(self, values, rest, height, width, extent):
-        self.count, self.height, self.width = dr.width(values[0]), height, width
+        self.count, self.height, self.width, self.parts = dr.width(values[0]), height, width, 1
         self.packets = packets_of(width)
         amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
         Float64 = dr.float64_array_t(mi.Float)
@@ -76,7 +80,7 @@ class _Plan:
                               packets=dr.opaque(mi.Int32, self.packets))
 
     def image(self):
-        return self.work.add_up(_draw, self.height, self.width, **self.arguments)
+        return self.work.add_up(_draw, self.height, self.width, self.parts, **self.arguments)
 
     def tangent(self, tangents):
         *others, x, y = tangents
@@ -85,7 +89,7 @@ class _Plan:
         zeros = dr.zeros(mi.Float, self.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self.work.add_up(_draw, self.height, self.width, **self.arguments, moved=moved)
+        return self.work.add_up(_draw, self.height, self.width, self.parts, **self.arguments, moved=moved)
 
     def gradient(self, grad_image):
         """Derivatives of the footprints' numbers, a tuple of Float [N], from that of the image."""

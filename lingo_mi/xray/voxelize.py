@@ -20,6 +20,7 @@ import numpy as np
 
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, position, repeat,
                       span, times, whole)
+from .depth import parts_of
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .rotation import rows_of
 from .splat import SETUP
@@ -40,11 +41,13 @@ class Grid:
         return np.ascontiguousarray(values.numpy().reshape(self.shape[::-1]).transpose(2, 1, 0))
 
 
-def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
+def voxelize(centre, scale, rotation, density, grid: Grid, extent: float, deep: bool = False):
     """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
 
-    centre, scale, rotation, density   as for `footprint.project`
+    centre, scale, rotation, density   as for `footprint.project`; one that is not finite, has no extent or no rotation leaves
+                                       no finite voxel
     extent                             cut-off in standard deviations
+    deep                               as for `splat.splat`
     """
     Vector3d = mi.Vector3d
     Float64 = dr.value_t(Vector3d)
@@ -66,16 +69,19 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float):
         size = [dr.maximum(end[i] - begin[i], 0) for i in range(3)]
         lines = dr.select(size[0] > 0, size[1] * size[2], 0)
         rest = (*middle, lines, begin[1], begin[2], size[1])
+        # An ellipsoid's voxels, or those of its box where they are fewer.
+        covered = mi.Float(dr.minimum(4 / 3 * dr.pi * extent ** 3 / (m1 * m2 * m3), Float64(lines) * Float64(size[0])))
+        sound = dr.isfinite(dr.sum(p) + rho + m1 + m2 + m3)
     values = (*(mi.Float(v) for v in (rho, m1, m2, m3)), s1, s2, s3,
               *(at[i] - (Float64(middle[i]) + .5) for i in range(3)))
-    return dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), grid.shape, extent)
+    out = dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), covered, grid.shape, extent, deep)
+    return out + dr.sum(dr.select(sound, 0, mi.Float(dr.nan)))
 
 
 class _Voxelize(dr.CustomOp):
-    def eval(self, values, rest, length, shape, extent):
+    def eval(self, values, rest, length, covered, shape, extent, deep):
         self.shape, (nx, ny, nz) = shape, shape
         self.packets = packets_of(nx)
-        self.work = Work((mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP)
         rho, m1, m2, m3, s1, s2, s3, x, y, z = values
         self.slopes = s1, s2, s3
         ridge, spine = x + s1 * y + s2 * z, y + s3 * z
@@ -86,10 +92,13 @@ class _Voxelize(dr.CustomOp):
         # (column of the ridge, row, slice, lines) and (first row, first slice, rows, row of the spine)
         column, row, *others = rest
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
-        dr.eval(packed, places)
+        blocks, cost = (mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP
+        dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
+        self.work = Work(blocks, cost)
+        parts = parts_of(rest[:3], covered, shape) if deep else 1
         self.arguments = dict(packed=packed, places=places, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets), rows=dr.opaque(mi.Int32, ny))
-        return self.work.add_up(_fill, ny * nz, nx, **self.arguments)
+        return self.work.add_up(_fill, ny * nz, nx, parts, **self.arguments)
 
     def backward(self):
         nx, ny, nz = self.shape

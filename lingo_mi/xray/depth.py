@@ -1,0 +1,47 @@
+"""How many items lie on top of each other, and in how many parts their sum must be taken.
+
+An element of an image that n equal numbers are added to one by one in float32 is off by some n 2e-9 of itself. Where more
+than DEEP items meet, they are therefore added up in parts, each into a sum of its own, and the sums in float64.
+"""
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+DEEP = 1_000   # 2e-6
+CELLS = 4096   # about as many on each level; a power of four and of eight
+
+
+def parts_of(places, covered, shape) -> int:
+    """In how many parts to add up items on a grid of elements. Waits for the device, where there are enough of them.
+
+    places    Int32 [N] for each axis, an item's element; it may lie outside the grid
+    covered   Float [N], elements that an item covers
+    shape     elements along each axis
+
+    Covered elements are counted by the cell in which the items' centres lie: cells of one element, of which those a number of
+    cells apart count as one; cells of some share of the grid, and larger ones; and the whole grid.
+    """
+    count = dr.width(covered)
+    if count <= DEEP:
+        return 1
+    side = round(CELLS ** (1 / len(shape)))
+    levels = [(side, None), (side, [max(n / side, 1.) for n in shape])]
+    coarse = side // (8 if len(shape) == 2 else 4)
+    levels.append((coarse, [max(n / coarse, 1.) for n in shape]))
+    with dr.suspend_grad():
+        inside = [dr.clip(p, 0, n - 1) for p, n in zip(places, shape)]
+        depth = dr.zeros(mi.Float, 2 * CELLS + coarse ** len(shape) + 1)
+        first = 0
+        for cells, size in levels:
+            index, volume = mi.UInt32(0), 1.
+            for axis, p in enumerate(inside):
+                along = mi.UInt32(p) % cells if size is None else mi.UInt32(mi.Float(p) / size[axis])
+                index, volume = index * cells + along, volume * (1. if size is None else size[axis])
+            dr.scatter_add(depth, dr.minimum(covered / volume, 1), index + first)
+            first += cells ** len(shape)
+        total = 1.
+        for n in shape:
+            total *= n
+        dr.scatter_add(depth, covered / total, mi.UInt32(first))
+        return -(-int(dr.max(depth)[0]) // DEEP)
