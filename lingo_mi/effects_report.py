@@ -16,7 +16,7 @@ from .fit.initial import initial_cloud
 from .fit.loop import run
 from .fit.settings import FAST
 from .geometry import Geometry
-from .metrics import psnr_3d
+from .metrics import psnr_3d_absolute
 from .scan import Scan
 from .scanning import load_scene, render_objects, take_scan
 from .xray.objects import find_objects
@@ -131,8 +131,8 @@ def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geom
 def quality(volume, truth) -> dict:
     """PSNR in dB of a volume [x, y, z] against the truth, whose maximum is full scale: as it is, and after the factor that
     makes the error least."""
-    peak, gain = truth.max(), np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
-    return dict(psnr_3d=psnr_3d(volume / peak, truth / peak), psnr_3d_gain=psnr_3d(gain * volume / peak, truth / peak))
+    gain = np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
+    return dict(psnr_3d=psnr_3d_absolute(volume, truth), psnr_3d_gain=psnr_3d_absolute(gain * volume, truth))
 
 
 def pace(history) -> float:

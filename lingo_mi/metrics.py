@@ -5,7 +5,9 @@ Two families stand side by side:
     psnr_2d_r2, ssim_2d         R2-Gaussian's form: every view of either stack is divided by its own maximum,
                                 so a wrong gain costs nothing. Published tables hold these.
     psnr_2d, ssim_2d_absolute   the same with one peak for all: a wrong gain counts as the error it is.
-    psnr_3d, ssim_3d            R2-Gaussian's form: peak 1, nothing rescaled or clipped.
+    psnr_3d, ssim_3d            R2-Gaussian's form: peak 1, nothing rescaled or clipped, SSIM slice by slice.
+    psnr_3d_absolute,           with the truth's own full scale, whatever the unit of density, and a window for SSIM that
+    ssim_3d_absolute            is as thick as it is wide.
 
 Every function takes the result first and the truth second, raises InputError where the shapes differ or a
 value is not finite, and returns a float: inf dB for identical images, NaN where the truth holds nothing to
@@ -92,14 +94,39 @@ def ssim_3d(volume, truth) -> float:
     return _mean(means)
 
 
-def ssim_map(a, b) -> np.ndarray:
-    """SSIM of two images [rows, columns] at every pixel, for values with full scale 1.
+def psnr_3d_absolute(volume, truth, peak: float | None = None) -> float:
+    """PSNR in dB of densities in any unit.
 
-    The window is an 11 x 11 Gaussian of sigma 1.5, the image is continued by zeros, variances are not
-    debiased: the form of the SSIM loss of 3D Gaussian Splatting.
+    volume, truth : [x, y, z]
+    peak          : the value that counts as full scale, > 0; by default the maximum of the truth
+    """
+    volume, truth = _pair(volume, truth, 'volumes', '[x, y, z]')
+    peak = _peak(truth, peak)
+    return _psnr(volume, truth, peak) if peak > 0 else np.nan
+
+
+def ssim_3d_absolute(volume, truth, peak: float | None = None) -> float:
+    """SSIM of densities in any unit, with a window of 11 x 11 x 11 voxels, mean over all of them.
+
+    volume, truth : [x, y, z]; along an axis of one voxel there is no window
+    peak          : the value that counts as full scale, > 0; by default the maximum of the truth
+    """
+    volume, truth = _pair(volume, truth, 'volumes', '[x, y, z]')
+    peak = _peak(truth, peak)
+    axes = [axis for axis in range(3) if truth.shape[axis] > 1]
+    return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
+
+
+def ssim_map(a, b, axes=(0, 1)) -> np.ndarray:
+    """SSIM of two images [rows, columns], or volumes, at every pixel, for values with full scale 1.
+
+    The window is a Gaussian of sigma 1.5, 11 wide along each of the `axes`, the image is continued by zeros, variances are
+    not debiased: the form of the SSIM loss of 3D Gaussian Splatting.
     """
     def blur(x):
-        return correlate1d(correlate1d(x, WINDOW, 0, mode='constant'), WINDOW, 1, mode='constant')
+        for axis in axes:
+            x = correlate1d(x, WINDOW, axis, mode='constant')
+        return x
 
     ma, mb = blur(a), blur(b)
     mab, mm = ma * mb, ma * ma + mb * mb

@@ -16,6 +16,8 @@ from .errors import InputError
 QUALITY = {
     'psnr_3d': ('PSNR 3D, peak 1', 'dB', '.2f'),
     'ssim_3d': ('SSIM 3D, mean over the slices of the three axes', '', '.4f'),
+    'psnr_3d_absolute': ("PSNR 3D, peak the truth's maximum", 'dB', '.2f'),
+    'ssim_3d_absolute': ("SSIM 3D, windows of 11 x 11 x 11 voxels, the truth's maximum as full scale", '', '.4f'),
     'psnr_2d': ('PSNR 2D, held-out views as they are', 'dB', '.2f'),
     'psnr_2d_r2': ('PSNR 2D, each view divided by its own maximum', 'dB', '.2f'),
     'ssim_2d': ('SSIM 2D, each view divided by its own maximum', '', '.4f'),

@@ -118,6 +118,8 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth), psnr_2d=of(metrics.psnr_2d, rendered, truth),
         ssim_2d=of(metrics.ssim_2d, rendered, truth), psnr_3d=of(metrics.psnr_3d, volume, dataset.volume),
         ssim_3d=of(metrics.ssim_3d, volume, dataset.volume),
+        psnr_3d_absolute=of(metrics.psnr_3d_absolute, volume, dataset.volume),
+        ssim_3d_absolute=of(metrics.ssim_3d_absolute, volume, dataset.volume),
         ipsd=_number(ipsd(fitted.initial, born)), ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
         gaussians=len(fitted.state), iterations=fitted.settings.iterations,

@@ -5,9 +5,11 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from lingo_mi import metrics
 from lingo_mi.errors import InputError
-from lingo_mi.metrics import psnr_2d, psnr_2d_r2, psnr_3d, ssim_2d, ssim_2d_absolute, ssim_3d, ssim_map
+from lingo_mi.metrics import (psnr_2d, psnr_2d_r2, psnr_3d, psnr_3d_absolute, ssim_2d, ssim_2d_absolute, ssim_3d,
+                              ssim_3d_absolute, ssim_map)
 
-BEST = {psnr_2d_r2: np.inf, psnr_2d: np.inf, psnr_3d: np.inf, ssim_2d: 1., ssim_2d_absolute: 1., ssim_3d: 1.}
+BEST = {psnr_2d_r2: np.inf, psnr_2d: np.inf, psnr_3d: np.inf, psnr_3d_absolute: np.inf, ssim_2d: 1., ssim_2d_absolute: 1.,
+        ssim_3d: 1., ssim_3d_absolute: 1.}
 ALL = list(BEST)
 
 
@@ -86,9 +88,26 @@ def test_3d_measures(pair):
     assert psnr_3d(2 * volume, 2 * truth) == pytest.approx(psnr_3d(volume, truth) - 20 * np.log10(2))
 
 
+def test_absolute_3d_measures_against_scikit_image():
+    rng = np.random.default_rng(4)
+    truth = .02 * rng.random((13, 17, 15))
+    volume = truth + rng.normal(0, .001, truth.shape)
+    assert psnr_3d_absolute(volume, truth) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=truth.max()))
+    assert psnr_3d_absolute(volume, truth, .1) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=.1))
+    for peak in (None, .1):
+        # Scikit-image continues by mirroring; what it finds inside a border of zeros is continued by zeros.
+        scale = peak or truth.max()
+        padded = reference_ssim(*(np.pad(x / scale, 10) for x in (volume, truth)))[10:-10, 10:-10, 10:-10]
+        assert ssim_3d_absolute(volume, truth, peak) == pytest.approx(padded.mean(), rel=1e-10)
+    for measure in psnr_3d_absolute, ssim_3d_absolute:
+        assert measure(50 * volume, 50 * truth) == pytest.approx(measure(volume, truth))
+        assert measure(1.25 * volume, truth) < measure(volume, truth)
+
+
 def test_a_fan_beam_slice_is_measured_in_its_plane(pair):
     a, b = pair[0][1], pair[1][1]
     assert ssim_3d(a[:, :, None], b[:, :, None]) == pytest.approx(ssim_map(a, b).mean())
+    assert ssim_3d_absolute(a[:, :, None], b[:, :, None], 1.) == pytest.approx(ssim_map(a, b).mean())
 
 
 @pytest.mark.parametrize('measure', ALL)
@@ -135,7 +154,7 @@ def test_bad_input(measure, pair):
         measure(a[0], b[0])
 
 
-@pytest.mark.parametrize('measure', [psnr_2d, ssim_2d_absolute])
+@pytest.mark.parametrize('measure', [psnr_2d, ssim_2d_absolute, psnr_3d_absolute, ssim_3d_absolute])
 def test_bad_peak(measure, pair):
     for peak in (0, -1, np.nan):
         with pytest.raises(InputError, match='peak'):
