@@ -20,15 +20,16 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
      * - accuracy
        - |string|
-       - A preset of the cut-off, with these relative L2 errors and times (docs/accuracy.md says of what, and why):
+       - A preset of the cut-off, with these relative L2 errors and times relative to the default's, of an image and with
+         its derivatives (docs/accuracy.md says of what, and why):
 
-         =============  =======  ========  =================  =============
-         preset         extent   image     worst derivative   relative time
-         =============  =======  ========  =================  =============
-         `draft`        3        6e-3      5e-2               0.7
-         `default`      5        2e-6      4e-5               1
-         `reference`    7        1e-7      2e-7               1.4
-         =============  =======  ========  =================  =============
+         =============  =======  ========  =================  ======  ==============
+         preset         extent   image     worst derivative   time    with gradients
+         =============  =======  ========  =================  ======  ==============
+         `draft`        3        6e-03     5e-02              0.6     0.6
+         `default`      5        2e-06     4e-05              1.0     1.0
+         `reference`    7        1e-07     2e-07              1.5     1.4
+         =============  =======  ========  =================  ======  ==============
 
          (Default: `default`)
      * - extent

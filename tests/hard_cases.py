@@ -427,7 +427,7 @@ def _numbers():
     cloud = random_cloud(np.random.default_rng(6), 1, spread=.1, size=.1)
     yield Case('1 million coincident Gaussians', cloud, frames, shape, image=3e-6, copies=1_000_000, note=note)
     cloud = random_cloud(np.random.default_rng(6), 1_000_000, size=.005)
-    yield Case('1 million Gaussians', cloud, *scanner(shape=(3, 3)), image=5e-6, note=note)
+    yield Case('1 million Gaussians', cloud, *scanner(shape=(3, 3)), image=2e-6, note=note)
 
 
 def _geometries():

@@ -251,6 +251,21 @@ def test_tables_find_their_place():
         insert(text, dict(y=''))
 
 
+def test_presets_are_described_as_measured(variant):
+    """The plugin's docstring gives, rounded, what the table in the documentation says."""
+    text = (ROOT / 'docs' / 'accuracy.md').read_text(encoding='utf-8')
+    rows = text.split('<!-- table presets -->\n')[1].split('<!-- end presets -->')[0].splitlines()[2:]
+    measured = {}
+    for row in rows:
+        name, extent, image, *derivatives, forward, gradients = (cell.strip(' `') for cell in row.strip('|').split('|'))
+        measured[name] = [extent, *(f'{x:.0e}' for x in (float(image), max(map(float, derivatives)))),
+                          *(f'{float(x):.1f}' for x in (forward, gradients))]
+    words = type(mi.load_dict(dict(type='lingo_xray'))).__doc__.splitlines()
+    described = {line.split()[0].strip('`'): line.split()[1:] for line in words if line.split()[:1] and
+                 line.split()[0].strip('`') in PRESETS and len(line.split()) == 6}
+    assert described == measured and list(measured) == list(PRESETS)
+
+
 def test_whole_measurement(tmp_path):
     """Every part on a tiny configuration, down to the documentation."""
     parts = []
