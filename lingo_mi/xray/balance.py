@@ -13,6 +13,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .depth import scattered
+
 LANES = 8    # rows that a team works on side by side
 PACKET = 4   # consecutive elements that a lane reads and writes at a time
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
@@ -47,8 +49,7 @@ class Work:
         float64.
         """
         if parts > 1:
-            # By a hash (Knuth's): clouds may be periodic.
-            which, total = dr.arange(mi.UInt32, self.count) * 2654435761 // 65536 % dr.opaque(mi.UInt32, parts), 0
+            which, total = scattered(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
             for part in range(parts):
                 some = Work(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
                 total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
