@@ -1,7 +1,7 @@
 """The paper's tables as cells: fits of sparse scans and reconstructions from completed ones, each stored when it is done.
 
 A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written in one piece, below a
-folder that names its recipe and a hash of every setting: a cell that exists is not computed again, one of other settings is
+folder that names its recipe and a hash of every setting: a cell that is whole is not computed again, one of other settings is
 another cell. A fit keeps its checkpoint beside it, from which it goes on after an interruption, from which the next longer fit
 of the same recipe begins, and from which the views missing to a CT volume are rendered.
 
@@ -45,6 +45,7 @@ from .scanning import choose_views
 PHANTOMS = 'foot', 'chest'
 VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
+NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # numbers of a fit's views; of a volume
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
@@ -181,9 +182,13 @@ class Cells:
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
 
     def get(self, cell: Fit | Volume) -> dict | None:
-        """The numbers of a cell, or None where it has not been computed."""
-        path = self.path(cell)
-        return json.loads(path.read_text(encoding='utf-8')) if path.exists() else None
+        """The numbers of a cell, or None where it has not been computed, or its file is damaged or lacks a number."""
+        try:
+            found = json.loads(self.path(cell).read_text(encoding='utf-8'))
+        except (FileNotFoundError, ValueError):
+            return None
+        needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
+        return found if isinstance(found, dict) and found.keys() >= set(needed) else None
 
     def compute(self, cell: Fit | Volume, label: str) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.

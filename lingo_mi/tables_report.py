@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .files.paths import replacing
-from .tables import ALGORITHMS, Cells, Fit, Volume, settings_of
+from .tables import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume, settings_of
 
 TABLES = 'views', 'ct', 'ablation'
 TITLES = dict(views='New views (Table 1 of the paper)', ct='CT reconstruction in two stages (Table 2 of the paper)',
@@ -29,7 +29,6 @@ NOTES = dict(
     ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
              f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}')
 SECOND = dict(views='iterations', ct='algorithm', ablation='scale, start, voxels')
-NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')
 
 # Gradient scaling, latent initialisation and voxel scaling, each with (+) or without (-).
 ABLATION = {'- - -': 'r2', '+ - -': 'r2:loss_scale=dynamic', '- + -': 'lingo:loss_scale=none,V_S=1', '+ + -': 'lingo:V_S=1',
@@ -201,7 +200,7 @@ def write(table: str, table_groups: list[Group], objects, cells: Cells, name: st
     """
     rows = results(table_groups, objects, cells)
     planned = plan(table_groups, objects)
-    done = sum(cells.path(cell).exists() for cell in planned)
+    done = sum(cells.get(cell) is not None for cell in planned)
     scale = cells.scale
     text = (f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side, {scale.pixels} x '
             f'{scale.pixels} pixels, {scale.n_points:,} Gaussians to start with; seed {cells.seed}; {done} of {len(planned)} '

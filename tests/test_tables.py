@@ -64,6 +64,19 @@ def test_a_cell_that_exists_is_not_computed_again(out):
     assert code == 0 and '1 of 1 cells' in text
 
 
+@pytest.mark.parametrize('content', [b'', b'{}', b'[]', b'{"psnr_2d_r2": 3', b'\xff'])
+def test_a_damaged_cell_is_computed_again(out, content):
+    arguments = 'views', out, '--views', '3', '--iterations', '5', '--methods', 'r2'
+    assert script(*arguments)[0] == 0
+    cells, cell = Cells(out, TINY), Fit('foot', 3, 'r2', 5)
+    before = cells.get(cell)
+    cells.path(cell).write_bytes(content)
+    assert cells.get(cell) is None
+    code, text, err = script(*arguments)
+    assert code == 0 and '1 of 1 cells' in text, err
+    assert numbers(cells.get(cell)) == pytest.approx(numbers(before))
+
+
 def test_two_stages(out):
     code, text, err = script('ct', out, '--views', '4', '--iterations', '20', '--methods', 'r2')
     assert code == 0, err
