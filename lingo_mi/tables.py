@@ -14,6 +14,7 @@ import functools
 import hashlib
 import json
 import os
+import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from .cli import between_steps
 from .errors import InputError
 from .files.paths import replacing
 from .files.volumes import read_volume
+from .fit import checkpoint
 from .fit.device import DeviceState
 from .fit.initial import initial_cloud
 from .fit.loop import extensible, run
@@ -214,33 +216,38 @@ class Cells:
         return choose_views(self.dataset(fit.object), fit.views)
 
     def _fit(self, cell: Fit, path: Path, label: str) -> dict:
-        dataset, settings, checkpoint = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
-        self._begin(settings, checkpoint)
-        cloud = None if checkpoint.exists() else initial_cloud(dataset.train, settings, self.seed)
+        dataset, settings, saved = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
+        if (path.exists() or saved.exists()) and _iterations(saved) is None:
+            print(f'{saved}: is missing or damaged, so {cell} is fitted again', file=sys.stderr)
+        self._begin(settings, saved)
+        cloud = initial_cloud(dataset.train, settings, self.seed) if _iterations(saved) is None else None
         with Progress(label, settings.iterations) as bar, between_steps() as check:
             def progress(iteration, **fields):
                 bar.update(iteration, **fields)
                 check()
-            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, checkpoint, cloud is None)
+            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved, cloud is None)
         state = DeviceState(fitted.state)
         rendered = fitted.stepper.render(state, dataset.test.geometry)
         found = measure(fitted, dataset, fitted.stepper.volume(state), rendered)
         return found | dict(method=cell.method, settings=asdict(settings), initial=fitted.info)
 
-    def _begin(self, settings, checkpoint: Path):
-        """Where there is no checkpoint yet, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
-        if checkpoint.exists() or not extensible(settings):
+    def _begin(self, settings, saved: Path):
+        """Without a whole checkpoint, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
+        if not extensible(settings) or _iterations(saved) is not None:
             return
-        done = [int(path.parent.name) for path in checkpoint.parents[1].glob('*/fit.json')]
-        shorter = max((n for n in done if n < settings.iterations), default=None)
-        if shorter is not None:
-            with replacing(checkpoint) as temporary:
-                temporary.write_bytes((checkpoint.parents[1] / str(shorter) / CHECKPOINT).read_bytes())
+        done = sorted(int(path.parent.name) for path in saved.parents[1].glob('*/fit.json'))
+        shorter = [saved.parents[1] / str(n) / CHECKPOINT for n in done if n < settings.iterations]
+        whole = next((path for path in reversed(shorter) if _iterations(path) is not None), None)
+        if whole is not None:
+            with replacing(saved) as temporary:
+                temporary.write_bytes(whole.read_bytes())
 
     def _cloud(self, fit: Fit):
-        """A stored fit's stepper, and its state on the device."""
-        fitted = run(self._measured(fit).train, recipe(fit, self.scale), None, self.seed,
-                     path=self.path(fit).with_name(CHECKPOINT), resume=True)
+        """A stored fit's stepper, and its state on the device; without its whole checkpoint, it is fitted again."""
+        settings, saved = recipe(fit, self.scale), self.path(fit).with_name(CHECKPOINT)
+        if _iterations(saved) != settings.iterations:  # fewer where fitting it again was interrupted
+            self.compute(fit, f'{fit}, again')
+        fitted = run(self._measured(fit).train, settings, None, self.seed, path=saved, resume=True)
         return fitted.stepper, DeviceState(fitted.state)
 
     def _completed(self, fit: Fit) -> Scan:
@@ -267,6 +274,14 @@ class Cells:
         volume = result if isinstance(result, np.ndarray) else result.volume
         return dict(algorithm=cell.algorithm, options=ALGORITHMS[cell.algorithm][1], method=cell.fit.method, seconds=seconds,
                     psnr_3d=metrics.psnr_3d(volume, dataset.volume), ssim_3d=metrics.ssim_3d(volume, dataset.volume))
+
+
+def _iterations(path: Path) -> int | None:
+    """How far the fit of a checkpoint has come, or None where the file is missing or damaged."""
+    try:
+        return checkpoint.load(path)[1].get('iteration')
+    except InputError:
+        return None
 
 
 def _hash(values: dict) -> str:

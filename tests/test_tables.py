@@ -155,6 +155,32 @@ def test_an_interrupted_fit_goes_on(tmp_path):
     assert numbers(resumed) == pytest.approx(numbers(whole.compute(fit, 'fit')))
 
 
+@pytest.mark.parametrize('content', [None, b'', b'PK'])
+def test_a_fit_without_its_checkpoint_is_fitted_again(tmp_path, content):
+    """Where a volume needs its cloud, or a longer fit would go on from it; what is stored stays."""
+    arguments = '--views', '4', '--methods', 'r2'
+    assert script('views', tmp_path, *arguments, '--iterations', '10')[0] == 0
+    cells, fit = Cells(tmp_path, TINY), Fit('foot', 4, 'r2', 10)
+    before, saved = cells.get(fit), cells.path(fit).with_name('checkpoint.npz')
+
+    def spoil():
+        saved.unlink() if content is None else saved.write_bytes(content)
+    spoil()
+    assert script('views', tmp_path, *arguments, '--iterations', '10', '20')[0] == 0
+    code, text, err = script('ct', tmp_path, *arguments, '--iterations', '10', '--algorithms', 'fdk', 'voxelize')
+    assert code == 0 and '3 of 3 cells' in text and '--resume' not in err
+    assert err.count('is missing or damaged, so foot, 4 views, r2 is fitted again\n') == 1
+    assert numbers(cells.get(fit)) == pytest.approx(numbers(before))
+    # Interrupted while it is fitted again, it goes on from there.
+    spoil()
+    cells.dataset('foot')  # its scan shows its progress, too
+    with mock.patch.object(tables.Progress, 'update', side_effect=_stop_at(7)), pytest.raises(KeyboardInterrupt):
+        cells.compute(fit, 'fit')
+    assert tables._iterations(saved) == 7 and cells.get(fit) is not None
+    cells.compute(Volume(fit, 'sart'), 'volume')
+    assert tables._iterations(saved) == 10 and numbers(cells.get(fit)) == pytest.approx(numbers(before))
+
+
 def test_a_longer_fit_goes_on_from_a_shorter_one(tmp_path):
     short, fit = Fit('foot', 4, SHORT, 10), Fit('foot', 4, SHORT, 20)
     steps, whole = Cells(tmp_path / 'a', TINY), Cells(tmp_path / 'b', TINY)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def load(path) -> tuple[State, dict, dict]:
         extra = json.loads(str(data['extra']))
     except FileNotFoundError:
         raise InputError(f'{path}: there is no checkpoint to resume from; run without --resume') from None
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, KeyError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f'{path}: this is not a checkpoint of a fit ({type(error).__name__}); remove it and start '
                          'again without --resume') from None
     return state, extra, {k[6:]: v for k, v in data.items() if k.startswith('array.')}

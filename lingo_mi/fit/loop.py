@@ -188,8 +188,7 @@ def scene_radius(geometry) -> float:
 
 def _same_fit(host, extra, settings, scan, seed, path):
     """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
-    damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again '
-                         'without --resume')
+    damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
     if not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys():
         raise damaged
     now = asdict(settings)
@@ -204,7 +203,7 @@ def _same_fit(host, extra, settings, scan, seed, path):
         changed.append('views')
     if changed:
         raise InputError(f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
-                         'settings, or start again without --resume')
+                         'settings, or remove it and start again')
     shapes = {k: (len(host), size) for k, size in parameters(settings).items()}
     if not (len(host.gradient) == len(host.seen) == len(host)
             and all({k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
