@@ -127,7 +127,7 @@ def available(names, say) -> list[str]:
 
     say   called with a line for each of VOLUMES that is missing
 
-    Raises InputError for a name that is neither.
+    Raises InputError for a name that is neither, and where no object is left.
     """
     found = []
     for name in names:
@@ -138,6 +138,8 @@ def available(names, say) -> list[str]:
         else:
             raise InputError(f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
                              'in the folder that LINGO_MI_DATA names')
+    if not found:
+        raise InputError(f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}')
     return found
 
 

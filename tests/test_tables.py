@@ -236,6 +236,14 @@ def test_volumes_are_averaged_down(tmp_path, monkeypatch):
     assert load_object('engine', 64).data.shape == data.shape
 
 
+def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
+    monkeypatch.setenv('LINGO_MI_DATA', '')
+    (tmp_path / 'views.md').write_text('kept')
+    code, _, err = run(TABLES, 'views', '--objects', 'engine', '--out', tmp_path)
+    assert code == 2 and err.startswith('error: no object is left') and err.count('\n') == 1
+    assert [p.name for p in tmp_path.iterdir()] == ['views.md'] and (tmp_path / 'views.md').read_text() == 'kept'
+
+
 def test_recipes():
     assert recipe(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
     assert recipe(Fit('foot', 5, 'fast'), TINY).iterations == tables.METHODS['fast'].iterations
