@@ -25,7 +25,7 @@ NOTES = dict(
           f'2. A recipe whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
     ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
        f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts there, with passes over all views '
-       f'and then over the measured ones. {_PAPER_IS}',
+       f'and then over the measured ones; both need densities, which `3dgs` and `xgaussian` do not have. {_PAPER_IS}',
     ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
              f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}')
 SECOND = dict(views='iterations', ct='algorithm', ablation='scale, start, voxels')
@@ -127,10 +127,10 @@ def _fit(views, method, iterations):
 
 def _volume(views, method, iterations, algorithm):
     """The cell of an object; of the volume that a fit samples itself, the fit."""
+    if algorithm in ('voxelize', 'refined') and (method == 'none' or settings_of(method).render == 'alpha'):
+        return lambda name: None  # neither measured views nor opacities are a volume to begin with
     if method == 'none':
-        return lambda name: None if algorithm in ('voxelize', 'refined') else Volume(Fit(name, views, 'none'), algorithm)
-    if algorithm == 'refined' and settings_of(method).render == 'alpha':  # opacities make no volume
-        return lambda name: None
+        return lambda name: Volume(Fit(name, views, 'none'), algorithm)
     fit = _fit(views, method, iterations)
     return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 
@@ -166,7 +166,8 @@ def results(table_groups: list[Group], objects, cells: Cells) -> list[dict]:
                 found = (cell := column.cell(name)) and cells.get(cell)
                 values[column.title] = found and {field: found[field] for field in column.fields}
             row(name, values)
-            if all(values[c.title] for c in group.columns if c.cell(name) is not None):
+            planned = [c.title for c in group.columns if c.cell(name) is not None]
+            if planned and all(values[title] for title in planned):
                 complete.append(values)
         if complete:
             row(f'mean of {len(complete)}', {c.title: complete[0][c.title] and {

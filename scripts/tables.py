@@ -63,7 +63,11 @@ def main():
     objects = available(dict.fromkeys(args.objects or (*PHANTOMS, *VOLUMES)), print)
     cells = Cells(args.out or Path('out/tables') / args.scale, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
-    missing = [cell for cell in plan(rows, objects) if cells.get(cell) is None]
+    planned = plan(rows, objects)
+    if not planned:
+        raise InputError(f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
+                         'are no densities; add other --algorithms or --methods')
+    missing = [cell for cell in planned if cells.get(cell) is None]
     failed = {}
     try:
         for i, cell in enumerate(missing, 1):

@@ -116,6 +116,17 @@ def test_the_parts_of_lingo():
         assert recipe(fit, TINY) == base.changed(**changes, V_S=20. if voxels or not start else 1.)
 
 
+def test_opacities_have_no_row_of_means(tmp_path):
+    found = groups('ct', [4], [20], ['3dgs'])
+    cells = mock.Mock(get=lambda cell: dict(psnr_3d=30., ssim_3d=.9))
+    rows = [(row['second'], row['object']) for row in results(found, ['foot'], cells)]
+    assert rows == [(a, name) for a in ('fdk', 'sart', 'asd-pocs') for name in ('foot', 'mean of 1')] + [
+        ('refined', 'foot'), ('voxelize', 'foot')]
+    code, _, err = script('ct', tmp_path / 'a', '--methods', 'xgaussian', '--algorithms', 'refined')
+    assert code == 2 and 'refined cannot make a volume of xgaussian' in err and err.count('\n') == 1
+    assert not (tmp_path / 'a').exists()
+
+
 def test_paper_beside_ours():
     found = groups('views', [5, 25], [5000, 30_000], ['r2', 'lingo', 'fast'])
     cells = mock.Mock(get=lambda cell: dict(psnr_2d_r2=30. + cell.views, ssim_2d=.9, ipsd=None))
