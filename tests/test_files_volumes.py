@@ -74,11 +74,14 @@ def test_noise_below_zero_becomes_zero_and_large_floats_are_scaled(tmp_path):
 def test_ambiguous_negative_values_ask_for_hu(tmp_path):
     for crop in (COUNTS.astype(int) - 20, COUNTS - 20., COUNTS / 60 - 0.5):
         np.save(tmp_path / 'v.npy', crop)
-        refused(tmp_path / 'v.npy', 'hu=True')
+        refused(tmp_path / 'v.npy', 'give --mu-water .*hu=True.*hu=False')
     np.save(tmp_path / 'v.npy', COUNTS.astype(int) - 20)
     np.testing.assert_allclose(read_volume(tmp_path / 'v.npy', hu=True).data, (COUNTS - 20. + 1000) / 3000,
                                rtol=1e-6)
     assert read_volume(tmp_path / 'v.npy', hu=False).data.min() == 0
+    # As --mu-water says.
+    np.testing.assert_allclose(read_volume(tmp_path / 'v.npy', mu_water=.02).data, .02 * (COUNTS - 20. + 1000) / 1000,
+                               rtol=1e-6)
     np.save(tmp_path / 'v.npy', HU)
     np.testing.assert_allclose(read_volume(tmp_path / 'v.npy', hu=False).data, np.maximum(HU, 0) / HU.max(),
                                rtol=1e-6)

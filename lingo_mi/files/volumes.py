@@ -6,9 +6,9 @@ lie in the world.
 Values become density by these rules, the first that applies:
 
 1. A NIfTI file that `write_volume` wrote is returned unchanged.
-2. Hounsfield units, recognised by a minimum of -500 or less, by DICOM or by `hu=True`: with `mu_water`
-   (1/mm), mu_water (1 + HU / 1000), not below 0, in 1/mm; without, clipped to [-1000, 2000] and mapped to
-   [0, 1] (R2-Gaussian's rule).
+2. Hounsfield units, recognised by a minimum of -500 or less, by DICOM or by `hu=True`, and taken for granted
+   with `mu_water` where rule 3 would refuse negative values: with `mu_water` (1/mm), mu_water (1 + HU / 1000),
+   not below 0, in 1/mm; without, clipped to [-1000, 2000] and mapped to [0, 1] (R2-Gaussian's rule).
 3. Anything else is a density: float values up to 1 stay; others are divided by their maximum. Negative
    fractions down to -10 % of the maximum are the noise of a reconstruction and become 0; other negative
    values are refused as ambiguous, unless `hu=False` says that they are to become 0 too.
@@ -75,16 +75,19 @@ def _density(data, path, hu, mu_water):
         hu = low <= -500
         # Whole numbers are looked for in the values: a header's slope makes floats of integers.
         if not hu and low < 0 and (low < -0.1 * high or not (data != np.round(data)).any()):
-            raise InputError(f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
-                             'or not; say which with hu=True or hu=False')
+            if mu_water is None:
+                raise InputError(f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
+                                 'or not; if they are, give --mu-water (in scenes and Python mu_water), else set '
+                                 'them to 0; in Python, hu=True or hu=False says which')
+            hu = True
     if hu:
         data = data.astype(np.float32)
         if mu_water is not None:
             return np.maximum((data + 1000) * np.float32(mu_water / 1000), 0), '1/mm'
         return (np.clip(data, -1000, 2000) + 1000) / 3000, 'normalised'
     if mu_water is not None:
-        raise InputError(f'{path}: mu_water was given, but the values ({low:g} to {high:g}) do not look like '
-                         'Hounsfield units; leave mu_water out, or say hu=True')
+        raise InputError(f'{path}: --mu-water (mu_water) was given, but the values ({low:g} to {high:g}) do not '
+                         'look like Hounsfield units; leave it out, or in Python say hu=True')
     if not high > 0:
         raise InputError(f'{path}: the volume is empty: no value is above 0')
     keep = data.dtype.kind == 'f' and high <= 1
