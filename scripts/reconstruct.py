@@ -41,6 +41,8 @@ def arguments():
     p.add_argument('--start', metavar='F', help='result.xml of a fit, whose volume an iterative algorithm starts from')
     p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
+    p.add_argument('--seed', type=int, metavar='N', help="of a simulated detector's noise (default: 0; with --complete and "
+                   '--start that of the fit)')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument('-D', dest='define', action='append', default=[], metavar='NAME=VALUE',
                    help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of '
@@ -91,10 +93,12 @@ def main():
     from lingo_mi.recon.fdk import fdk
     from lingo_mi.recon.refined import refined
     from lingo_mi.recon.sart import os_sart, sart, sirt
-    from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, without_effects
+    from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, without_effects
     from lingo_mi.scanning import defaults, load_scene, voxelize_cloud
 
     check_input(args)
+    if args.seed is not None and args.seed < 0:
+        raise InputError(f'--seed must not be negative, but is {args.seed}')
     from_cloud = args.algorithm in ('refined', 'voxelize')
     if from_cloud and not args.complete:
         raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete')
@@ -116,7 +120,8 @@ def main():
     if (from_cloud or args.start) and not hasattr(cloud, 'gaussians'):
         raise InputError(f'{args.complete or args.start}: opacities and radiances make no volume; '
                          + ('leave out --start' if args.start else 'take another --algorithm'))
-    dataset = read_input(args, scene, 0 if args.complete else args.views)
+    seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
+    dataset = read_input(args, scene, 0 if args.complete else args.views, seed or 0)
     scan = dataset.train
     began = time.monotonic()
     if args.algorithm == 'voxelize':
@@ -124,12 +129,15 @@ def main():
     else:
         if args.complete:
             measured = fitted_views(dataset, cloud.geometry)
+            if args.algorithm == 'fdk' and cloud.corrected.poses is not None and measured.geometry.poses is None:
+                raise InputError('filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
+                                 'take another --algorithm')
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
                 given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent))
                 scan = scan.subset(np.arange(len(measured)))
         elif args.start:
-            scan = without_effects(fitted_views(dataset, cloud.geometry), cloud)
+            scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
             given['init'] = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)

@@ -19,8 +19,9 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import sart
-from lingo_mi.recon.two_stage import complete, fitted_views, load_cloud, missing_angles, without_effects
+from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, missing_angles, without_effects
 from lingo_mi.results import write_scene
+from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scanning import load_scene, render_objects, take_scan, voxelize_cloud
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
@@ -189,7 +190,7 @@ def test_missing_angles(dataset):
     (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),
-    (['--algorithm', 'art'], 'art'), (['--projections', 'no.npy'], 'no.npy')])
+    (['--algorithm', 'art'], 'art'), (['--seed', '-1'], '--seed'), (['--projections', 'no.npy'], 'no.npy')])
 def test_bad_input_is_one_line(scene, tmp_path, args, message):
     out = [] if '--out' in args else ['--out', tmp_path / 'new' / 'v.nii.gz']
     code, _, err = run(RECONSTRUCT, scene, *args, *out)
@@ -212,3 +213,94 @@ def test_a_cloud_of_other_views_or_no_cloud(scene, fitted, tmp_path):
     assert code == 2 and 'fitted to 4 views' in err
     code, _, err = run(RECONSTRUCT, scene, '--complete', scene, '--views', '9', '--out', out)
     assert code == 2 and 'no cloud' in err and not out.exists()
+
+
+# ---- which views a cloud was fitted to ---------------------------------------------------------------------------------
+
+QUICK = '--iterations', '20', '-D', 'n_points=200'
+
+
+def changed_scene(folder, *pairs):
+    """The tiny scene with some of its lines replaced."""
+    text = SCENE
+    for old, new in pairs:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / 'scene.xml').write_text(text)
+    return folder / 'scene.xml'
+
+
+def test_a_helix_comes_back_to_its_angles(tmp_path):
+    """At another height: the views of two turns are told by their rays, each is taken once and in its place."""
+    path = changed_scene(tmp_path, ('"views" value="$views"/>', '"views" value="$views"/> <float name="pitch" value="4"/>'
+                                    '<float name="startAngle" value="-360"/> <float name="totalAngle" value="720"/>'))
+    code, _, err = fit(path, *QUICK, '--views', '4', '--out', tmp_path / 'fit')
+    assert code == 0, err
+    dataset, cloud = take_scan(load_scene(path)), load_cloud(tmp_path / 'fit' / 'result.xml')
+    assert len(np.unique(np.round(np.mod(cloud.geometry.angles + 1e-6, 2 * np.pi), 4))) == 2
+    np.testing.assert_array_equal(fitted_views(dataset, cloud.geometry).projections, dataset.train.projections[::2])
+    mixed = dataset.train.geometry.subset([5, 1, 6])
+    np.testing.assert_array_equal(fitted_views(dataset, mixed).projections, dataset.train.projections[[5, 1, 6]])
+
+
+def test_views_that_repeat_each_other(dataset):
+    """Each is taken once; those that fit.py chooses, where these are of the right rays."""
+    geometry = dataset.train.geometry
+    twice = Dataset(Scan(geometry.joined(geometry), np.arange(16.)[:, None, None] * np.ones((1, *geometry.nDetector))))
+
+    def found(views):
+        return fitted_views(twice, geometry.joined(geometry).subset(views)).projections[:, 0, 0].tolist()
+    assert found([0, 3, 6, 9, 12]) == [0, 3, 6, 9, 12] and found([3, 11, 4]) == [3, 11, 4]
+    with pytest.raises(InputError, match='not all of which'):
+        found([3, 3, 3])
+
+
+def test_corrected_poses(scene, tmp_path):
+    """A fit that corrects poses knows its measured views still; they are used where it has put them."""
+    path = tmp_path / 'fit' / 'result.xml'
+    code, _, err = fit(scene, *QUICK, '--views', '4', '-D', 'rate_pose=2e-2,2e-3', '--out', path.parent)
+    assert code == 0, err
+    dataset, cloud = take_scan(load_scene(scene)), load_cloud(path)
+    geometry = dataset.train.geometry
+    assert cloud.geometry.poses is None and cloud.corrected.poses is not None
+    np.testing.assert_allclose(cloud.geometry.frames().source, geometry.frames().source[::2], atol=1e-4)
+    measured = fitted_views(dataset, cloud.geometry)
+    np.testing.assert_array_equal(measured.projections, dataset.train.projections[::2])
+    whole = complete(measured, cloud, 8)
+    np.testing.assert_allclose(whole.geometry.frames().corner[:4], cloud.corrected.frames().corner)
+    np.testing.assert_allclose(whole.geometry.frames().corner[4:], geometry.frames().corner[1::2], atol=1e-9)
+    out = '--out', tmp_path / 'v.nii', '--force'
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=2', '--start', path, *out)
+    assert code == 0 and 'of 4 views' in text, err
+    own = voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(as_corrected(measured, cloud), 2, init=own).volume)
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', '--complete', path, '--views', 8, *out)
+    assert code == 0, err
+    code, _, err = run(RECONSTRUCT, scene, '--complete', path, '--views', 8, *out)
+    assert code == 2 and 'corrected the poses' in err
+    (path.parent / 'metrics.json').write_text('{"pose_turns_degrees": [[0, 0, 0]]}')
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '--start', path, *out)
+    assert code == 2 and 'of another fit' in err
+
+
+def test_the_noise_is_that_of_the_fit(tmp_path):
+    film = '<film type="ct_detector"><float name="photons" value="1e3"/></film>'
+    path = changed_scene(tmp_path, ('<string name="nDetector" value="32, 40"/>', '<string name="nDetector" value="32, 40"/>' + film),
+                         ('value="24"/>\n            <tr', 'value="24"/> <float name="scale" value="0.05"/>\n            <tr'))
+    code, _, err = fit(path, *QUICK, '--views', '4', '--seed', '3', '--out', tmp_path / 'fit')
+    assert code == 0, err
+    cloud = load_cloud(tmp_path / 'fit' / 'result.xml')
+    assert cloud.seed == 3
+
+    def volume(*args):
+        code, _, err = run(RECONSTRUCT, path, '--algorithm', 'sart', '-D', 'niter=1', '--out', tmp_path / 'v.nii', '--force', *args)
+        assert code == 0, err
+        return load(tmp_path / 'v.nii')
+
+    def expected(seed):
+        scan = fitted_views(take_scan(load_scene(path), seed=seed), cloud.geometry)
+        return sart(without_effects(scan, cloud), 1, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)).volume
+    start = '--start', tmp_path / 'fit' / 'result.xml'
+    np.testing.assert_array_equal(volume(*start), expected(3))
+    np.testing.assert_array_equal(volume(*start, '--seed', 1), expected(1))
+    assert np.abs(volume('--seed', 1) - volume()).max() > 0

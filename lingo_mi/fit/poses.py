@@ -12,11 +12,14 @@ shift of the views are taken off.
 """
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..frames import Frames
+from ..geometry import Geometry
 from ..xray.frame import vector64
 
 _NAMES = ('source', 'corner', 'u', 'v')
@@ -50,6 +53,20 @@ class Poses:
         own [1]."""
         chosen = slice(None) if view is None else [view]
         return frames.moved(Rotation.from_rotvec(self.turn[chosen]).as_matrix(), self.shift[chosen])
+
+    def corrected(self, geometry: Geometry) -> Geometry:
+        """A scan's geometry, in mm, with its views as corrected."""
+        g, centre = geometry, np.array(geometry.offOrigin)
+        f = self.correct(g.normalised_frames())
+        source = f.source if f.parallel else f.source / g.scale + centre
+        frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
+        return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+
+    def undone(self) -> Poses:
+        """What takes corrected views back to where they were."""
+        back = Poses(len(self.turn))
+        back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
+        return back
 
     def step(self, view: int, frames: Frames, gradient: dict, rate: float, settings):
         """Move a view by one Adam step, then take off the mean motion of all.

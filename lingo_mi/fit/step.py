@@ -124,13 +124,7 @@ class Stepper:
 
     def corrected(self) -> Geometry:
         """The scan's geometry with its views where the fit has put them: as given, where it left them alone."""
-        g = self.geometry
-        if self.poses is None:
-            return g
-        f, centre = self.poses.correct(g.normalised_frames()), np.array(g.offOrigin)
-        source = f.source if f.parallel else f.source / g.scale + centre
-        frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
-        return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+        return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
         """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of

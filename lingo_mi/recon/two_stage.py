@@ -1,6 +1,7 @@
 """The two-stage way: views that were not measured are rendered from a fitted cloud, then a volume is made of all of them."""
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from ..effects.forward import Effects, find_effects
 from ..errors import InputError
 from ..fit import checkpoint
 from ..fit.device import DeviceState
+from ..fit.poses import Poses
 from ..fit.settings import Settings
 from ..fit.state import State
 from ..fit.step import Stepper
-from ..geometry import Geometry
+from ..geometry import Geometry, spread
+from ..results import METRICS
 from ..scan import Dataset, Scan
 from ..scanning import load_scene, render_objects
 from ..xray.objects import Ellipsoids, find_objects
@@ -31,14 +34,18 @@ class FittedCloud:
 
     gaussians   densities in 1/mm
     geometry    of the scan that it was fitted to
+    corrected   the same with its views where the fit has put them: `geometry` itself, where it left them alone
     extent      cut-off in standard deviations
     effects     that the fit has modelled; None where it took the projections for line integrals
+    seed        of the fit, and of the noise that it has seen in a simulated scan; None where that is not known
     """
 
     gaussians: Ellipsoids
     geometry: Geometry
+    corrected: Geometry
     extent: float
     effects: Effects | None
+    seed: int | None
 
     def render(self, geometry: Geometry) -> np.ndarray:
         """Line integrals in any views, float32 [view, v, u]."""
@@ -49,15 +56,18 @@ class FittedCloud:
 class CompositedCloud:
     """A cloud as a fit by alpha compositing left it, which no scene renders.
 
-    state, settings   of the fit
-    geometry          of the scan that it was fitted to
-    unit              what the fit counts as 1 (`fit.step.density_unit`)
+    state, settings       of the fit
+    geometry, corrected   as of a `FittedCloud`
+    unit                  what the fit counts as 1 (`fit.step.density_unit`)
+    seed                  of the fit
     """
 
     state: State
     settings: Settings
     geometry: Geometry
+    corrected: Geometry
     unit: float
+    seed: int
     effects = None
 
     def render(self, geometry: Geometry) -> np.ndarray:
@@ -78,30 +88,93 @@ def load_cloud(path) -> FittedCloud | CompositedCloud:
     quality = getattr(loaded.scene.integrator(), 'quality', None)
     if quality is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
         raise InputError(f'{path}: is no cloud of Gaussians; {WANTED}')
-    return FittedCloud(objects[0], loaded.scanner.geometry, quality.extent, find_effects(loaded.scene, loaded.scanner))
+    corrected, record = loaded.scanner.geometry, _record(path)
+    return FittedCloud(objects[0], _as_given(corrected, record, path), corrected, quality.extent,
+                       find_effects(loaded.scene, loaded.scanner), record.get('seed'))
+
+
+def _record(path) -> dict:
+    """What the fit has noted beside its result.xml; nothing where there is no such file."""
+    file = Path(path).with_name(METRICS)
+    if not file.exists():
+        return {}
+    try:
+        record = json.loads(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise InputError(f'{file}: cannot be read ({type(error).__name__}); fit again, or remove it') from None
+    return record if isinstance(record, dict) else {}
+
+
+def _as_given(geometry: Geometry, record: dict, path) -> Geometry:
+    """The geometry that the fit was given, from the corrected one of its result.xml."""
+    if 'pose_turns_degrees' not in record:
+        return geometry
+    poses = Poses(len(geometry))
+    try:
+        turn, shift = (np.array(record[name], float) for name in ('pose_turns_degrees', 'pose_shifts_mm'))
+    except (KeyError, TypeError, ValueError):
+        turn = shift = np.empty(0)
+    if turn.shape != poses.turn.shape or shift.shape != poses.shift.shape:
+        raise InputError(f'{path}: the poses in the {METRICS} beside it are of another fit')
+    poses.turn, poses.shift = np.radians(turn), shift * geometry.scale
+    return poses.undone().corrected(geometry)
 
 
 def _composited(path):
     if not Path(path).exists():
         raise InputError(f'{path}: no such file; {WANTED}')
-    state, extra, _ = checkpoint.load(path)
+    state, extra, arrays = checkpoint.load(path)
     if extra.get('settings', {}).get('render') != 'alpha':
         raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
     settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()})
-    return CompositedCloud(state, settings, mi.load_dict(extra['scanner']).geometry, extra['unit'])
+    geometry = corrected = mi.load_dict(extra['scanner']).geometry
+    if max(settings.rate_pose) > 0:
+        poses = Poses(len(geometry))
+        poses.restore(arrays)
+        corrected = poses.corrected(geometry)
+    return CompositedCloud(state, settings, geometry, corrected, extra['unit'], extra['seed'])
 
 
 def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
-    """The measured views of a data set at the angles of `geometry`, to 1e-5 radians.
+    """The measured views of a data set whose rays are those of `geometry`, in its order, to a hundredth of a pixel.
 
-    Raises InputError where one of them is missing.
+    Angles do not tell views: a helix comes back to them at other heights. Where views repeat each other, they are those that
+    fit.py chooses, else the first of them that are left. Raises InputError where a view is missing.
     """
-    turn = np.exp(1j * dataset.train.geometry.angles)
-    distance = np.abs(np.exp(1j * geometry.angles)[:, None] - turn)
-    if len(dataset.train) < len(geometry) or distance.min(1).max() > 1e-5:
-        raise InputError(f'the cloud was fitted to {len(geometry)} views, not all of which are among the '
-                         f'{len(dataset.train)} of this scan: give the scan that it was fitted to')
-    return dataset.train.subset(np.sort(distance.argmin(1)))
+    scan = dataset.train
+    reach = np.linalg.norm(scan.geometry.frames().corner, axis=1).max()
+    there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
+    allowed = .01 * min(scan.geometry.dDetector)
+    missing = InputError(f'the cloud was fitted to {len(geometry)} views, not all of which are among the '
+                         f'{len(scan)} of this scan: give the scan that it was fitted to')
+    if len(scan) < len(geometry) or scan.geometry.mode != geometry.mode:
+        raise missing
+    chosen = spread(len(scan), len(geometry))
+    if np.abs(there[chosen] - wanted).max() > allowed:
+        left = np.ones(len(scan), bool)
+        for i, view in enumerate(wanted):
+            same = left & (np.abs(there - view).max(1) <= allowed)
+            if not same.any():
+                raise missing
+            chosen[i] = np.argmax(same)
+            left[chosen[i]] = False
+    return scan.subset(chosen)
+
+
+def _corners(geometry: Geometry, reach: float) -> np.ndarray:
+    """What tells views apart, [view, 12] in mm: the source, or how far a beam goes sideways in `reach`, and three corners of
+    the panel."""
+    f, (rows, columns) = geometry.frames(), geometry.nDetector
+    source = f.source * reach if f.parallel else f.source
+    return np.concatenate([source, f.corner, f.corner + columns * f.u, f.corner + rows * f.v], 1)
+
+
+def as_corrected(scan: Scan, cloud: FittedCloud | CompositedCloud) -> Scan:
+    """The `fitted_views` with their poses as the fit has corrected them; as they are, where it left them alone."""
+    if cloud.corrected is cloud.geometry:
+        return scan
+    g = scan.geometry
+    return replace(scan, geometry=replace(cloud.corrected, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin))
 
 
 def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
@@ -123,24 +196,26 @@ def without_effects(scan: Scan, cloud: FittedCloud | CompositedCloud) -> Scan:
 
 
 def complete(scan: Scan, cloud: FittedCloud | CompositedCloud, views: int) -> Scan:
-    """A scan of `views` views: the measured ones, `without_effects`, and those between them rendered from the cloud.
+    """A scan of `views` views: the measured ones, `as_corrected` and `without_effects`, and those between them rendered from
+    the cloud.
 
     Raises InputError where fewer views are asked for than were measured, and for a scan that is no circle about z.
     """
     require_circle(scan, 'the completion of a scan')
-    return filled(without_effects(scan, cloud), views, cloud.render)
+    return filled(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
 
 
-def filled(scan: Scan, views: int, render) -> Scan:
+def filled(scan: Scan, views: int, render, circle: Geometry | None = None) -> Scan:
     """A scan of `views` views: the given ones and those between them, by `render`, a function of their geometry.
+
+    circle   where the views should be, if a fit has found them to be beside it (default: where they are)
 
     Raises InputError where fewer views are asked for than are given.
     """
-    geometry = scan.geometry
+    geometry = circle or scan.geometry
     if views < len(scan):
         raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
     if views == len(scan):
         return scan
     rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
-    both = replace(geometry, angles=np.concatenate([geometry.angles, rendered.angles]))
-    return Scan(both, np.concatenate([scan.projections, render(rendered)]))
+    return Scan(scan.geometry.joined(rendered), np.concatenate([scan.projections, render(rendered)]))
