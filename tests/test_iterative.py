@@ -1,4 +1,6 @@
 """SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, the analytic ball, bad input."""
+import inspect
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,6 +15,7 @@ from lingo_mi.geometry import Geometry, circular
 from lingo_mi.recon.asd_pocs import asd_pocs, tv_gradient
 from lingo_mi.recon.cgls import cgls
 from lingo_mi.recon.fdk import fdk
+from lingo_mi.recon.refined import refined
 from lingo_mi.recon.sart import blocks, os_sart, sart, sirt
 from lingo_mi.recon.two_stage import complete
 from lingo_mi.scan import Scan
@@ -209,9 +212,27 @@ def test_bad_input(name):
     if name == 'asd_pocs':
         with pytest.raises(InputError, match='exact_every'):
             run(scan, exact_every=-1)
+    for parameter, values in (('seed', (-1,)), ('tol', (np.nan, -1., np.inf)), ('maxl2err', (np.nan, -1., np.inf)),
+                              ('alpha', (np.nan, 0., np.inf, 1e30)), ('rmax', (np.inf,)), ('niter', (np.inf, np.nan))):
+        for value in values if parameter in inspect.signature(run).parameters else ():
+            with pytest.raises(InputError, match=f'{parameter} must be'):
+                run(scan, **{parameter: value})
     calls = []
     run(scan, niter=2, progress=lambda *a: calls.append(a))
     assert [c[:2] for c in calls] == [(1, 2), (2, 2)] and all(np.isfinite(c[2]) for c in calls)
+
+
+@pytest.mark.parametrize('run', [sart, cgls, asd_pocs])
+def test_what_is_not_finite_is_no_result(run):
+    with pytest.raises(InputError, match='not finite'):
+        run(Scan(small(n=2), np.full((2, 17, 21), 1e25)))
+
+
+@pytest.mark.parametrize('wrong', [dict(alpha=np.inf), dict(seed=-1), dict(maxl2err=np.nan), dict(exact_every=-1)])
+def test_refined_checks_before_its_passes(wrong):
+    scan = Scan(small(n=2), np.ones((2, 17, 21)))
+    with pytest.raises(InputError, match=f'{next(iter(wrong))} must be'):
+        refined(scan, completed=scan, init=None, progress=lambda *_: pytest.fail('has begun'), **wrong)
 
 
 def test_no_kernel_is_compiled_after_the_first_iterations(system):

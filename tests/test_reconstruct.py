@@ -185,7 +185,9 @@ def test_missing_angles(dataset):
     (['--views', '99'], 'the scan has 8'), (['--views', '-1'], '--views'), (['-D', 'nitre=3'], 'nitre'),
     (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
     (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
-    (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'), (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
+    (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'),
+    (['--algorithm', 'sart', '-D', 'seed=-1'], 'seed must be'), (['--algorithm', 'asd-pocs', '-D', 'alpha=inf'], 'alpha must'),
+    (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
     (['--algorithm', 'voxelize'], '--complete'), (['--algorithm', 'refined'], '--complete'), (['--start', 'no.xml'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
@@ -285,7 +287,8 @@ def test_corrected_poses(scene, tmp_path):
 
 def test_the_noise_is_that_of_the_fit(tmp_path):
     film = '<film type="ct_detector"><float name="photons" value="1e3"/></film>'
-    path = changed_scene(tmp_path, ('<string name="nDetector" value="32, 40"/>', '<string name="nDetector" value="32, 40"/>' + film),
+    panel = '<string name="nDetector" value="32, 40"/>'
+    path = changed_scene(tmp_path, (panel, panel + film),
                          ('value="24"/>\n            <tr', 'value="24"/> <float name="scale" value="0.05"/>\n            <tr'))
     code, _, err = fit(path, *QUICK, '--views', '4', '--seed', '3', '--out', tmp_path / 'fit')
     assert code == 0, err
@@ -293,7 +296,8 @@ def test_the_noise_is_that_of_the_fit(tmp_path):
     assert cloud.seed == 3
 
     def volume(*args):
-        code, _, err = run(RECONSTRUCT, path, '--algorithm', 'sart', '-D', 'niter=1', '--out', tmp_path / 'v.nii', '--force', *args)
+        code, _, err = run(RECONSTRUCT, path, '--algorithm', 'sart', '-D', 'niter=1', '--out', tmp_path / 'v.nii', '--force',
+                           *args)
         assert code == 0, err
         return load(tmp_path / 'v.nii')
 

@@ -13,7 +13,7 @@ from ..scan import Scan
 from .circle import on_circle
 from .fdk import fdk
 from .sart import blocks, sweep
-from .system import Reconstruction, System, check_counts, check_range, dot, evaluated, norm, scalar
+from .system import LARGE, Reconstruction, System, check_bound, check_counts, check_range, dot, evaluated, norm, scalar
 
 EPSILON = 1e-8   # added to the squared gradient, relative to its largest value in the volume: TV is not smooth at zero
 LMBDA_MIN = 0.005
@@ -60,6 +60,17 @@ def minimise_tv(volume, size, step: float, tviter: int):
     return volume
 
 
+def check_parameters(niter, blocksize, lmbda, lmbda_red, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed):
+    """Raises InputError for a parameter of `asd_pocs` out of its range."""
+    check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
+    check_counts(least=0, exact_every=exact_every, seed=seed)
+    for name, value, high in (('lmbda', lmbda, 2), ('lmbda_red', lmbda_red, 1), ('alpha', alpha, LARGE),
+                              ('alpha_red', alpha_red, 1), ('rmax', rmax, LARGE)):
+        check_range(name, value, 0, high)
+    if maxl2err is not None:
+        check_bound('maxl2err', maxl2err)
+
+
 def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1., lmbda_red: float = 0.99, tviter: int = 20,
              alpha: float = 0.002, alpha_red: float = 0.95, rmax: float = 0.95, maxl2err: float | None = None,
              nonneg: bool = True, order: str = 'random', exact_every: int = 0, init=None, seed: int = 0,
@@ -88,13 +99,9 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     Stops where the data are met and both steps undo each other (cosine below -0.99), or lmbda falls below 0.005. The
     volume is the one after descent, as TIGRE's; the residuals are those of the data steps before it.
 
-    Raises InputError for a parameter out of its range and a start volume that does not fit.
+    Raises InputError for a parameter out of its range, a start volume that does not fit, and where the result is not finite.
     """
-    check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
-    check_counts(least=0, exact_every=exact_every)
-    for name, value, high in (('lmbda', lmbda, 2), ('lmbda_red', lmbda_red, 1), ('alpha', alpha, np.inf),
-                              ('alpha_red', alpha_red, 1), ('rmax', rmax, np.inf)):
-        check_range(name, value, 0, high)
+    check_parameters(niter, blocksize, lmbda, lmbda_red, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed)
     system, rng = System(scan), np.random.default_rng(seed)
     angles, size = scan.geometry.angles, scan.geometry.nVoxel
     blocks(angles, blocksize, order, rng)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 
 from ..scan import Scan
-from .system import Reconstruction, System, check_counts, dot, evaluated, norm, scalar
+from .system import Reconstruction, System, check_bound, check_counts, dot, evaluated, scalar
 
 
 def cgls(scan: Scan, niter: int = 20, init=None, tol: float = 0., progress=None) -> Reconstruction:
@@ -20,10 +20,11 @@ def cgls(scan: Scan, niter: int = 20, init=None, tol: float = 0., progress=None)
     tol        stop when |A x - b| / |b| is no larger
     progress   called as progress(iterations done, niter, residual)
 
-    Stops early where the gradient A^T (b - A x) has vanished to rounding. Raises InputError for a parameter out of its range
-    and a start volume that does not fit.
+    Stops early where the gradient A^T (b - A x) has vanished to rounding. Raises InputError for a parameter out of its range,
+    a start volume that does not fit, and where the result is not finite.
     """
     check_counts(niter=niter)
+    check_bound('tol', tol)
     system = System(scan)
     A, views = system.A, system.views
     x = system.start(init)
@@ -41,7 +42,7 @@ def cgls(scan: Scan, niter: int = 20, init=None, tol: float = 0., progress=None)
         s = evaluated(A.adjoint(r, views))
         gamma, before = dot(s, s), gamma
         p = evaluated(dr.fma(scalar(gamma / before), p, s))
-        residuals.append(norm(r) / system.size_b)
+        residuals.append(system.relative(r))
         if progress:
             progress(k + 1, niter, residuals[-1])
     return Reconstruction(system.volume(x), residuals)

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from ..scan import Scan
-from .asd_pocs import asd_pocs
+from .asd_pocs import asd_pocs, check_parameters
 from .sart import sart
 from .system import Reconstruction, check_counts
 
@@ -32,6 +32,7 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
     The residuals are those of the measured views. Raises InputError as `asd_pocs` does.
     """
     check_counts(niter=niter, completed_niter=completed_niter)
+    check_parameters(niter, 1, 1., 1., tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed)  # before the passes
     passes = completed_niter + niter
 
     def of_stage(before):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..scan import Scan
-from .system import Reconstruction, System, check_counts, check_range, evaluated, scalar
+from .system import Reconstruction, System, check_bound, check_counts, check_range, evaluated, scalar
 
 ORDERS = ('ordered', 'random', 'angularDistance')
 
@@ -76,11 +76,13 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     seed        of the random order
     progress    called as progress(passes done, niter, residual)
 
-    Raises InputError for a parameter out of its range and a start volume that does not fit.
+    Raises InputError for a parameter out of its range, a start volume that does not fit, and where the result is not finite.
     """
     check_counts(niter=niter, blocksize=blocksize)
+    check_counts(least=0, seed=seed)
     check_range('lmbda', lmbda, 0, 2)
     check_range('lmbda_red', lmbda_red, 0, 1)
+    check_bound('tol', tol)
     system, rng = System(scan), np.random.default_rng(seed)
     blocks(scan.geometry.angles, blocksize, order, rng)  # an unknown order must fail before the work
     x = system.start(init)

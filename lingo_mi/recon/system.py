@@ -14,6 +14,8 @@ from ..xray.pair import ExactPair
 from .circle import on_circle
 
 PARTIAL = 4096  # terms of a sum that are added in float32
+LARGE = 1e18    # of parameters without a bound of their own: what is above has no square in float32
+DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the projections'
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,14 @@ class System:
     def residual(self, x):
         """b - A x of all views, and its norm over that of b."""
         r = evaluated(self.b - self.A.forward(x, self.views)[0])
-        return r, norm(r) / self.size_b
+        return r, self.relative(r)
+
+    def relative(self, r) -> float:
+        """The norm of a residual over that of b. Raises InputError where it is not finite."""
+        value = norm(r) / self.size_b
+        if not np.isfinite(value):
+            raise InputError(DIVERGED)
+        return value
 
     def correct(self, x):
         """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
@@ -77,8 +86,8 @@ class System:
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x) -> np.ndarray:
-        """A device volume as float32 [x, y, z]."""
-        return x.numpy().reshape(self.geometry.nVoxel)
+        """A device volume as float32 [x, y, z]. Raises InputError where it is not finite."""
+        return finite(x.numpy().reshape(self.geometry.nVoxel))
 
 
 def evaluated(x):
@@ -100,10 +109,17 @@ def norm(a) -> float:
     return dot(a, a) ** 0.5
 
 
+def finite(volume: np.ndarray) -> np.ndarray:
+    """The volume itself. Raises InputError where it is not finite."""
+    if not np.isfinite(volume).all():
+        raise InputError(DIVERGED)
+    return volume
+
+
 def check_counts(least: int = 1, **counts):
     """Raises InputError for a count that is not an integer, or below `least`."""
     for name, value in counts.items():
-        if value != int(value) or value < least:
+        if not (least <= value < np.inf and value == int(value)):
             raise InputError(f'{name} must be an integer from {least} on, not {value}')
 
 
@@ -111,3 +127,9 @@ def check_range(name: str, value: float, low: float, high: float):
     """Raises InputError for a parameter outside low < value <= high."""
     if not low < value <= high:
         raise InputError(f'{name} must be above {low:g} and at most {high:g}, not {value}')
+
+
+def check_bound(name: str, value: float, high: float = LARGE):
+    """Raises InputError for a parameter, which may be zero, outside 0 <= value <= high."""
+    if not 0 <= value <= high:
+        raise InputError(f'{name} must be from 0 to {high:g}, not {value}')
