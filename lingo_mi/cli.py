@@ -85,7 +85,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check_input(args) -> None:
     """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
-    if args.views < 0:
+    if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
     if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
         raise InputError('--shape, --dtype and --mu-water go with --volume')
@@ -93,22 +93,23 @@ def check_input(args) -> None:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
 
 
-def read_input(args, scene, views: int, seed: int = 0):
+def read_input(args, scene, views: int | None, seed: int = 0):
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
     scene   the `LoadedScene` of args.scene
-    views   how many evenly spaced views to use (0: all)
+    views   how many evenly spaced views to use (None: all)
     seed    of the noise, where the scene's detector has any
     """
     from .files.scans import read_scan
     from .files.volumes import read_volume
-    from .scanning import check_memory, choose_views, take_scan, with_effects
+    from .scanning import check_memory, choose_views, take_scan, warn_if_truncated, with_effects
     if args.projections:
-        dataset = choose_views(with_effects(read_scan(args.projections), scene), views)
+        dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
         check_memory(dataset.train.geometry)
+        warn_if_truncated(dataset.train.geometry)
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
-    return take_scan(scene, views, volume, seed)
+    return take_scan(scene, views or 0, volume, seed)
 
 
 def definitions(pairs) -> dict[str, str]:
@@ -136,13 +137,35 @@ def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
     if path.is_dir() and any(path.iterdir()) and not (force or resume):
         what = 'holds a result already' if (path / owns).exists() else 'is not empty'
         raise InputError(f'{path}: {what}; add --resume to go on, --force to replace it, or choose another --out')
+    _probe(path, path)
+    return path
+
+
+def writable_file(path: Path, force: bool) -> Path:
+    """The output file, whose folder can be made and written to, or an error that refuses to spoil one.
+
+    Leaves nothing behind.
+
+    force   whether an earlier file may be replaced
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder; choose another --out')
+    if path.exists() and not force:
+        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
+    _probe(path.parent, path)
+    return path
+
+
+def _probe(folder: Path, path: Path):
+    """Make a folder, write into it and take it away again. Raises InputError, naming `path`, where that fails."""
     made = []
     try:
-        for part in (*reversed(path.parents), path):
+        for part in (*reversed(folder.parents), folder):
             if not part.exists():
                 part.mkdir()
                 made.append(part)
-        probe = path / '.writable'
+        probe = folder / '.writable'
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -150,4 +173,3 @@ def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
     finally:
         for part in reversed(made):
             part.rmdir()
-    return path

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from .effects.forward import Effects, find_effects
 from .errors import InputError
 from .geometry import Geometry, spread
+from .memory import room
 from .progress import Progress
 from .scan import Dataset, Scan
 from .xray import grid
@@ -66,21 +66,21 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     return LoadedScene(scene, scanner, path)
 
 
-def check_memory(*geometries: Geometry | None):
-    """Refuse, before anything is allocated, a scan that this machine cannot hold.
+def check_memory(*geometries: Geometry | None, views: int = 0, copies: float = 0):
+    """Refuse, before anything is allocated, a scan that this process cannot hold.
 
-    Counts the least there is: the voxels as read, fitted and compared, and the projections as measured and rendered.
+    views    of all geometries together (0: as many as they have)
+    copies   of volume and projections that an algorithm needs at its peak (0: the least there is, the voxels as read, fitted
+             and compared, and the projections as measured and rendered)
     """
     known = [g for g in geometries if g is not None]
-    voxels = math.prod(known[0].nVoxel)
-    pixels = sum(len(g) * math.prod(g.nDetector) for g in known)
-    needed = 4 * (3 * voxels + 2 * pixels)
-    room = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') if hasattr(os, 'sysconf') else math.inf
-    if needed > room:
+    views = views or sum(map(len, known))
+    voxels, pixels = math.prod(known[0].nVoxel), views * math.prod(known[0].nDetector)
+    needed = 4 * (copies * (voxels + pixels) if copies else 3 * voxels + 2 * pixels)
+    if needed > (has := room()):
         size = [' x '.join(map(str, counts)) for counts in (known[0].nVoxel, known[0].nDetector)]
-        raise InputError(f'{size[0]} voxels and {sum(map(len, known))} views of {size[1]} pixels need at least '
-                         f'{needed / 2 ** 30:,.0f} GiB of memory, but this machine has {room / 2 ** 30:,.0f} GiB: '
-                         'lower nVoxel, nDetector or the views')
+        raise InputError(f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2 ** 30:,.1f} GiB of '
+                         f'memory, but this process may take {has / 2 ** 30:,.1f} GiB: lower nVoxel, nDetector or the views')
 
 
 def defaults(path) -> set[str]:
@@ -118,7 +118,9 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:
-        return choose_views(with_effects(scanner.dataset, loaded), views)
+        dataset = choose_views(with_effects(scanner.dataset, loaded), views)
+        warn_if_truncated(dataset.train.geometry)
+        return dataset
     geometry, test = scanner.geometry, scanner.test_geometry
     if views:  # before the work, not after
         spread(len(geometry), views)
@@ -133,7 +135,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -
             objects = find_objects(loaded.scene)
         except InputError as error:
             raise InputError(f'{loaded.path}: {error}') from None
-    _warn_if_truncated(geometry)
+    warn_if_truncated(geometry)
     keys = np.arange(len(geometry) + (len(test) if test is not None else 0))
     if views and test is not None:  # unused views are needed only where nothing else is held out
         chosen = spread(len(geometry), views)
@@ -250,7 +252,7 @@ def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.n
     return on_grid(cloud, corner, geometry.dVoxel, geometry.nVoxel, extent)
 
 
-def _warn_if_truncated(geometry: Geometry):
+def warn_if_truncated(geometry: Geometry):
     """Say so where the volume's midplane is wider than what the panels see of it."""
     frames, centre = geometry.frames(), np.array(geometry.offOrigin)
     widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]

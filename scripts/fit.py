@@ -28,7 +28,7 @@ def arguments():
     p.add_argument('--method', choices=METHODS, default='fast',
                    help='recipe: fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
                    'composite opacities and make views but no volume')
-    p.add_argument('--views', type=int, default=0, metavar='N', help='fit N evenly spaced views (default: all)')
+    p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
     p.add_argument('--init', choices=('lingo', 'r2', 'random', 'cuboid'), help='initial cloud: Otsu masks (lingo) or an FDK '
                    'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid)')

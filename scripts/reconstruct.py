@@ -17,24 +17,26 @@ given; with --complete and --start, those that the fit has modelled.
 """
 import argparse
 import inspect
-import os
 import time
 from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.cli import Parser, check_input, definitions, guard, input_arguments, read_input
+from lingo_mi.cli import Parser, check_input, definitions, guard, input_arguments, read_input, writable_file
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
 ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'refined', 'voxelize')
+
+# Memory at the peak, over that of the volume and the projections, as measured on volumes of gigabytes.
+COPIES = {'fdk': 2.7, 'sart': 2.7, 'os-sart': 2.7, 'sirt': 2.7, 'cgls': 4.3, 'asd-pocs': 4., 'refined': 4.}
 
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument('--algorithm', choices=ALGORITHMS, default='fdk', help='(default: fdk)')
-    p.add_argument('--views', type=int, default=0, metavar='N', help='use N evenly spaced views (default: all); with '
+    p.add_argument('--views', type=int, metavar='N', help='use N evenly spaced views (default: all); with '
                    '--complete: measured and rendered ones together')
     p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered; '
                    'checkpoint.npz of one by 3dgs or xgaussian')
@@ -54,14 +56,7 @@ def output(path: Path, force: bool) -> Path:
     """The output file, if it can be written without spoiling one."""
     if not path.name.endswith(('.nii', '.nii.gz')):
         raise InputError(f'{path}: volumes are written as NIfTI; give an --out that ends in .nii or .nii.gz')
-    if path.is_dir():
-        raise InputError(f'{path}: is a folder; choose another --out')
-    if path.exists() and not force:
-        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
-    nearest = next(p for p in path.absolute().parents if p.exists())
-    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
-        raise InputError(f'{path}: cannot write there; choose another --out')
-    return path
+    return writable_file(path, force)
 
 
 def options(function, given: dict[str, str]) -> dict:
@@ -89,6 +84,7 @@ def main():
     from lingo_mi.progress import Progress
     from lingo_mi.recon.asd_pocs import asd_pocs
     from lingo_mi.recon.cgls import cgls
+    from lingo_mi.recon.circle import require_signal
     from lingo_mi.recon.corrections import linearised
     from lingo_mi.recon.fdk import fdk
     from lingo_mi.recon.refined import refined
@@ -102,6 +98,8 @@ def main():
     from_cloud = args.algorithm in ('refined', 'voxelize')
     if from_cloud and not args.complete:
         raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete')
+    if args.algorithm == 'voxelize' and args.views:
+        raise InputError('--algorithm voxelize makes its volume of the cloud alone: leave out --views')
     if args.complete and not args.views and args.algorithm != 'voxelize':
         raise InputError('--complete needs --views, the number of measured and rendered views together')
     if args.start and (args.complete or args.views or args.algorithm == 'fdk' or from_cloud):
@@ -121,8 +119,14 @@ def main():
         raise InputError(f'{args.complete or args.start}: opacities and radiances make no volume; '
                          + ('leave out --start' if args.start else 'take another --algorithm'))
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
-    dataset = read_input(args, scene, 0 if args.complete else args.views, seed or 0)
+    views = len(cloud.geometry) if cloud else args.views
+    if not (args.projections or args.volume):  # their geometry is not known before they are read
+        check_scan(scene.scanner.geometry, views, args.algorithm)
+    dataset = read_input(args, scene, None if cloud else args.views, seed or 0)
     scan = dataset.train
+    check_scan(scan.geometry, views, args.algorithm)
+    if args.algorithm != 'voxelize':
+        require_signal(scan)
     began = time.monotonic()
     if args.algorithm == 'voxelize':
         volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), []
@@ -132,6 +136,8 @@ def main():
             if args.algorithm == 'fdk' and cloud.corrected.poses is not None and measured.geometry.poses is None:
                 raise InputError('filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
                                  'take another --algorithm')
+            # refined works on all of the views as sart does
+            check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm)
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
                 given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent))
@@ -147,12 +153,21 @@ def main():
     geometry = scan.geometry
     out.parent.mkdir(parents=True, exist_ok=True)
     write_volume(out, volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
-    print(f'{args.algorithm} of {len(scan)} views: {seconds:.1f} s'
+    of = f'a cloud fitted to {views}' if args.algorithm == 'voxelize' else len(scan)
+    print(f'{args.algorithm} of {of} views: {seconds:.1f} s'
           + (f', |A x - b| / |b| = {residuals[-1]:.4g} after {len(residuals) - 1} iterations' if residuals else ''))
     if dataset.volume is not None:
         print(f'volume          PSNR {metrics.psnr_3d(volume, dataset.volume):.2f} dB, '
               f'SSIM {metrics.ssim_3d(volume, dataset.volume):.4f}')
     print(out)
+
+
+def check_scan(geometry, views: int | None, algorithm: str):
+    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them."""
+    from lingo_mi.recon.circle import require_rays
+    from lingo_mi.scanning import check_memory
+    require_rays(geometry)
+    check_memory(geometry, views=views or 0, copies=COPIES.get(algorithm, 0))
 
 
 def reconstruct(run, scan, given, Progress):

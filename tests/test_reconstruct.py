@@ -1,5 +1,6 @@
 """scripts/reconstruct.py from end to end on a tiny scene, the two-stage way, and bad input in one line."""
 import re
+from dataclasses import replace
 
 import mitsuba as mi
 import nibabel
@@ -14,6 +15,7 @@ from lingo_mi.effects.forward import Effects
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
+from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.recon.asd_pocs import asd_pocs
@@ -88,6 +90,7 @@ def test_voxelize(scene, dataset, fitted, tmp_path):
     assert code == 0, err
     result = load(fitted.with_name('volume.nii.gz'))
     assert np.linalg.norm(load(tmp_path / 'v.nii') - result) < 1e-4 * np.linalg.norm(result)
+    assert 'voxelize of a cloud fitted to 4 views' in text
 
 
 def test_start(scene, dataset, fitted, tmp_path):
@@ -188,7 +191,10 @@ def test_missing_angles(dataset):
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'),
     (['--algorithm', 'sart', '-D', 'seed=-1'], 'seed must be'), (['--algorithm', 'asd-pocs', '-D', 'alpha=inf'], 'alpha must'),
     (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
-    (['--algorithm', 'voxelize'], '--complete'), (['--algorithm', 'refined'], '--complete'), (['--start', 'no.xml'], 'iterative'),
+    (['--algorithm', 'voxelize'], '--complete'), (['--views', '0'], '--views must be at least 1'),
+    (['--algorithm', 'voxelize', '--complete', 'no.xml', '--views', '9'], 'leave out --views'),
+    (['--out', '/proc/v.nii'], 'cannot write'),
+    (['--algorithm', 'refined'], '--complete'), (['--start', 'no.xml'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),
@@ -215,6 +221,56 @@ def test_a_cloud_of_other_views_or_no_cloud(scene, fitted, tmp_path):
     assert code == 2 and 'fitted to 4 views' in err
     code, _, err = run(RECONSTRUCT, scene, '--complete', scene, '--views', '9', '--out', out)
     assert code == 2 and 'no cloud' in err and not out.exists()
+
+
+def refused(*args):
+    """The one line by which reconstruct.py refuses its input."""
+    code, _, err = run(RECONSTRUCT, *args)
+    lines = [line for line in err.splitlines() if not line.startswith(('Scan: ', 'warning: '))]
+    assert code == 2 and len(lines) == 1 and lines[0].startswith('error: '), err
+    return lines[0]
+
+
+@pytest.mark.parametrize('given, says', [
+    ('"offOrigin" value="0, 0, 1000"', 'no ray meets the volume'), ('"offDetector" value="0, 500"', 'no ray meets the volume'),
+    ('"DSO" value="10"', 'source lies within the volume'), ('"DSD" value="1e5"', None)])
+def test_scans_that_see_no_volume(tmp_path, given, says):
+    name, line = given.split('"')[1], f'<string name={given}/>' if 'off' in given else f'<float name={given}/>'
+    old = f'<float name="{name}" value="{dict(DSO=100, DSD=150).get(name)}"/>'
+    new = (old, line) if 'off' not in given else ('<integer name="test_views"', line + '<integer name="test_views"')
+    path, out = changed_scene(tmp_path, new), ('--out', tmp_path / 'v.nii')
+    if says is None:  # the panel sees a part of it
+        code, _, err = run(RECONSTRUCT, path, *out)
+        assert code == 0 and 'may be truncated' in err
+    else:
+        assert says in refused(path, *out)
+
+
+@pytest.mark.parametrize('factor, says', [(0, 'zero everywhere'), (-1, 'nowhere above zero')])
+def test_projections_of_nothing(scene, dataset, tmp_path, factor, says):
+    scan = dataset.train
+    write_scan(tmp_path / 'scan.npy', replace(scan, projections=factor * scan.projections - 1e-3 * (factor < 0)), 'npy')
+    assert says in refused(scene, '--projections', tmp_path / 'scan.npy', '--out', tmp_path / 'v.nii')
+    assert not (tmp_path / 'v.nii').exists()
+
+
+def test_truncated_measurements_are_told(scene, dataset, tmp_path):
+    scan = dataset.train
+    narrow = replace(scan.geometry, nDetector=(32, 10))
+    write_scan(tmp_path / 'scan.npy', Scan(narrow, scan.projections[:, :, 15:25]), 'npy')
+    code, _, err = run(RECONSTRUCT, scene, '--projections', tmp_path / 'scan.npy', '--out', tmp_path / 'v.nii')
+    assert code == 0 and err.count('may be truncated') == 1, err
+
+
+def test_too_many_views_and_too_little_memory(scene, fitted, tmp_path, monkeypatch):
+    out = '--out', tmp_path / 'v.nii'
+    assert 'at most 100000' in refused(scene, '--complete', fitted, '--views', 1_000_000, *out)
+    assert 'GiB of memory' in refused(scene, '--complete', fitted, '--views', 10_000_000, *out)
+    size = 4 * (24 ** 3 + 8 * 32 * 40)
+    monkeypatch.setattr('lingo_mi.scanning.room', lambda: 3.5 * size)
+    assert run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', *out)[0] == 0
+    for algorithm in 'cgls', 'asd-pocs':
+        assert 'at least' in refused(scene, '--algorithm', algorithm, '-D', 'niter=1', *out, '--force')
 
 
 # ---- which views a cloud was fitted to ---------------------------------------------------------------------------------

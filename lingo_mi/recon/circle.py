@@ -1,7 +1,12 @@
 """What reconstruction on voxels asks of a scan."""
 from __future__ import annotations
 
+from itertools import product
+
+import numpy as np
+
 from ..errors import InputError
+from ..geometry import Geometry
 from ..scan import Scan
 
 
@@ -16,3 +21,25 @@ def require_circle(scan: Scan, what: str):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     if scan.valid is not None:
         raise InputError(f'{what} needs every pixel, and some of this scan are not valid: fill them first')
+
+
+def require_rays(geometry: Geometry):
+    """Raises InputError where a source is in the volume, and where no view's rays meet it."""
+    frames, centre, half = geometry.frames(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    if not frames.parallel and (np.abs(frames.source - centre) < half).all(1).any():
+        raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
+    corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector
+    for view in range(len(geometry)):
+        x, y = frames.project(corners, view)
+        # NaN are corners behind the source, which hide how far the others' shadow goes.
+        if 0 < np.isnan(x).sum() < len(x) or x.max() > 0 and x.min() < columns and y.max() > 0 and y.min() < rows:
+            return
+    raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')
+
+
+def require_signal(scan: Scan):
+    """Raises InputError for projections of nothing."""
+    if not scan.projections.any():
+        raise InputError('the projections are zero everywhere: there is nothing to reconstruct')
+    if scan.projections.max() <= 0:
+        raise InputError('the projections are nowhere above zero: there is nothing to reconstruct; check their sign')

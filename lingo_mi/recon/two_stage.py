@@ -19,7 +19,7 @@ from ..fit.step import Stepper
 from ..geometry import Geometry, spread
 from ..results import METRICS
 from ..scan import Dataset, Scan
-from ..scanning import load_scene, render_objects
+from ..scanning import check_memory, load_scene, render_objects
 from ..xray.objects import Ellipsoids, find_objects
 from .circle import require_circle
 from .corrections import corrected
@@ -199,9 +199,14 @@ def complete(scan: Scan, cloud: FittedCloud | CompositedCloud, views: int) -> Sc
     """A scan of `views` views: the measured ones, `as_corrected` and `without_effects`, and those between them rendered from
     the cloud.
 
-    Raises InputError where fewer views are asked for than were measured, and for a scan that is no circle about z.
+    Raises InputError where fewer views are asked for than were measured or more than a scan may have, and for a scan that is
+    no circle about z.
     """
+    from ..plugins.ct_scanner import MOST_VIEWS
     require_circle(scan, 'the completion of a scan')
+    if views > MOST_VIEWS:
+        raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
+    check_memory(scan.geometry, views=views)
     return filled(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
 
 

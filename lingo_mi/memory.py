@@ -1,0 +1,52 @@
+"""How much memory this process may take."""
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+
+def room() -> float:
+    """Bytes: the smallest of the machine's memory, the limits of the control groups that this process is in, and what its limit
+    of address space leaves; infinity where none of them is known."""
+    return min(_machine(), *_control_groups(), _address_space())
+
+
+def _machine() -> float:
+    return os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') if hasattr(os, 'sysconf') else math.inf
+
+
+def _control_groups(groups: Path = Path('/proc/self/cgroup'), mounted: Path = Path('/sys/fs/cgroup')) -> list[float]:
+    """The limits of this process's control groups, v1 and v2, and of those around them, where they can be read."""
+    out = []
+    try:
+        lines = groups.read_text().splitlines()
+    except OSError:
+        return out
+    for line in lines:
+        _, controllers, path = line.split(':', 2)
+        if controllers and 'memory' not in controllers.split(','):
+            continue
+        root, name = (mounted / 'memory', 'memory.limit_in_bytes') if controllers else (mounted, 'memory.max')
+        group = root / path.lstrip('/')
+        for folder in (group, *group.parents):
+            try:
+                out.append(float((folder / name).read_text()))
+            except (OSError, ValueError):  # not there in a container, or 'max'
+                pass
+            if folder == root:
+                break
+    return out
+
+
+def _address_space() -> float:
+    """What is left of RLIMIT_AS (`ulimit -v`): code, and what Dr.Jit has set aside, have taken some of it."""
+    try:
+        import resource
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return math.inf
+        taken = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf('SC_PAGE_SIZE')
+    except (ImportError, OSError):  # Windows, macOS
+        return math.inf
+    return max(limit - taken, 0)
