@@ -9,9 +9,11 @@
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --start out/x3d_foot/result.xml -D niter=8
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
-are rendered from it, and the volume is made of both; refined, which is the best for few clean views, starts from the cloud's own
-volume, meets all views first and the measured ones then. With --start, it is made of the views that the cloud was fitted to, by
-an iterative algorithm that starts from the cloud's own volume. Where the true volume is known, PSNR and SSIM are printed.
+are rendered from it, and the volume is made of both; the scan must be one on a circle, with every pixel. refined, which is the
+best for few clean views, starts from the cloud's own volume, meets all views first and the measured ones then. With --start,
+the volume is made of the views that the cloud was fitted to, by an iterative algorithm that starts from the cloud's own volume;
+any scan will do. Poses that the fit has corrected are used as it has left them, but not by fdk. Where the true volume is known,
+PSNR and SSIM are printed.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 """
@@ -38,7 +40,7 @@ def arguments():
     p.add_argument('--algorithm', choices=ALGORITHMS, default='fdk', help='(default: fdk)')
     p.add_argument('--views', type=int, metavar='N', help='use N evenly spaced views (default: all); with '
                    '--complete: measured and rendered ones together')
-    p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views are rendered; '
+    p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views of a circle are rendered; '
                    'checkpoint.npz of one by 3dgs or xgaussian')
     p.add_argument('--start', metavar='F', help='result.xml of a fit, whose volume an iterative algorithm starts from')
     p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')

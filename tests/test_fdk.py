@@ -165,6 +165,13 @@ def test_matrices_agree_with_the_frames(mode):
         np.testing.assert_allclose(w, 1 - points @ out / 300 if mode == 'cone' else 1, rtol=1e-10)
 
 
+def test_filters_by_tigres_names():
+    for name in 'ram_lak', 'shepp_logan':
+        np.testing.assert_array_equal(ramp(9, 1., name), ramp(9, 1., name.replace('_', '-')))
+    with pytest.raises(InputError, match='unknown'):
+        ramp(9, 1., 'box_car')
+
+
 def test_one_kernel_for_all_views():
     scan = ellipsoids(geometry(angles=circular(10)), BALL)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

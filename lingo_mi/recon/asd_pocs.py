@@ -1,7 +1,8 @@
 """ASD-POCS: SART steps towards the data, then steepest descent on total variation, in balance.
 
 Sidky and Pan, "Image reconstruction in circular cone-beam computed tomography by constrained, total-variation
-minimization", Phys. Med. Biol. 53 (2008), algorithm of section 2.3; names and defaults are TIGRE's.
+minimization", Phys. Med. Biol. 53 (2008), algorithm of section 2.3; the defaults of lmbda, lmbda_red, tviter, alpha,
+alpha_red, rmax and blocksize are TIGRE's.
 """
 from __future__ import annotations
 

@@ -44,14 +44,15 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
 
     Raises InputError for an unknown window.
     """
-    if window not in WINDOWS:
+    shape = WINDOWS.get(window.replace('_', '-'))
+    if shape is None:
         raise InputError(f'filter {window!r} is unknown: use one of {", ".join(WINDOWS)}')
     size = fft.next_fast_len(2 * n, real=True)
     k = np.minimum(np.arange(size), size - np.arange(size))
     kernel = np.where(k % 2 == 1, -1 / (np.pi * np.maximum(k, 1) * tau) ** 2, 0.)
     kernel[0] = 1 / (4 * tau ** 2)
     response = tau * fft.rfft(kernel).real
-    return response * WINDOWS[window](np.linspace(0, 1, len(response)))
+    return response * shape(np.linspace(0, 1, len(response)))
 
 
 def gaps(geometry: Geometry, turn: float):
@@ -207,7 +208,7 @@ def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
 
     scan       cone (one detector row: fan) or parallel, detector offsets included; the views together must see the
                whole width of the object, otherwise the truncated rows are filtered as they are
-    filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'
+    filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'; TIGRE's 'ram_lak' and 'shepp_logan' are known too
     progress   called as progress(views done, views) after every few views
 
     Short scans and offset detectors are weighted, see `ray_weights`. A voxel outside a view's panel gets nothing from that

@@ -5,7 +5,8 @@ block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray meets is left alone. Names and defaults are TIGRE's.
+where division is by voxel and by pixel, and what no ray meets is left alone. The defaults of lmbda, lmbda_red and blocksize are
+TIGRE's; its `noneg` is `nonneg` here, its `OrderStrategy` is `order`.
 """
 from __future__ import annotations
 
