@@ -32,7 +32,7 @@ def test_too_little_address_space_is_one_line(tmp_path):
     (tmp_path / 'scene.xml').write_text(SCENE.replace('value="24, 24, 24"', 'value="1000, 1000, 1000"'))
     command = [sys.executable, FIT.with_name('reconstruct.py'), tmp_path / 'scene.xml', '--variant', 'llvm_ad_mono', '--out',
                tmp_path / 'v.nii']
-    done = subprocess.run(['bash', '-c', 'ulimit -v 12000000; exec "$@"', 'bash', *map(str, command)], capture_output=True,
+    done = subprocess.run(['bash', '-c', 'ulimit -v 10000000; exec "$@"', 'bash', *map(str, command)], capture_output=True,
                           text=True)
     assert done.returncode == 2 and done.stderr.startswith('error: ') and done.stderr.count('\n') == 1, done.stderr
     assert 'GiB of memory' in done.stderr
