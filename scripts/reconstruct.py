@@ -31,7 +31,7 @@ from lingo_mi.runtime import use_variant
 ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'refined', 'voxelize')
 
 # Memory at the peak, over that of the volume and the projections, as measured on volumes of gigabytes.
-COPIES = {'fdk': 2.7, 'sart': 2.7, 'os-sart': 2.7, 'sirt': 2.7, 'cgls': 4.3, 'asd-pocs': 4., 'refined': 4.}
+COPIES = {'fdk': 2.7, 'sart': 2.7, 'os-sart': 2.7, 'sirt': 2.7, 'cgls': 4.3, 'asd-pocs': 5., 'refined': 5.}
 
 
 def arguments():

@@ -331,7 +331,8 @@ def test_corrected_poses(scene, tmp_path):
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=2', '--start', path, *out)
     assert code == 0 and 'of 4 views' in text, err
     own = voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
-    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(as_corrected(measured, cloud), 2, init=own).volume)
+    expected = sart(as_corrected(measured, cloud), 2, init=own).volume  # up to the order of sums
+    np.testing.assert_allclose(load(tmp_path / 'v.nii'), expected, rtol=1e-4, atol=1e-5 * expected.max())
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', '--complete', path, '--views', 8, *out)
     assert code == 0, err
     code, _, err = run(RECONSTRUCT, scene, '--complete', path, '--views', 8, *out)
@@ -361,6 +362,6 @@ def test_the_noise_is_that_of_the_fit(tmp_path):
         scan = fitted_views(take_scan(load_scene(path), seed=seed), cloud.geometry)
         return sart(without_effects(scan, cloud), 1, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)).volume
     start = '--start', tmp_path / 'fit' / 'result.xml'
-    np.testing.assert_array_equal(volume(*start), expected(3))
-    np.testing.assert_array_equal(volume(*start, '--seed', 1), expected(1))
+    np.testing.assert_allclose(volume(*start), expected(3), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(volume(*start, '--seed', 1), expected(1), rtol=1e-4, atol=1e-5)
     assert np.abs(volume('--seed', 1) - volume()).max() > 0
