@@ -1,7 +1,8 @@
 """How many items lie on top of each other, and in how many parts their sum must be taken.
 
 An element of an image that n equal numbers are added to one by one in float32 is off by some n 2e-9 of itself. Where more
-than DEEP items meet, they are therefore added up in parts, each into a sum of its own, and the sums in float64.
+than DEEP items lie at one place, they are therefore added up in parts, each into a sum of its own, and the sums in float64.
+Items that overlap from different places add different numbers, of which the rounding cancels: RANDOM times as many do no more.
 """
 from __future__ import annotations
 
@@ -9,8 +10,9 @@ import drjit as dr
 import mitsuba as mi
 
 DEEP = 1_000   # 2e-6
-CELLS = 4096   # about as many on each level; a power of four and of eight
-SAMPLE = 8192  # items that are looked at
+RANDOM = 32
+CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by the number of axes, along each of them: of one element, and of two sizes
+SAMPLE = 16384  # items that are looked at
 
 
 def scattered(i):
@@ -32,27 +34,25 @@ def parts_of(places, covered, shape) -> int:
     count = dr.width(covered)
     if count <= DEEP:
         return 1
-    side = round(CELLS ** (1 / len(shape)))
-    levels = [(side, None), (side, [max(n / side, 1.) for n in shape])]
-    coarse = side // (8 if len(shape) == 2 else 4)
-    levels.append((coarse, [max(n / coarse, 1.) for n in shape]))
+    single, *sides = CELLS[len(shape)]
+    levels = [(single, None), *((side, [max(n / side, 1.) for n in shape]) for side in sides)]
     with dr.suspend_grad():
         step = count // SAMPLE + 1
         i, every = dr.arange(mi.UInt32, count // step), dr.opaque(mi.UInt32, step)
         i = i * every + scattered(i) % every
         covered = dr.gather(mi.Float, covered, i)
         inside = [dr.clip(dr.gather(mi.Int32, p, i), 0, n - 1) for p, n in zip(places, shape)]
-        depth = dr.zeros(mi.Float, 2 * CELLS + coarse ** len(shape) + 1)
+        depth = dr.zeros(mi.Float, sum(cells ** len(shape) for cells, _ in levels) + 1)
         first = 0
         for cells, size in levels:
             index, volume = mi.UInt32(0), 1.
             for axis, p in enumerate(inside):
                 along = mi.UInt32(p) % cells if size is None else mi.UInt32(mi.Float(p) / size[axis])
                 index, volume = index * cells + along, volume * (1. if size is None else size[axis])
-            dr.scatter_add(depth, dr.minimum(covered / volume, 1), index + first)
+            dr.scatter_add(depth, dr.minimum(covered / volume, 1) / (1 if size is None else RANDOM), index + first)
             first += cells ** len(shape)
         total = 1.
         for n in shape:
             total *= n
-        dr.scatter_add(depth, covered / total, mi.UInt32(first))
+        dr.scatter_add(depth, covered / (RANDOM * total), mi.UInt32(first))
         return -(-int(step * dr.max(depth)[0]) // DEEP)
