@@ -63,16 +63,16 @@ def curves(sizes: Sizes) -> list[dict]:
         plans += [dict(side=side, pixels=p, iterations=sizes.iterations[-1]) for p in (small, side)]
     scans, rows = {}, []
     usual = dict(name='fast', side=small, pixels=small, iterations=middle, points=sizes.points[1], extent=3.,
-                 values_per_gaussian=METHODS['fast'].values_per_gaussian)
+                 values_per_gaussian=None)  # the method's own
     for changes in plans:
         plan = usual | changes
         side, pixels = plan['side'], plan['pixels']
         if (side, pixels) not in scans:
             scans[side, pixels] = dataset(side, pixels, sizes.views)
         data, method = scans[side, pixels], METHODS[plan['name']]
-        given = plan['values_per_gaussian'] if plan['name'] == 'fast' else method.values_per_gaussian
-        settings = method.changed(iterations=plan['iterations'], n_points=plan['points'], extent=plan['extent'],
-                                  values_per_gaussian=given)
+        settings = method.changed(iterations=plan['iterations'], n_points=plan['points'], extent=plan['extent'])
+        if plan['values_per_gaussian'] is not None:
+            settings = settings.changed(values_per_gaussian=plan['values_per_gaussian'])
         cloud = initial_cloud(data.train, settings)
         fitted = run(data.train, settings, cloud, measure=quick_measure(data))
         rows.append(plan | dict(

@@ -61,7 +61,8 @@ def minimise_tv(volume, size, step: float, tviter: int):
     return volume
 
 
-def check_parameters(niter, blocksize, lmbda, lmbda_red, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed):
+def check_parameters(*, niter, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed, blocksize=1, lmbda=1.,
+                     lmbda_red=1.):
     """Raises InputError for a parameter of `asd_pocs` out of its range."""
     check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
     check_counts(least=0, exact_every=exact_every, seed=seed)
@@ -102,7 +103,8 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
 
     Raises InputError for a parameter out of its range, a start volume that does not fit, and where the result is not finite.
     """
-    check_parameters(niter, blocksize, lmbda, lmbda_red, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed)
+    check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
+                     exact_every=exact_every, seed=seed, blocksize=blocksize, lmbda=lmbda, lmbda_red=lmbda_red)
     system, rng = System(scan), np.random.default_rng(seed)
     angles, size = scan.geometry.angles, scan.geometry.nVoxel
     blocks(angles, blocksize, order, rng)

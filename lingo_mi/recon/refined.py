@@ -32,7 +32,8 @@ def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int =
     The residuals are those of the measured views. Raises InputError as `asd_pocs` does.
     """
     check_counts(niter=niter, completed_niter=completed_niter)
-    check_parameters(niter, 1, 1., 1., tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed)  # before the passes
+    check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
+                     exact_every=exact_every, seed=seed)  # before the passes
     passes = completed_niter + niter
 
     def of_stage(before):

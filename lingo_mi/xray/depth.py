@@ -6,10 +6,12 @@ Items that overlap from different places add different numbers, of which the rou
 """
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 
-DEEP = 1_000   # 2e-6
+DEEP = 1_000    # 2e-6
 RANDOM = 32
 CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by the number of axes, along each of them: of one element, and of two sizes
 SAMPLE = 16384  # items that are looked at
@@ -51,8 +53,5 @@ def parts_of(places, covered, shape) -> int:
                 index, volume = index * cells + along, volume * (1. if size is None else size[axis])
             dr.scatter_add(depth, dr.minimum(covered / volume, 1) / (1 if size is None else RANDOM), index + first)
             first += cells ** len(shape)
-        total = 1.
-        for n in shape:
-            total *= n
-        dr.scatter_add(depth, covered / (RANDOM * total), mi.UInt32(first))
+        dr.scatter_add(depth, covered / (RANDOM * math.prod(shape)), mi.UInt32(first))
         return -(-int(step * dr.max(depth)[0]) // DEEP)
