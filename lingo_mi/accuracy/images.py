@@ -115,5 +115,6 @@ def _teams(factor: float, lanes: int):
         def __init__(self, *args):
             super().__init__(*args)
             self.teams = max(round(factor * self.teams), 1)
-    with mock.patch.multiple(splat, Work=Work, LANES=lanes), mock.patch.object(balance, 'LANES', lanes):
+    unfrozen = dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)  # a recording would not notice
+    with unfrozen, mock.patch.multiple(splat, Work=Work, LANES=lanes), mock.patch.object(balance, 'LANES', lanes):
         yield

@@ -33,7 +33,7 @@ class Work:
 
     def shares(self) -> dict:
         """The arguments of a kernel for `each_item`: lane, the begin and end of its share as (item, block), and blocks."""
-        total = dr.gather(mi.UInt64, self.ends, self.count - 1)
+        total = dr.gather(mi.UInt64, self.ends, dr.opaque(mi.UInt32, self.count - 1))
         lane = dr.arange(mi.UInt32, self.teams * LANES)
         share = total // self.teams + 1
         begin = mi.UInt64(lane // LANES) * share

@@ -8,12 +8,16 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import AccuracyWarning
+from .depth import deepest, parts_of
 from .footprint import NAMES, project
+from .frame import View
+from .replay import Replay
 from .segment import add_straddling
 from .splat import splat
 
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
+POSE = 4                 # where a view begins among the inputs, behind a cloud's four parameters
 PIXEL_VARIANCE = 1 / 12  # of a square of side 1, along either side
 
 
@@ -34,13 +38,13 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
     no extent or no rotation leaves no finite pixel.
     """
-    footprints = project(centre, scale, rotation, density, view, extent, PIXEL_VARIANCE if area else 0.)
-    if affine:
-        footprints = _frozen(footprints)
-    image = splat(footprints, view.height, view.width, extent, primal, deep=True) * view.lengths()
+    inputs = centre, scale, rotation, density, view.source, view.corner, view.u, view.v
+    settings = dict(width=view.width, height=view.height, parallel=view.parallel, panel=view.panel, extent=extent,
+                    affine=affine, area=area)
+    image, straddles = dr.custom(_Splatted, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
     if view.parallel:
-        return image + dr.sum(dr.select(footprints.straddles, dr.nan, mi.Float(0)))
-    straddling = dr.compress(footprints.straddles)  # waits for the device
+        return image + dr.sum(dr.select(straddles, dr.nan, mi.Float(0)))
+    straddling = dr.compress(straddles)  # waits for the device
     if (affine or area) and dr.width(straddling):
         warnings.warn(AccuracyWarning(
             f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
@@ -48,7 +52,63 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     return add_straddling(image, centre, scale, rotation, density, view, straddling)
 
 
-def _frozen(footprints):
+class _Splatted(dr.CustomOp):
+    """The image of what can be splatted, and which Gaussians cannot, Bool [N]. All but tangents is replayed."""
+
+    def eval(self, inputs, wanted, settings, primal):
+        self.inputs, self.wanted, self.settings, self.parts = inputs, wanted, settings, 1
+        if not primal:
+            return dr.zeros(mi.Float, settings['width'] * settings['height']), _STRADDLES(*inputs, **settings)
+        image, straddles, depth = _PRIMAL(*inputs, **settings)
+        self.parts = parts_of(depth)
+        if self.parts > 1:
+            image, _ = _image(*inputs, **settings, parts=self.parts)
+        return image, straddles
+
+    def forward(self):
+        leaves = tuple(dr.detach(x) for x in self.inputs)
+        dr.enable_grad(leaves)
+        dr.set_grad(leaves, self.grad_in('inputs'))
+        image, footprints = _image(*leaves, **self.settings, parts=self.parts)
+        dr.forward_to(image)
+        self.set_grad_out((dr.grad(image), footprints.straddles))
+
+    def backward(self):
+        self.set_grad_in('inputs', _GRADIENT(*self.inputs, self.grad_out()[0], wanted=self.wanted, **self.settings))
+
+    def name(self):
+        return 'line integrals'
+
+
+def _footprints(centre, scale, rotation, density, source, corner, u, v, width, height, parallel, panel, extent, affine, area):
+    view = View(source, corner, u, v, width, height, parallel, panel)
+    footprints = project(centre, scale, rotation, density, view, extent, PIXEL_VARIANCE if area else 0.)
+    return view, _affine(footprints) if affine else footprints
+
+
+def _image(*inputs, primal=True, parts=1, **settings):
+    view, footprints = _footprints(*inputs, **settings)
+    return splat(footprints, view.height, view.width, settings['extent'], primal, parts) * view.lengths(), footprints
+
+
+def _primal(*inputs, width, height, **settings):
+    image, f = _image(*inputs, width=width, height=height, **settings)
+    return image, f.straddles, deepest((f.column, f.row), f.area, (width, height))
+
+
+def _gradient(*inputs, wanted, **settings):
+    *inputs, upstream = inputs
+    dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
+    of_pose = any(wanted[POSE:])  # which changes what the splat's image is multiplied by, too
+    dr.backward_from(_image(*inputs, primal=of_pose, **settings)[0] * upstream)
+    return tuple(dr.grad(x) for x in inputs)
+
+
+_PRIMAL, _GRADIENT = Replay(_primal), Replay(_gradient)
+_STRADDLES = Replay(lambda *inputs, **settings: _footprints(*inputs, **settings)[1].straddles)
+
+
+def _affine(footprints):
     """Footprints whose denominators are 1; opaque zeros, so that the kernels are those of the exact model."""
     zero = dr.opaque(mi.Float, 0, dr.width(footprints.column))
     values = (zero if name in DENOMINATOR else value for name, value in zip(NAMES, footprints.values))

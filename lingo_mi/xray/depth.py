@@ -22,8 +22,13 @@ def scattered(i):
     return i * 2654435761 // 65536
 
 
-def parts_of(places, covered, shape) -> int:
-    """In how many parts to add up items on a grid of elements. Waits for the device, where there are enough of them.
+def parts_of(depth) -> int:
+    """In how many parts to add up items that lie so `deepest`. Waits for the device."""
+    return max(-(-int(depth[0]) // DEEP), 1)
+
+
+def deepest(places, covered, shape):
+    """How many items lie on top of each other where they do most, on a grid of elements: Float [1], 0 where few are there.
 
     places    Int32 [N] for each axis, an item's element; it may lie outside the grid
     covered   Float [N], elements that an item covers
@@ -35,7 +40,7 @@ def parts_of(places, covered, shape) -> int:
     """
     count = dr.width(covered)
     if count <= DEEP:
-        return 1
+        return mi.Float(0)
     single, *sides = CELLS[len(shape)]
     levels = [(single, None), *((side, [max(n / side, 1.) for n in shape]) for side in sides)]
     with dr.suspend_grad():
@@ -54,4 +59,4 @@ def parts_of(places, covered, shape) -> int:
             dr.scatter_add(depth, dr.minimum(covered / volume, 1) / (1 if size is None else RANDOM), index + first)
             first += cells ** len(shape)
         dr.scatter_add(depth, covered / (RANDOM * math.prod(shape)), mi.UInt32(first))
-        return -(-int(step * dr.max(depth)[0]) // DEEP)
+        return step * dr.max(depth)

@@ -21,28 +21,24 @@ import mitsuba as mi
 
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, pair, position,
                       repeat, span, times, unpair, whole)
-from .depth import parts_of
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .footprint import NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True, deep: bool = False):
+def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True, parts: int = 1):
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
     Differentiable in `footprints.values`, in forward and in reverse mode. With `primal` off the image itself is left at
-    zero, for who only wants derivatives. With `deep` on, thousands of footprints on top of each other are added up in parts
-    (`depth`), which waits for the device once.
+    zero, for who only wants derivatives. The footprints are added up in that many `parts` (`depth`).
     """
-    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal, deep)
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal, parts)
 
 
 class _Splat(dr.CustomOp):
-    def eval(self, values, rest, height, width, extent, primal, deep):
-        self.plan = _Plan(values, rest, height, width, extent)
-        if deep and primal:
-            self.plan.parts = parts_of((rest.column, rest.row), rest.area, (width, height))
+    def eval(self, values, rest, height, width, extent, primal, parts):
+        self.plan = _Plan(values, rest, height, width, extent, parts)
         return self.plan.image() if primal else dr.zeros(mi.Float, height * width)
 
     def forward(self):
@@ -58,8 +54,8 @@ class _Splat(dr.CustomOp):
 class _Plan:
     """The work of one image: packed footprints, shared out by their pixels."""
 
-    def __init__(self, values, rest, height, width, extent):
-        self.count, self.height, self.width, self.parts = dr.width(values[0]), height, width, 1
+    def __init__(self, values, rest, height, width, extent, parts):
+        self.count, self.height, self.width, self.parts = dr.width(values[0]), height, width, parts
         self.packets = packets_of(width)
         amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
         Float64 = dr.float64_array_t(mi.Float)

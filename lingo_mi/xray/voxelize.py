@@ -20,7 +20,7 @@ import numpy as np
 
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, position, repeat,
                       span, times, whole)
-from .depth import parts_of
+from .depth import deepest, parts_of
 from .exponential import HALF_LOG2E, exp2_of_negative
 from .rotation import rows_of
 from .splat import SETUP
@@ -95,7 +95,7 @@ class _Voxelize(dr.CustomOp):
         blocks, cost = (mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP
         dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
         self.work = Work(blocks, cost)
-        parts = parts_of(rest[:3], covered, shape) if deep else 1
+        parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
         self.arguments = dict(packed=packed, places=places, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets), rows=dr.opaque(mi.Int32, ny))
         return self.work.add_up(_fill, ny * nz, nx, parts, **self.arguments)
