@@ -252,6 +252,22 @@ def test_no_kernel_is_compiled_after_the_first_steps():
     assert not {i: len(hashes) for i, hashes in fresh.items() if i > 5 and hashes}
 
 
+@pytest.mark.parametrize('batch', [1, 2])
+def test_replayed_steps_are_the_traced_ones(scan, batch):
+    """To the last bit, through densifications and with views of two sizes."""
+    settings = SHORT.changed(iterations=20, densify_from=0, densify_every=5, loss_scale='dynamic', batch=batch,
+                             coarse_share=.3)
+    found = []
+    for frozen in (False, True):
+        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
+            found.append(run(scan, settings, some_points(scan.geometry)).state)
+    traced, replayed = found
+    assert len(traced) != 0 and len(traced) == len(replayed)
+    for name, values in traced.values.items():
+        assert np.array_equal(values, replayed.values[name]), name
+    assert np.array_equal(traced.gradient, replayed.gradient) and np.array_equal(traced.seen, replayed.seen)
+
+
 def test_a_fit_that_loses_everything_says_so(scan):
     with pytest.raises(InputError, match='every Gaussian was pruned'):
         run(scan, SHORT.changed(prune_density=1e3), some_points(scan.geometry))

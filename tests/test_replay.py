@@ -1,4 +1,6 @@
 """Replayed calls: the numbers of traced ones, whatever changes between them, and no kernel compiled anew."""
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -101,3 +103,11 @@ def test_settings_are_no_constants():
     scaled = Replay(lambda x, factor: factor * x)
     for factor in (2., 3., 2.):
         assert scaled(mi.Float(1, 2), factor=factor).numpy().tolist() == [factor, 2 * factor]
+
+
+def test_collects_no_garbage_while_recording():
+    """A Mitsuba scene that is collected then would abort the process."""
+    collecting = []
+    noted = Replay(lambda x: collecting.append(gc.isenabled()) or 2 * x)
+    noted(mi.Float(1, 2))
+    assert collecting == [False] and gc.isenabled()

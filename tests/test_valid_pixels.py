@@ -12,7 +12,7 @@ from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS
-from lingo_mi.fit.step import Target
+from lingo_mi.fit.view import Target
 from lingo_mi.geometry import circular
 from lingo_mi.lingo.initialise import Settings, initialise
 from lingo_mi.lingo.masks import masks, truncated
@@ -197,8 +197,8 @@ def test_truncated_scans_keep_what_the_panel_misses():
 # ---- the fit -----------------------------------------------------------------------------------------------
 
 def kernels(scan, settings, start):
-    """Hashes of the compiled kernels of a fit, in the order of their launches."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    """Hashes of the compiled kernels of a fit, in the order of their launches, traced in every step."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
         dr.kernel_history_clear()
         run(scan, settings, start, seed=3)
         return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]

@@ -1,10 +1,7 @@
 """One step of the fit: render, compare, differentiate, and move the Gaussians."""
 from __future__ import annotations
 
-import functools
 import math
-import operator
-from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,55 +10,21 @@ import numpy as np
 from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Scan
-from ..xray.alpha import composite, flatten
-from ..xray.footprint import project
 from ..xray.frame import View, vector64
 from ..xray.objects import Ellipsoids
-from ..xray.radiance import seen
-from ..xray.splat import splat
 from ..xray.voxelize import Grid, voxelize
 from . import losses
 from .device import DeviceState, uploaded
-from .loss_scale import loss_scale
 from .model import RENEWED, model_of, trusted, weights_of
 from .poses import Poses, gathered, place
 from .scattered import RENEWED as SCATTER_RENEWED, light
 from .settings import Settings
-
-
-class Target:
-    """A measured view on the device: its rays, pixels (normalised line integrals over the fit's unit of density), which of
-    them are valid (None: all), what they are multiplied by before they are compared (None: nothing), and the scattered light
-    that is expected in them (None: none)."""
-
-    def __init__(self, scan: Scan, index: int, unit: float, weights=None):
-        height, width = scan.geometry.nDetector
-        # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
-        # panel would otherwise leave the fast path.
-        self.frames = scan.geometry.normalised_frames()[[index]]
-        self.view = View.of(self.frames, 0, height, width, panel=False)
-        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
-        self.weights = None if weights is None else uploaded(weights[index].ravel())
-        self.pixels = mi.Float(pixels if weights is None else pixels * weights[index].ravel())
-        dr.eval(self.pixels)
-        self.valid, self.scattered = None, None
-        if scan.valid is not None and not scan.valid[index].all():
-            self.valid = mi.Bool(scan.valid[index].ravel())
-            dr.make_opaque(self.valid)
-
-    def seen(self, image):
-        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
-
-        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
-        """
-        if self.weights is not None:
-            image = image * self.weights
-        return image if self.valid is None else dr.select(self.valid, image, 0)
+from .view import Target, add_gradient, differentiate, evaluate, footprints_of, integrals, leaves, pass_on
 
 
 def _targets(scan, unit, settings):
     weights = weights_of(scan, settings)
-    return [Target(scan, i, unit, weights) for i in range(len(scan))]
+    return [Target.of(scan, i, unit, weights) for i in range(len(scan))]
 
 
 class Stepper:
@@ -97,7 +60,7 @@ class Stepper:
             dr.enable_grad(value)
         gaussians = state.gaussians(s)
         # Each view and the cube add their derivatives to these; then one pass takes them to the raw parameters.
-        leaf = _leaf(gaussians)
+        leaf = leaves(gaussians)
         total = mi.Float(0)
         targets = self.coarse if iteration < self.coarse_until else self.targets
         for view in views:
@@ -105,12 +68,18 @@ class Stepper:
             if self.poses is not None:
                 frames = self.poses.correct(target.frames, view)
                 place(target.view, frames)
-            total += self._view(state, leaf, target, len(views))
+            if self.model is None and self.poses is None and s.render != 'alpha':
+                loss, norm, visible = add_gradient(leaf, target, s, len(views))
+            else:
+                loss, norm, visible = differentiate(leaf, target, s, len(views), self.model, self.share)
+            total += loss
+            state.gradient += norm
+            state.seen += visible
             if self.poses is not None:
                 self.poses.step(view, frames, gathered(target.view), s.rate('pose', iteration), s)
         if s.lambda_tv > 0:
             total += self._total_variation(leaf, rng)
-        _pass_on(leaf, gaussians)
+        pass_on(leaf, gaussians)
         gradients = {name: dr.grad(value) for name, value in state.values.items()}
         if self.flat:
             gradients['centre'].z, gradients['scale'].z = 0, 0
@@ -137,12 +106,12 @@ class Stepper:
             found = self.model.scattered.estimate(self.cloud(state), geometry)
             scattered = [uploaded(image.ravel()) for image in light(found, geometry)]
 
-        def integrals(rays):
-            return self._integrals(self._project(gaussians, rays), rays, share)
+        def along(rays):
+            return integrals(footprints_of(gaussians, rays, self.settings), rays, self.settings, share)
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
-            image = integrals(view)[0] if self.model is None else self.model.image(integrals, view, scattered[i])
+            image = along(view)[0] if self.model is None else self.model.image(along, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
@@ -201,52 +170,6 @@ class Stepper:
             for target, image in zip(targets, scan.projections):
                 target.scattered = uploaded(image.ravel())
 
-    def _project(self, gaussians, rays):
-        """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
-        if self.settings.render == 'alpha':
-            centre, scale, rotation, opacity, *radiance = gaussians
-            return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
-        return project(*gaussians, rays, self.settings.extent)
-
-    def _integrals(self, footprints, rays, share):
-        """Line integrals along the rays of a view, a list of Float: of the cloud, or of each of its two materials; or the grey
-        image that alpha compositing takes for them."""
-        if self.settings.render == 'alpha':
-            return [composite(footprints, rays.height, rays.width)]
-        amplitude, *others = footprints.values
-        parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
-        return [splat(replace(footprints, values=(part, *others)), rays.height, rays.width, self.settings.extent)
-                * rays.lengths() for part in parts]
-
-    def _view(self, state, gaussians, target, batch):
-        """Add one view's gradient to the parameters', and its part to the densification statistic."""
-        s, view = self.settings, target.view
-        bundles = []  # of rays: one, or all those that the model takes a mean over
-
-        def integrals(rays):
-            footprints = self._project(gaussians, rays)
-            leaf = _leaf(footprints.values)  # their derivatives are wanted themselves, for the statistic
-            bundles.append((footprints, leaf))
-            return self._integrals(replace(footprints, values=leaf), rays, self.share)
-        image = integrals(view)[0] if self.model is None else self.model.image(integrals, view, target.scattered)
-        loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
-        factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
-        weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
-        # Bundles share what leads to a view's pose, so its edges must outlast all but the last.
-        flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
-        dr.backward(loss * weight * (1 / batch), flags=flags)
-        # Not while derivatives are suspended: they would read as zero.
-        gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
-        footprints = bundles[len(bundles) // 2][0]
-        with dr.suspend_grad():
-            norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
-            state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
-            state.seen += dr.select(footprints.seen, 1., 0.)
-        for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
-            _pass_on(leaf, footprints.values, flags)
-            _evaluate(gaussians)
-        return dr.detach(loss) * (1 / batch)
-
     def _total_variation(self, gaussians, rng):
         """Add the gradient of the total variation of a cube at a random place (R2-Gaussian), its samples between the centres
         of the first and the last voxels."""
@@ -268,7 +191,7 @@ class Stepper:
         cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), s.extent)
         loss = s.lambda_tv * losses.tv(cube, shape[::-1])
         dr.backward(loss)
-        _evaluate(gaussians)
+        evaluate(gaussians)
         return dr.detach(loss)
 
 
@@ -278,24 +201,3 @@ def density_unit(scan: Scan, settings: Settings) -> float:
     if largest <= 0:
         raise InputError('the projections are zero everywhere: there is nothing to fit')
     return largest if settings.normalise else 1.
-
-
-def _leaf(values):
-    """Copies that gather derivatives, cut off from what the values were made of."""
-    copies = tuple(dr.detach(v) for v in values)
-    dr.enable_grad(copies)
-    return copies
-
-
-def _pass_on(leaf, values, flags=dr.ADFlag.Default):
-    """Propagate the derivatives gathered in a leaf through the making of its values."""
-    for value, copy in zip(values, leaf):
-        if dr.grad_enabled(value):
-            dr.set_grad(value, dr.grad(copy))
-            dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward, flags)
-
-
-def _evaluate(values):
-    """Evaluate all derivatives in one kernel; one by one, each would repeat the work that they share."""
-    dr.eval([dr.grad(value) for value in values])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..geometry import Geometry
 from .grid import gather, scatter, view_table, view_walk, whole_box

@@ -7,7 +7,9 @@ and settings.
 """
 from __future__ import annotations
 
+import gc
 from collections import OrderedDict
+from contextlib import contextmanager
 
 import drjit as dr
 
@@ -15,7 +17,7 @@ MOST = 16  # recordings of a function, the latest ones
 
 
 class Replay:
-    """A function of Dr.Jit arrays and of settings, which are hashable keyword arguments.
+    """A function of Dr.Jit arrays, or None in their place, and of settings, which are hashable keyword arguments.
 
     It may differentiate within, but no derivatives pass through it, and it must not wait for the device. What it returns is
     evaluated. `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` has it traced in every call.
@@ -31,4 +33,17 @@ class Replay:
         self.recordings[key] = recording
         if len(self.recordings) > MOST:
             self.recordings.popitem(last=False)
-        return recording(*map(dr.detach, arrays))
+        with _uncollected():
+            return recording(*(None if x is None else dr.detach(x) for x in arrays))
+
+
+@contextmanager
+def _uncollected():
+    """No garbage is collected: a Mitsuba scene's end, for one, is a call that cannot be recorded, which would kill the process."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()

@@ -1,0 +1,168 @@
+"""One measured view in a step of the fit: the cloud's image, the loss and its derivatives."""
+from __future__ import annotations
+
+import functools
+import operator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..scan import Scan
+from ..xray.alpha import composite, flatten
+from ..xray.footprint import project
+from ..xray.frame import View
+from ..xray.radiance import seen
+from ..xray.replay import Replay
+from ..xray.splat import splat
+from . import losses
+from .device import uploaded
+from .loss_scale import loss_scale
+from .settings import Settings
+
+
+@dataclass
+class Target:
+    """A measured view on the device.
+
+    view       its rays
+    pixels     Float [height * width], normalised line integrals over the fit's unit of density
+    weights    Float, what they were multiplied by and images are before they are compared; None: nothing
+    valid      Bool, which of them are valid; None: all
+    frames     the geometry's `Frames` of the view alone
+    scattered  Float, the scattered light that is expected in them; None: none
+    """
+
+    view: View
+    pixels: object
+    weights: object = None
+    valid: object = None
+    frames: object = None
+    scattered: object = None
+
+    @staticmethod
+    def of(scan: Scan, index: int, unit: float, weights=None) -> Target:
+        """View `index` of a scan; weights float32 [view, v, u] or None."""
+        height, width = scan.geometry.nDetector
+        frames = scan.geometry.normalised_frames()[[index]]
+        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
+        valid = None
+        if weights is not None:
+            weights = weights[index].ravel()
+            pixels, weights = pixels * weights, uploaded(weights)
+        if scan.valid is not None and not scan.valid[index].all():
+            valid = mi.Bool(scan.valid[index].ravel())
+            dr.make_opaque(valid)
+        # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
+        # panel would otherwise leave the fast path.
+        return Target(View.of(frames, 0, height, width, panel=False), uploaded(pixels), weights, valid, frames)
+
+    def seen(self, image):
+        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
+
+        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
+        """
+        if self.weights is not None:
+            image = image * self.weights
+        return image if self.valid is None else dr.select(self.valid, image, 0)
+
+
+
+def footprints_of(gaussians, rays, settings: Settings):
+    """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
+    if settings.render == 'alpha':
+        centre, scale, rotation, opacity, *radiance = gaussians
+        return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
+    return project(*gaussians, rays, settings.extent)
+
+
+def integrals(footprints, rays, settings: Settings, share=None) -> list:
+    """Line integrals along the rays of a view, a list of Float [height * width]: of the cloud, or of each of its two materials,
+    where `share` is the second one's share in every Gaussian; or the grey image that alpha compositing takes for them."""
+    if settings.render == 'alpha':
+        return [composite(footprints, rays.height, rays.width)]
+    amplitude, *others = footprints.values
+    parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
+    return [splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.extent)
+            * rays.lengths() for part in parts]
+
+
+def differentiate(gaussians, target: Target, settings: Settings, batch: int, model=None, share=None):
+    """Add the gradient of one view's loss to that of the Gaussians, which are leaves.
+
+    batch   views of a step, over which the loss is a mean
+    model   `model.Model`, what the detector sees; None: line integrals
+
+    Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
+    footprint's place, and 1 where a Gaussian is seen.
+    """
+    s, view = settings, target.view
+    bundles = []  # of rays: one, or all those that the model takes a mean over
+
+    def image_along(rays):
+        footprints = footprints_of(gaussians, rays, s)
+        leaf = leaves(footprints.values)  # their derivatives are wanted themselves, for the statistic
+        bundles.append((footprints, leaf))
+        return integrals(replace(footprints, values=leaf), rays, s, share)
+    image = image_along(view)[0] if model is None else model.image(image_along, view, target.scattered)
+    loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
+    weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
+    # Bundles share what leads to a view's pose, so its edges must outlast all but the last.
+    flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
+    dr.backward(loss * weight * (1 / batch), flags=flags)
+    # Not while derivatives are suspended: they would read as zero.
+    gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
+    footprints = bundles[len(bundles) // 2][0]
+    with dr.suspend_grad():
+        norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
+        norm = norm * factor if s.loss_scale == 'statistic' else norm
+        visible = dr.select(footprints.seen, mi.Float(1), 0)
+    for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
+        pass_on(leaf, footprints.values, flags)
+        evaluate(gaussians)
+    return dr.detach(loss) * (1 / batch), norm, visible
+
+
+def add_gradient(gaussians, target: Target, settings: Settings, batch: int):
+    """`differentiate` line integrals that are fitted as they are, replayed; the view's pose is a constant."""
+    view = target.view
+    *found, gradients = _REPLAY(
+        *gaussians, view.source, view.corner, view.u, view.v, target.pixels, target.weights, target.valid,
+        height=view.height, width=view.width, parallel=view.parallel, settings=settings, batch=batch)
+    for x, gradient in zip(gaussians, gradients):
+        dr.accum_grad(x, gradient)
+    return found
+
+
+def _differentiated(centre, scale, rotation, density, source, corner, u, v, pixels, weights, valid, height, width, parallel,
+                    settings, batch):
+    gaussians = centre, scale, rotation, density
+    dr.enable_grad(gaussians)
+    target = Target(View(source, corner, u, v, width, height, parallel, panel=False), pixels, weights, valid)
+    return *differentiate(gaussians, target, settings, batch), [dr.grad(x) for x in gaussians]
+
+
+_REPLAY = Replay(_differentiated)
+
+
+def leaves(values):
+    """Copies that gather derivatives, cut off from what the values were made of."""
+    copies = tuple(dr.detach(v) for v in values)
+    dr.enable_grad(copies)
+    return copies
+
+
+def pass_on(leaf, values, flags=dr.ADFlag.Default):
+    """Propagate the derivatives gathered in a leaf through the making of its values."""
+    for value, copy in zip(values, leaf):
+        if dr.grad_enabled(value):
+            dr.set_grad(value, dr.grad(copy))
+            dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward, flags)
+
+
+def evaluate(values):
+    """Evaluate all derivatives in one kernel; one by one, each would repeat the work that they share."""
+    dr.eval([dr.grad(value) for value in values])
