@@ -55,7 +55,8 @@ def stepper_of(effects, views=3, **changes):
 
 
 def kernels(function):
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+    """Hashes of the kernels of a function, traced in every call."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
         dr.kernel_history_clear()
         function()
         return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]
@@ -63,11 +64,11 @@ def kernels(function):
 
 # ---- absent costs nothing --------------------------------------------------------------------------------------------
 
-def plain_view(self, state, gaussians, target, batch):
+def plain_view(self, gaussians, target, batch):
     """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
     s, view = self.settings, target.view
     footprints = project(*gaussians, view, s.extent)
-    leaf = step._leaf(footprints.values)
+    leaf = step.leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
@@ -76,11 +77,11 @@ def plain_view(self, state, gaussians, target, batch):
     gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
-        state.gradient += norm * factor if s.loss_scale == 'statistic' else norm
-        state.seen += dr.select(footprints.row_end > footprints.row_begin, 1., 0.)
-    step._pass_on(leaf, footprints.values)
-    step._evaluate(gaussians)
-    return dr.detach(loss) * (1 / batch)
+        norm = norm * factor if s.loss_scale == 'statistic' else norm
+        seen = dr.select(footprints.row_end > footprints.row_begin, mi.Float(1), 0)
+    step.pass_on(leaf, footprints.values)
+    step.evaluate(gaussians)
+    return dr.detach(loss) * (1 / batch), norm, seen
 
 
 @pytest.mark.parametrize('effects, changes', [
@@ -156,15 +157,15 @@ def test_derivatives_by_differences(name):
 
     def loss(values):
         state.values = values
-        return float(stepper._view(state, step._leaf(state.gaussians(stepper.settings)), target, 1)[0])
+        return float(stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
     values = dict(state.values)
     for v in values.values():
         dr.enable_grad(v)
     state.values = values
     gaussians = state.gaussians(stepper.settings)
-    leaf = step._leaf(gaussians)
-    stepper._view(state, leaf, target, 1)
-    step._pass_on(leaf, gaussians)
+    leaf = step.leaves(gaussians)
+    stepper._view(leaf, target, 1)
+    step.pass_on(leaf, gaussians)
     rng = np.random.default_rng(1)
     for key, h in (('density', 2e-2), ('scale', 2e-2), ('centre', 4e-3)):
         plain = dr.detach(values[key])
@@ -184,7 +185,7 @@ def test_derivatives_by_the_pose_through_bundles():
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
         step.place(target.view, target.frames)
-        stepper._view(state, step._leaf(state.gaussians(stepper.settings)), target, 1)
+        stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)
         found.append(np.concatenate(list(step.gathered(target.view).values())))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
 

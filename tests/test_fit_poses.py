@@ -46,8 +46,8 @@ def test_derivatives_by_differences(mode):
     def loss(move):
         frames = here.moved(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
         place(target.view, frames)
-        leaf = step._leaf(state.gaussians(settings))
-        return float(stepper._view(state, leaf, target, 1)[0])
+        leaf = step.leaves(state.gaussians(settings))
+        return float(stepper._view(leaf, target, 1)[0][0])
     loss(np.zeros(6))
     poses = Poses(3)
     # Adam without memory: its first moment is the derivative.
@@ -120,7 +120,7 @@ def test_poses_left_alone_compile_nothing_new(monkeypatch):
     scan = tiny_scan(geometry(3))
 
     def kernels(settings):
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
             dr.kernel_history_clear()
             run(scan, settings, some_points(scan.geometry), seed=3)
             return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]

@@ -66,14 +66,14 @@ def test_the_light_is_a_constant_to_the_derivatives():
         state.values['density'] = mi.Float(plain)
         dr.enable_grad(state.values['density'])
         gaussians = state.gaussians(stepper.settings)
-        leaf = step._leaf(gaussians)
-        stepper._view(state, leaf, target, 1)
-        step._pass_on(leaf, gaussians)
+        leaf = step.leaves(gaussians)
+        stepper._view(leaf, target, 1)
+        step.pass_on(leaf, gaussians)
         found[lit] = dr.grad(state.values['density']).numpy()
 
     def loss(values):
         state.values['density'] = values
-        return float(stepper._view(state, step._leaf(state.gaussians(stepper.settings)), target, 1)[0])
+        return float(stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
     way = mi.Float(np.abs(np.random.default_rng(1).normal(size=len(state))).astype(np.float32) * np.sign(found[True]))
     expected = (loss(plain + .02 * way) - loss(plain - .02 * way)) / .04
     assert (found[True] * way.numpy()).sum() == pytest.approx(expected, rel=2e-2)

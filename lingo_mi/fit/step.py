@@ -68,10 +68,7 @@ class Stepper:
             if self.poses is not None:
                 frames = self.poses.correct(target.frames, view)
                 place(target.view, frames)
-            if self.model is None and self.poses is None and s.render != 'alpha':
-                loss, norm, visible = add_gradient(leaf, target, s, len(views))
-            else:
-                loss, norm, visible = differentiate(leaf, target, s, len(views), self.model, self.share)
+            loss, norm, visible = self._view(leaf, target, len(views))
             total += loss
             state.gradient += norm
             state.seen += visible
@@ -169,6 +166,11 @@ class Stepper:
         for targets, scan in ((self.targets, views), (self.coarse, views.binned(2))):
             for target, image in zip(targets, scan.projections):
                 target.scattered = uploaded(image.ravel())
+
+    def _view(self, leaf, target, batch):
+        if self.model is None and self.poses is None and self.settings.render != 'alpha':
+            return add_gradient(leaf, target, self.settings, batch)
+        return differentiate(leaf, target, self.settings, batch, self.model, self.share)
 
     def _total_variation(self, gaussians, rng):
         """Add the gradient of the total variation of a cube at a random place (R2-Gaussian), its samples between the centres

@@ -17,12 +17,20 @@ from .splat import splat
 
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
-POSE = 4                 # where a view begins among the inputs, behind a cloud's four parameters
+POSE = 4                 # arrays at the end of the inputs: source, corner, u, v
 PIXEL_VARIANCE = 1 / 12  # of a square of side 1, along either side
 
 
+def columns(rows):
+    """Centres Point3f, scales Vector3f and rotations Vector4f [N] of `ellipsoids`, from its rows of ten numbers, Float [10 N]."""
+    i = dr.arange(mi.UInt32, dr.width(rows) // 10) * 10
+    # Every entry is read once, so the derivative needs no atomics.
+    c = [dr.gather(mi.Float, rows, i + j, mode=dr.ReduceMode.Permute) for j in range(10)]
+    return mi.Point3f(*c[:3]), mi.Vector3f(*c[3:6]), mi.Vector4f(*c[6:])
+
+
 def line_integrals(centre, scale, rotation, density, view, extent: float = 4., primal: bool = True,
-                   affine: bool = False, area: bool = False):
+                   affine: bool = False, area: bool = False, rows=None):
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
@@ -34,11 +42,13 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     affine          the model of Gaussian splatting (EWA): |d|^2 frozen at each Gaussian's centre
     area            the mean over each pixel's area instead of the ray through its centre: the footprint convolved with a
                     Gaussian of the pixel's variance
+    rows            Float [10 N], what the first three are the `columns` of, if that is so; saves a copy of them
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
     no extent or no rotation leaves no finite pixel.
     """
-    inputs = centre, scale, rotation, density, view.source, view.corner, view.u, view.v
+    gaussians = (centre, scale, rotation, density) if rows is None else (rows, density)
+    inputs = *gaussians, view.source, view.corner, view.u, view.v
     settings = dict(width=view.width, height=view.height, parallel=view.parallel, panel=view.panel, extent=extent,
                     affine=affine, area=area)
     image, straddles = dr.custom(_Splatted, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
@@ -80,9 +90,11 @@ class _Splatted(dr.CustomOp):
         return 'line integrals'
 
 
-def _footprints(centre, scale, rotation, density, source, corner, u, v, width, height, parallel, panel, extent, affine, area):
-    view = View(source, corner, u, v, width, height, parallel, panel)
-    footprints = project(centre, scale, rotation, density, view, extent, PIXEL_VARIANCE if area else 0.)
+def _footprints(*inputs, width, height, parallel, panel, extent, affine, area):
+    *shapes, density = inputs[:-POSE]
+    view = View(*inputs[-POSE:], width, height, parallel, panel)
+    shapes = columns(*shapes) if len(shapes) == 1 else shapes
+    footprints = project(*shapes, density, view, extent, PIXEL_VARIANCE if area else 0.)
     return view, _affine(footprints) if affine else footprints
 
 
@@ -99,7 +111,7 @@ def _primal(*inputs, width, height, **settings):
 def _gradient(*inputs, wanted, **settings):
     *inputs, upstream = inputs
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
-    of_pose = any(wanted[POSE:])  # which changes what the splat's image is multiplied by, too
+    of_pose = any(wanted[-POSE:])  # which changes what the splat's image is multiplied by, too
     dr.backward_from(_image(*inputs, primal=of_pose, **settings)[0] * upstream)
     return tuple(dr.grad(x) for x in inputs)
 

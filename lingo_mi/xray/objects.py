@@ -59,15 +59,7 @@ class Ellipsoids:
             raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
         data, self.density = params['data'], params['density']
         self.second = params['second'] if 'second' in params else None  # share of a second material
-        count = dr.width(self.density)
-        i = dr.arange(mi.UInt32, count) * 10
-
-        def column(j):
-            # Every entry is read once, so the derivative needs no atomics.
-            return dr.gather(mi.Float, data, i + j, mode=dr.ReduceMode.Permute)
-        self.centre = mi.Point3f(*(column(j) for j in range(3)))
-        self.scale = mi.Vector3f(*(column(j) for j in range(3, 6)))
-        self.rotation = mi.Vector4f(*(column(j) for j in range(6, 10)))
+        self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
         key = data.index, self.density.index
         if key not in _USABLE and self._usable():
             while len(_USABLE) >= MOST_USABLE:
@@ -105,12 +97,12 @@ class Ellipsoids:
         be None."""
         self = cls.__new__(cls)
         self.centre, self.scale, self.rotation, self.density = centre, scale, rotation, density
-        self.second, self.name = second, name
+        self.second, self.name, self.rows = second, name, None
         return self
 
     def line_integrals(self, view, extent, primal, affine=False, area=False):
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, extent, primal,
-                                    affine, area)
+                                    affine, area, self.rows)
 
 
 class GridInCube:
