@@ -84,7 +84,8 @@ class _Splatted(dr.CustomOp):
         self.set_grad_out((dr.grad(image), footprints.straddles))
 
     def backward(self):
-        self.set_grad_in('inputs', _GRADIENT(*self.inputs, self.grad_out()[0], wanted=self.wanted, **self.settings))
+        self.set_grad_in('inputs', _GRADIENT(*self.inputs, self.grad_out()[0], wanted=self.wanted, parts=self.parts,
+                                             **self.settings))
 
     def name(self):
         return 'line integrals'
@@ -108,11 +109,11 @@ def _primal(*inputs, width, height, **settings):
     return image, f.straddles, deepest((f.column, f.row), f.area, (width, height))
 
 
-def _gradient(*inputs, wanted, **settings):
+def _gradient(*inputs, wanted, parts, **settings):
     *inputs, upstream = inputs
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
     of_pose = any(wanted[-POSE:])  # which changes what the splat's image is multiplied by, too
-    dr.backward_from(_image(*inputs, primal=of_pose, **settings)[0] * upstream)
+    dr.backward_from(_image(*inputs, primal=of_pose, parts=parts, **settings)[0] * upstream)
     return tuple(dr.grad(x) for x in inputs)
 
 
