@@ -51,7 +51,7 @@ NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # num
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (refined, dict(completed_niter=2, niter=25, exact_every=5))}
+              'refined': (refined, dict(completed_niter=2, niter=20, exact_every=5))}
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def test_two_stages(out):
     measured = train.subset([0, 6, 12, 18])
     stepper, state = cells._cloud(fit)
     first = tables.sart(whole, niter=2, init=stepper.volume(state)).volume
-    then = tables.asd_pocs(measured, niter=25, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=first).volume
+    then = tables.asd_pocs(measured, niter=20, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=first).volume
     assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(then, truth), abs=1e-3)
     assert rows['refined']['none'] is None and groups('ct', [4], [20], ['3dgs'], ['refined'])[0].columns[1].cell('foot') is None
 

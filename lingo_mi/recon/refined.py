@@ -7,7 +7,7 @@ from .sart import sart
 from .system import Reconstruction, check_counts
 
 
-def refined(scan: Scan, niter: int = 25, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
+def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
             alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, seed: int = 0, *,
             completed: Scan, init, progress=None) -> Reconstruction:
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
