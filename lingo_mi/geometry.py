@@ -29,7 +29,7 @@ from .frames import Frames, scanner_frames
 
 __all__ = ['Frames', 'Geometry', 'circular', 'helix', 'spread']
 
-_SAME = 1e-3  # pixels by which a pose may miss a circle and still be one
+SAME = 1e-3  # pixels by which a pose may miss a circle and still be one
 
 
 @dataclass(frozen=True)
@@ -104,10 +104,9 @@ class Geometry:
         nDetector   (v, u) pixels; the other arguments as for the class
 
         Poses that are a circle's to a thousandth of a pixel (the source around z, the panel upright, rows down) give the
-        plain geometry of that circle, which filtered backprojection and every file format know. Otherwise the nominal
-        DSO is the mean distance from the source to the volume's centre, DSD that to the panel's plane, dDetector the
-        mean length of the steps, `angles` the directions to the source as seen from above. Raises InputError for poses
-        that are none, see `Frames.checked`.
+        plain geometry of that circle, which every file format knows. Otherwise the nominal DSO is the mean distance from
+        the source to the volume's centre, DSD that to the panel's plane, dDetector the mean length of the steps, `angles`
+        the directions to the source as seen from above. Raises InputError for poses that are none, see `Frames.checked`.
         """
         frames = frames.checked()
         nDetector = tuple(int(n) for n in nDetector)
@@ -246,7 +245,7 @@ def _circle(frames: Frames, nDetector) -> dict | None:
                           circle['offDetector'])
     # A beam's direction moves what it meets at a distance.
     reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1
-    allowed = _SAME * min(circle['dDetector'])
+    allowed = SAME * min(circle['dDetector'])
     near = all(np.abs(a - b).max() * size <= allowed for a, b, size in (
         (frames.source, like.source, reach), (frames.corner, like.corner, 1), (frames.u, like.u, nDetector[1]),
         (frames.v, like.v, nDetector[0])))

@@ -45,7 +45,7 @@ def assert_ball(volume, geo):
     near = np.linalg.norm(x - BALL[0], axis=-1)
     assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005
     for axis in range(3):
-        inside = near < 35
+        inside = near < 30  # farther out, the faint shading of what a cone misses weighs by its distance
         position = np.average(x[inside][:, axis], weights=volume[inside])
         assert abs(position - BALL[0][axis]) < 0.1 * geo.dVoxel[axis]
 

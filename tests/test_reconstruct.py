@@ -67,6 +67,17 @@ def test_the_volume_is_the_functions(scene, dataset, tmp_path):
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(dataset.train.subset([0, 2, 4, 6]), 2).volume)
 
 
+def test_fdk_of_a_turned_panel(dataset, tmp_path):
+    """As good as of the scene whose panel is upright."""
+    panel = '<string name="dDetector" value="1.8, 1.8"/>'
+    path = changed_scene(tmp_path, (panel, panel + '<string name="rotDetector" value="3, -4, 5"/>'))
+    code, _, err = run(RECONSTRUCT, path, '--out', tmp_path / 'v.nii')
+    assert code == 0, err
+    volume, turned = load(tmp_path / 'v.nii'), take_scan(load_scene(path)).train
+    assert psnr_3d(volume, dataset.volume) > psnr_3d(fdk(dataset.train), dataset.volume) - .3
+    np.testing.assert_array_equal(volume, fdk(turned))
+
+
 def test_two_stage(scene, dataset, fitted, tmp_path):
     code, text, err = run(RECONSTRUCT, scene, '--complete', fitted, '--views', '16', '--out', tmp_path / 'v.nii')
     assert code == 0 and 'of 16 views' in text, err

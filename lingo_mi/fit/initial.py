@@ -8,8 +8,8 @@ import numpy as np
 
 from ..lingo import initialise as lingo
 from ..lingo.initialise import InitialCloud
-from ..recon.circle import on_circle
 from ..recon.fdk import fdk
+from ..recon.upright import is_circular
 from ..scan import Scan
 from .device import DeviceState
 from .loop import bounded
@@ -45,7 +45,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings.changed(weights='equal'), unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
-        density = 'lsq' if settings.init_density == 'fdk' and not on_circle(scan) else settings.init_density
+        density = 'lsq' if settings.init_density == 'fdk' and not is_circular(scan) else settings.init_density
         chosen = lingo.Settings(
             n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
             resolution=settings.occupancy_voxels, V_S=settings.V_S, density=density,

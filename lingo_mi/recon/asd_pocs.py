@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..scan import Scan
-from .circle import on_circle
 from .fdk import fdk
 from .sart import blocks, sweep
 from .system import LARGE, Reconstruction, System, check_bound, check_counts, check_range, dot, evaluated, norm, scalar
+from .upright import is_circular
 
 EPSILON = 1e-8   # added to the squared gradient, relative to its largest value in the volume: TV is not smooth at zero
 LMBDA_MIN = 0.005
@@ -110,7 +110,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     blocks(angles, blocksize, order, rng)
     x = system.start(init)
     if maxl2err is None:
-        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if on_circle(scan) else 0.
+        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if is_circular(scan) else 0.
     residuals = [system.residual(x)[1]]
     step = None
     for k in range(niter):

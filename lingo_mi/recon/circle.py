@@ -1,4 +1,4 @@
-"""What reconstruction on voxels asks of a scan."""
+"""What reconstruction on voxels asks of a scan, and how its views lie around the circle."""
 from __future__ import annotations
 
 from itertools import product
@@ -19,6 +19,11 @@ def require_circle(scan: Scan, what: str):
     """Raises InputError, naming what needs it, for a scan that is not `on_circle`."""
     if scan.geometry.poses is not None:
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
+    require_pixels(scan, what)
+
+
+def require_pixels(scan: Scan, what: str):
+    """Raises InputError, naming what needs them, where not all pixels are valid."""
     if scan.valid is not None:
         raise InputError(f'{what} needs every pixel, and some of this scan are not valid: fill them first')
 
@@ -43,3 +48,22 @@ def require_signal(scan: Scan):
         raise InputError('the projections are zero everywhere: there is nothing to reconstruct')
     if scan.projections.max() <= 0:
         raise InputError('the projections are nowhere above zero: there is nothing to reconstruct; check their sign')
+
+
+def gaps(geometry: Geometry, turn: float):
+    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
+
+    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
+    step.
+    """
+    angle = np.mod(geometry.angles, turn)
+    order = np.argsort(angle, kind='stable')
+    gap = np.diff(angle[order], append=angle[order[0]] + turn)
+    distinct = np.sort(gap[gap > 1e-6])
+    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
+    is_open = bool(distinct[-1] > 1.5 * typical)
+    if is_open:
+        widest = np.argmax(gap)
+        gap[widest] = typical
+        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
+    return order, gap, is_open

@@ -10,8 +10,8 @@ from ..effects.forward import Effects
 from ..scan import Scan
 from ..scanning import render_objects, render_with
 from ..xray.objects import GridInCube
-from .circle import on_circle
 from .fdk import fdk
+from .upright import is_circular
 
 PASSES = 2  # over the scattered light; from the third on, FDK's own errors grow
 
@@ -44,7 +44,7 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
         found = replace(found, projections=np.where(scan.projections <= least + 1e-6, np.float32(0), found.projections))
     if effects.scatter is None:
         return found
-    if not on_circle(scan):
+    if not is_circular(scan):
         warnings.warn('scatter stays in the projections for filtered backprojection and initial clouds: its estimate needs a '
                       'source on a circle and all pixels', stacklevel=2)
         return found

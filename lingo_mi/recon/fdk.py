@@ -21,7 +21,8 @@ from ..errors import InputError
 from ..geometry import Geometry
 from ..lingo.camera import camera_matrices
 from ..scan import Scan
-from .circle import require_circle
+from .circle import gaps
+from .upright import upright
 
 # Apodisation of the ramp over |frequency| in units of the Nyquist frequency, f in [0, 1].
 WINDOWS = {
@@ -53,25 +54,6 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
     kernel[0] = 1 / (4 * tau ** 2)
     response = tau * fft.rfft(kernel).real
     return response * shape(np.linspace(0, 1, len(response)))
-
-
-def gaps(geometry: Geometry, turn: float):
-    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
-
-    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
-    step.
-    """
-    angle = np.mod(geometry.angles, turn)
-    order = np.argsort(angle, kind='stable')
-    gap = np.diff(angle[order], append=angle[order[0]] + turn)
-    distinct = np.sort(gap[gap > 1e-6])
-    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
-    is_open = bool(distinct[-1] > 1.5 * typical)
-    if is_open:
-        widest = np.argmax(gap)
-        gap[widest] = typical
-        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
-    return order, gap, is_open
 
 
 def view_weights(geometry: Geometry) -> np.ndarray:
@@ -207,7 +189,8 @@ def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
     """Reconstruct a volume by filtered backprojection: float32 [x, y, z], density per mm.
 
     scan       cone (one detector row: fan) or parallel, detector offsets included; the views together must see the
-               whole width of the object, otherwise the truncated rows are filtered as they are
+               whole width of the object, otherwise the truncated rows are filtered as they are. What a panel that is turned
+               or tilted has measured is brought to an upright one first (`upright`)
     filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'; TIGRE's 'ram_lak' and 'shepp_logan' are known too
     progress   called as progress(views done, views) after every few views
 
@@ -215,10 +198,11 @@ def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
     view. With one detector row only the slice in the plane of the fan is meaningful. One compiled kernel serves all
     views.
 
-    Raises InputError for an unknown filter, a scan that is no circle about z, or one with pixels that are not valid.
+    Raises InputError for an unknown filter, a source that moves on no circle about z, a panel that moves against it, or pixels
+    that are not valid.
     """
     ramp(scan.geometry.nDetector[1], 1., filter)  # an unknown name must fail before the work
-    require_circle(scan, 'filtered backprojection')
+    scan = upright(scan, 'filtered backprojection')
     rays = ray_weights(scan.geometry)[:, None].astype(np.float32)
     scan = extended(Scan(scan.geometry, scan.projections * rays))
     geometry = scan.geometry

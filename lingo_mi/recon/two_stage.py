@@ -21,9 +21,8 @@ from ..results import METRICS
 from ..scan import Dataset, Scan
 from ..scanning import check_memory, load_scene, render_objects
 from ..xray.objects import Ellipsoids, find_objects
-from .circle import require_circle
+from .circle import gaps, require_circle
 from .corrections import corrected
-from .fdk import gaps
 
 WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or xgaussian'
 
