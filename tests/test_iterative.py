@@ -1,5 +1,6 @@
 """SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, the analytic ball, bad input."""
 import inspect
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -40,12 +41,12 @@ def divide(a, b):
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
-def sart_pass(x, A, b, lmbda, parts, nonneg=True):
+def sart_pass(x, A, b, lmbda, parts, noneg=True):
     """One pass of SART as Andersen and Kak write it."""
     for part in parts:
         rows, data = np.concatenate(A[part]), np.concatenate(b[part])
         x = x + lmbda * divide(rows.T @ divide(data - rows @ x, rows.sum(1)), rows.sum(0))
-        x = np.maximum(x, 0) if nonneg else x
+        x = np.maximum(x, 0) if noneg else x
     return x
 
 
@@ -53,24 +54,24 @@ def close(result, expected):
     np.testing.assert_allclose(result.volume.ravel(), expected, atol=1e-4 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize('blocksize, nonneg', [(1, True), (2, True), (2, False), (5, True)])
-def test_sart_is_the_transcription(system, blocksize, nonneg):
+@pytest.mark.parametrize('blocksize, noneg', [(1, True), (2, True), (2, False), (5, True)])
+def test_sart_is_the_transcription(system, blocksize, noneg):
     scan, A, b = system
     start = np.random.default_rng(1).random(scan.geometry.nVoxel)
-    result = os_sart(scan, 3, blocksize, 0.8, 0.9, nonneg, 'ordered', start)
+    result = os_sart(scan, 3, blocksize, 0.8, 0.9, noneg, 'ordered', start)
     x = start.ravel()
     expected = [np.linalg.norm(A @ x - b) / np.linalg.norm(b)]
     for k in range(3):
-        x = sart_pass(x, A, b, 0.8 * 0.9 ** k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], nonneg)
+        x = sart_pass(x, A, b, 0.8 * 0.9 ** k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], noneg)
         expected.append(np.linalg.norm(A @ x - b) / np.linalg.norm(b))
     close(result, x)
     np.testing.assert_allclose(result.residuals, expected, rtol=1e-4)
-    assert (result.volume.min() < 0) != nonneg
+    assert (result.volume.min() < 0) != noneg
 
 
 def test_names_of_the_family(system):
     scan, _, _ = system
-    np.testing.assert_array_equal(sirt(scan, 2).volume, os_sart(scan, 2, 5, order='ordered').volume)
+    np.testing.assert_array_equal(sirt(scan, 2).volume, os_sart(scan, 2, 5, OrderStrategy='ordered').volume)
     np.testing.assert_array_equal(sart(scan, 2).volume, os_sart(scan, 2, 1).volume)
     assert np.abs(sart(scan, 1).volume - sart(scan, 1, seed=1).volume).max() > 0
 
@@ -82,6 +83,25 @@ def test_orders():
     assert sorted(np.concatenate(drawn)) == list(range(10)) and np.any(np.diff(np.concatenate(drawn)) != 1)
     spread = np.concatenate(blocks(circular(8), 1, 'angularDistance', rng))
     assert list(spread[:2]) == [0, 4] and set(spread[2:4]) == {2, 6} and sorted(spread) == list(range(8))
+
+
+@pytest.mark.parametrize('strategy', ['ordered', 'random', 'angularDistance'])
+def test_order_strategy(system, strategy):
+    """SART visits the views as `blocks` says, drawn anew every pass."""
+    scan, A, b = system
+    rng, x = np.random.default_rng(3), np.zeros(A.shape[2])
+    blocks(scan.geometry.angles, 1, strategy, rng)  # the first draw is for a check of the name
+    for _ in range(2):
+        x = sart_pass(x, A, b, 0.8, blocks(scan.geometry.angles, 1, strategy, rng))
+    close(sart(scan, 2, 0.8, 1., OrderStrategy=strategy, seed=3), x)
+
+
+@pytest.mark.parametrize('name', ['sart', 'sirt', 'asd_pocs'])
+def test_noneg(system, name):
+    scan = replace(system[0], projections=system[0].projections - system[0].projections.mean())
+    kept, free = (ALGORITHMS[name](scan, niter=2, noneg=noneg).volume for noneg in (True, False))
+    assert free.min() < -.1 * free.max()
+    assert kept.min() >= (-.01 * kept.max() if name == 'asd_pocs' else 0)  # whose descent comes after
 
 
 def test_cgls_is_lsqr_and_its_residual_falls(system):
@@ -126,7 +146,7 @@ def test_tv_gradient():
 def test_asd_pocs_is_the_transcription(system):
     scan, A, b = system
     shape, maxl2err = scan.geometry.nVoxel, 0.05 * np.linalg.norm(b)
-    result = asd_pocs(scan, 4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, order='ordered')
+    result = asd_pocs(scan, 4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, OrderStrategy='ordered')
     x, lmbda, step, errors = np.zeros(A.shape[2]), 0.9, None, []
     for _ in range(4):
         start = x
@@ -161,7 +181,7 @@ def test_asd_pocs_meets_exact_line_integrals():
 def test_asd_pocs_stops(system):
     scan, _, _ = system
     assert len(asd_pocs(scan, 50, 5, 0.01, 0.8, maxl2err=1.).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
-    met = dict(tviter=5, alpha=0.02, lmbda_red=1., alpha_red=1., maxl2err=1e9, order='ordered')
+    met = dict(tviter=5, alpha=0.02, lmbda_red=1., alpha_red=1., maxl2err=1e9, OrderStrategy='ordered')
     assert len(asd_pocs(scan, 100, 5, **met).residuals) < 100  # the data are met at once: the steps come to undo each other
     assert len(asd_pocs(scan, 100, 5, **{**met, 'maxl2err': 1e-9}).residuals) == 101
 
@@ -206,9 +226,9 @@ def test_bad_input(name):
     if name != 'cgls':
         with pytest.raises(InputError, match='lmbda'):
             run(scan, lmbda=3.)
-    if name in ('os_sart', 'asd_pocs'):
-        with pytest.raises(InputError, match='order'):
-            run(scan, order='sorted')
+    if name in ('sart', 'os_sart', 'asd_pocs'):
+        with pytest.raises(InputError, match='OrderStrategy .sorted. is unknown: use one of ordered, random, angularDistance'):
+            run(scan, OrderStrategy='sorted')
     if name == 'asd_pocs':
         with pytest.raises(InputError, match='exact_every'):
             run(scan, exact_every=-1)

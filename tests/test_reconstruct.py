@@ -48,8 +48,9 @@ def load(path):
 
 
 @pytest.mark.parametrize('algorithm, options', [
-    ('fdk', ['filter=hann']), ('sart', ['niter=2']), ('os-sart', ['niter=2', 'blocksize=3']), ('sirt', ['niter=2']),
-    ('cgls', ['niter=3', 'tol=0.01']), ('asd-pocs', ['niter=2', 'tviter=3', 'nonneg=true', 'maxl2err=5'])])
+    ('fdk', ['filter=hann']), ('sart', ['niter=2', 'OrderStrategy=angularDistance']),
+    ('os-sart', ['niter=2', 'blocksize=3', 'noneg=false']), ('sirt', ['niter=2']),
+    ('cgls', ['niter=3', 'tol=0.01']), ('asd-pocs', ['niter=2', 'tviter=3', 'noneg=true', 'maxl2err=5'])])
 def test_every_algorithm(scene, dataset, tmp_path, algorithm, options):
     out = tmp_path / 'new' / 'volume.nii.gz'
     defined = (a for o in options for a in ('-D', o))
@@ -198,8 +199,9 @@ def test_missing_angles(dataset):
 @pytest.mark.parametrize('args, message', [
     (['--views', '99'], 'the scan has 8'), (['--views', '-1'], '--views'), (['-D', 'nitre=3'], 'nitre'),
     (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
-    (['--algorithm', 'sart', '-D', 'nonneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
+    (['--algorithm', 'sart', '-D', 'noneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'),
+    (['--algorithm', 'sart', '-D', 'OrderStrategy=sorted'], 'ordered, random, angularDistance'),
     (['--algorithm', 'sart', '-D', 'seed=-1'], 'seed must be'), (['--algorithm', 'asd-pocs', '-D', 'alpha=inf'], 'alpha must'),
     (['-D', 'filter=box'], 'ram-lak'), (['--out', 'v.npy'], '.nii'),
     (['--algorithm', 'voxelize'], '--complete'), (['--views', '0'], '--views must be at least 1'),

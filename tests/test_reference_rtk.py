@@ -51,7 +51,7 @@ def test_sart():
     system = System(scan)
     x = system.start(None)
     for niter in range(1, 5):
-        x = sweep(system, x, 1., [[view] for view in RTK_ORDER], nonneg=True)
+        x = sweep(system, x, 1., [[view] for view in RTK_ORDER], noneg=True)
         theirs = rtk.reconstruct('SART', scan, itk, Lambda=1., EnforcePositivity=True, NumberOfProjectionsPerSubset=1,
                                  NumberOfIterations=niter, BackProjectionFilter=JOSEPH)
         assert np.linalg.norm(system.volume(x) - theirs) < 0.01 * np.linalg.norm(theirs)

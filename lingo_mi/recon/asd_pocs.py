@@ -75,7 +75,7 @@ def check_parameters(*, niter, tviter, alpha, alpha_red, rmax, maxl2err, exact_e
 
 def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1., lmbda_red: float = 0.99, tviter: int = 20,
              alpha: float = 0.002, alpha_red: float = 0.95, rmax: float = 0.95, maxl2err: float | None = None,
-             nonneg: bool = True, order: str = 'random', exact_every: int = 0, init=None, seed: int = 0,
+             noneg: bool = True, OrderStrategy: str = 'random', exact_every: int = 0, init=None, seed: int = 0,
              progress=None) -> Reconstruction:
     """Adaptive steepest descent, projection onto convex sets.
 
@@ -90,8 +90,9 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     rmax         see `alpha_red`
     maxl2err     |A x - b| at which the data count as met, density times mm (default: 0.2 |A fdk(b) - b|; 0 for scans that FDK
                  does not know, so that the step shortens wherever total variation changes too much)
-    nonneg       whether negative densities are set to zero by the data step
-    order        of the blocks, see `os_sart`
+    noneg        whether negative densities are set to zero by the data step
+    OrderStrategy
+                 of the blocks, see `os_sart`
     exact_every  passes between corrections of the projections for what Joseph's projector is off (`System.correct`), before the
                  first pass and after every so many; 0 for none
     init         start volume [x, y, z], density per mm (default: zero)
@@ -107,7 +108,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
                      exact_every=exact_every, seed=seed, blocksize=blocksize, lmbda=lmbda, lmbda_red=lmbda_red)
     system, rng = System(scan), np.random.default_rng(seed)
     angles, size = scan.geometry.angles, scan.geometry.nVoxel
-    blocks(angles, blocksize, order, rng)
+    blocks(angles, blocksize, OrderStrategy, rng)
     x = system.start(init)
     if maxl2err is None:
         maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if is_circular(scan) else 0.
@@ -117,7 +118,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
         if exact_every and k % exact_every == 0:
             system.correct(x)
         start = x
-        x = sweep(system, x, lmbda, blocks(angles, blocksize, order, rng), nonneg)
+        x = sweep(system, x, lmbda, blocks(angles, blocksize, OrderStrategy, rng), noneg)
         residuals.append(system.residual(x)[1])
         error = residuals[-1] * system.size_b
         data_change = evaluated(x - start)

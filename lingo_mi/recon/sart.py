@@ -5,8 +5,8 @@ block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray meets is left alone. The defaults of lmbda, lmbda_red and blocksize are
-TIGRE's; its `noneg` is `nonneg` here, its `OrderStrategy` is `order`.
+where division is by voxel and by pixel, and what no ray meets is left alone. The parameters have the names of TIGRE for
+Python, and its defaults lmbda, lmbda_red, blocksize and noneg; that of OrderStrategy is TIGRE's for MATLAB.
 """
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
     if order == 'random':
         return [parts[i] for i in rng.permutation(len(parts))]
     if order != 'angularDistance':
-        raise InputError(f'order {order!r} is unknown: use one of {", ".join(ORDERS)}')
+        raise InputError(f'OrderStrategy {order!r} is unknown: use one of {", ".join(ORDERS)}')
     middle = np.array([angles[p[len(p) // 2]] for p in parts])
     nearest, out = np.full(len(parts), np.inf), [0]
     while len(out) < len(parts):
@@ -45,7 +45,7 @@ def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
     return [parts[i] for i in out]
 
 
-def sweep(system: System, x, lmbda: float, parts, nonneg: bool):
+def sweep(system: System, x, lmbda: float, parts, noneg: bool):
     """One pass over all blocks: the new volume, on the device."""
     A, step = system.A, scalar(lmbda)
     for views in parts:
@@ -56,26 +56,26 @@ def sweep(system: System, x, lmbda: float, parts, nonneg: bool):
         def updated(voxel, change, weight, x=x):
             change = dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0)
             value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
-            return dr.maximum(value, 0) if nonneg else value
+            return dr.maximum(value, 0) if noneg else value
         x = evaluated(A.adjoint(error, views, updated))
     return x
 
 
 def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1., lmbda_red: float = 0.99,
-            nonneg: bool = True, order: str = 'random', init=None, tol: float = 0., seed: int = 0,
+            noneg: bool = True, OrderStrategy: str = 'random', init=None, tol: float = 0., seed: int = 0,
             progress=None) -> Reconstruction:
     """Ordered-subset SART.
 
-    scan        projections and geometry
-    niter       passes over all views
-    blocksize   views an update
-    lmbda       relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
-    nonneg      whether negative densities are set to zero after every update
-    order       of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance'
-    init        start volume [x, y, z], density per mm (default: zero)
-    tol         stop when |A x - b| / |b| is no larger
-    seed        of the random order
-    progress    called as progress(passes done, niter, residual)
+    scan            projections and geometry
+    niter           passes over all views
+    blocksize       views an update
+    lmbda           relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
+    noneg           whether negative densities are set to zero after every update
+    OrderStrategy   of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
+    init            start volume [x, y, z], density per mm (default: zero)
+    tol             stop when |A x - b| / |b| is no larger
+    seed            of the random order
+    progress        called as progress(passes done, niter, residual)
 
     Raises InputError for a parameter out of its range, a start volume that does not fit, and where the result is not finite.
     """
@@ -85,26 +85,26 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     check_range('lmbda_red', lmbda_red, 0, 1)
     check_bound('tol', tol)
     system, rng = System(scan), np.random.default_rng(seed)
-    blocks(scan.geometry.angles, blocksize, order, rng)  # an unknown order must fail before the work
+    blocks(scan.geometry.angles, blocksize, OrderStrategy, rng)  # an unknown order must fail before the work
     x = system.start(init)
     residuals = [system.residual(x)[1]]
     for k in range(niter):
         if residuals[-1] <= tol:
             break
-        x = sweep(system, x, lmbda * lmbda_red ** k, blocks(scan.geometry.angles, blocksize, order, rng), nonneg)
+        x = sweep(system, x, lmbda * lmbda_red ** k, blocks(scan.geometry.angles, blocksize, OrderStrategy, rng), noneg)
         residuals.append(system.residual(x)[1])
         if progress:
             progress(k + 1, niter, residuals[-1])
     return Reconstruction(system.volume(x), residuals)
 
 
-def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True,
-         order: str = 'random', init=None, tol: float = 0., seed: int = 0, progress=None) -> Reconstruction:
+def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True,
+         OrderStrategy: str = 'random', init=None, tol: float = 0., seed: int = 0, progress=None) -> Reconstruction:
     """SART: an update after every view. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, 1, lmbda, lmbda_red, nonneg, order, init, tol, seed, progress)
+    return os_sart(scan, niter, 1, lmbda, lmbda_red, noneg, OrderStrategy, init, tol, seed, progress)
 
 
-def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, nonneg: bool = True, init=None,
+def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True, init=None,
          tol: float = 0., progress=None) -> Reconstruction:
     """SIRT: one update from all views. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, nonneg, 'ordered', init, tol, progress=progress)
+    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, noneg, 'ordered', init, tol, progress=progress)
