@@ -101,6 +101,8 @@ def plain(error: Exception) -> str:
     if ours:
         lines = re.findall(r'\(line (\d+), col \d+\)', text)
         return (f'line {lines[-1]}: ' if lines else '') + ours[-1].strip()
+    if '"ellipsoids"' in text and '(sizes: 0, 1)' in text:  # what becomes of no Gaussians in Mitsuba
+        return 'the shape ellipsoids holds no Gaussian: give it a file or data of at least one'
     text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]
     return ' '.join(lines)[:400] or type(error).__name__

@@ -50,7 +50,9 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          (Default: `centre`)
      * - output
        - |string|
-       - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral).
+       - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral),
+         which float32 holds for integrals above -88: where densities are more negative, it is infinite, without a
+         warning, since to look for one every rendering would have to wait for the device.
          (Default: `line_integral`)
 
     Beer-Lambert line integrals through everything in the scene that attenuates:

@@ -103,6 +103,18 @@ def test_bad_scene(tmp_path, monkeypatch, old, new, says):
     assert says in refused(tmp_path, tmp_path / 'scene.xml')
 
 
+def test_a_cloud_of_nothing(tmp_path):
+    """In Mitsuba it ends in operands of incompatible sizes."""
+    from lingo_mi.files.ply import _PROPERTIES
+    (tmp_path / 'empty.ply').write_text('\n'.join([
+        'ply', 'format binary_little_endian 1.0', 'element vertex 0', *(f'property float {name}' for name in _PROPERTIES),
+        'end_header', '']))
+    start, end = SCENE.index('<shape'), SCENE.index('</shape>')
+    (tmp_path / 'scene.xml').write_text(
+        SCENE[:start] + '<shape type="ellipsoids"><string name="filename" value="empty.ply"/>' + SCENE[end:])
+    assert 'holds no Gaussian' in refused(tmp_path, tmp_path / 'scene.xml')
+
+
 # ---- arguments -------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('args, says', [
