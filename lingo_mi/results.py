@@ -116,10 +116,7 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
         return None if result is None or reference is None else _number(function(result, reference))
     return dict(
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth), psnr_2d=of(metrics.psnr_2d, rendered, truth),
-        ssim_2d=of(metrics.ssim_2d, rendered, truth), psnr_3d=of(metrics.psnr_3d, volume, dataset.volume),
-        ssim_3d=of(metrics.ssim_3d, volume, dataset.volume),
-        psnr_3d_absolute=of(metrics.psnr_3d_absolute, volume, dataset.volume),
-        ssim_3d_absolute=of(metrics.ssim_3d_absolute, volume, dataset.volume),
+        ssim_2d=of(metrics.ssim_2d, rendered, truth), **compared(volume, dataset.volume),
         ipsd=_number(ipsd(fitted.initial, born)), ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
         gaussians=len(fitted.state), iterations=fitted.settings.iterations,
@@ -183,13 +180,31 @@ def _number(x: float):
     return x if np.isfinite(x) else None
 
 
+def compared(volume, truth) -> dict:
+    """PSNR and SSIM of a volume, in both of their forms; None where there is nothing to compare, or no number."""
+    names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
+    if volume is None or truth is None:
+        return dict.fromkeys(names)
+    return {name: _number(getattr(metrics, name)(volume, truth)) for name in names}
+
+
+def volume_quality(result: dict) -> str:
+    """The lines of a volume's numbers (`compared`): for densities in any unit first, then R2-Gaussian's, for those up to 1."""
+    return (f'volume          {_shown(result, "psnr_3d_absolute", "ssim_3d_absolute")} (full scale: the largest true density)\n'
+            f'                {_shown(result, "psnr_3d", "ssim_3d")} (full scale: 1, as in R2-Gaussian)')
+
+
+def _shown(result: dict, psnr: str, ssim: str) -> str:
+    psnr, ssim = ('n/a' if result[name] is None else form.format(result[name])
+                  for name, form in ((psnr, '{:.2f} dB'), (ssim, '{:.4f}')))
+    return f'PSNR {psnr}, SSIM {ssim}'
+
+
 def summary(result: dict) -> str:
     """The main numbers of a result, one line each."""
-    def show(name, form, unit):
-        return form.format(result[name]) + unit if result[name] is not None else 'n/a'
     return '\n'.join([
-        f'held-out views  PSNR {show("psnr_2d", "{:.2f}", " dB")}, SSIM {show("ssim_2d", "{:.4f}", "")}',
-        f'volume          PSNR {show("psnr_3d", "{:.2f}", " dB")}, SSIM {show("ssim_3d", "{:.4f}", "")}',
+        f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}',
+        volume_quality(result),
         f'cloud           {result["gaussians"]:,} Gaussians after {result["iterations"]} iterations of '
         f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
         f'{result["seconds_fit"]:.0f} s to fit'])

@@ -13,7 +13,7 @@ are rendered from it, and the volume is made of both; the scan must be one on a 
 pixel. refined, which is the best for few clean views, starts from the cloud's own volume, meets all views first and the
 measured ones then. With --start, the volume is made of the views that the cloud was fitted to, by an iterative algorithm that
 starts from the cloud's own volume; any scan will do. Poses that the fit has corrected are used as it has left them, but not by
-fdk. Where the true volume is known, PSNR and SSIM are printed.
+fdk. Where the true volume is known, PSNR and SSIM are printed, with its largest density for full scale, then with 1.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 """
@@ -81,7 +81,6 @@ def options(function, given: dict[str, str]) -> dict:
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi import metrics
     from lingo_mi.files.volumes import first_voxel, write_volume
     from lingo_mi.progress import Progress
     from lingo_mi.recon.asd_pocs import asd_pocs
@@ -92,6 +91,7 @@ def main():
     from lingo_mi.recon.refined import refined
     from lingo_mi.recon.sart import os_sart, sart, sirt
     from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, without_effects
+    from lingo_mi.results import compared, volume_quality
     from lingo_mi.scanning import defaults, load_scene, voxelize_cloud
 
     check_input(args)
@@ -159,8 +159,7 @@ def main():
     print(f'{args.algorithm} of {of} views: {seconds:.1f} s'
           + (f', |A x - b| / |b| = {residuals[-1]:.4g} after {len(residuals) - 1} iterations' if residuals else ''))
     if dataset.volume is not None:
-        print(f'volume          PSNR {metrics.psnr_3d(volume, dataset.volume):.2f} dB, '
-              f'SSIM {metrics.ssim_3d(volume, dataset.volume):.4f}')
+        print(volume_quality(compared(volume, dataset.volume)))
     print(out)
 
 

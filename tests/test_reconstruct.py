@@ -17,12 +17,12 @@ from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry import circular
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
 from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, missing_angles, without_effects
-from lingo_mi.results import write_scene
+from lingo_mi.results import compared, volume_quality, write_scene
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scanning import load_scene, render_objects, take_scan, voxelize_cloud
 
@@ -56,8 +56,12 @@ def test_every_algorithm(scene, dataset, tmp_path, algorithm, options):
     defined = (a for o in options for a in ('-D', o))
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, '--out', out, *defined)
     assert code == 0, err
-    shown = float(re.search(r'PSNR (\S+) dB', text)[1])
-    assert abs(shown - psnr_3d(load(out), dataset.volume)) < 0.006 and shown > 10
+    shown = [float(x) for x in re.findall(r'PSNR (\S+) dB', text)]
+    volume, truth = load(out), dataset.volume / 2
+    assert abs(shown[0] - psnr_3d_absolute(volume, dataset.volume)) < 0.006
+    assert abs(shown[1] - psnr_3d(volume, dataset.volume)) < 0.006 and shown[1] > 10
+    lines = volume_quality(compared(volume / 2, truth)).splitlines()  # in another unit the first line stays, the second not
+    assert lines[0] in text and lines[1] not in text
     assert ('|A x - b|' in text) == (algorithm != 'fdk') and 'of 8 views' in text and str(out) in text
 
 
