@@ -39,23 +39,19 @@ def centres(geo):
 BALL = (np.array([12., -9., 6.]), np.array([25., 25., 25.]), 0.02)
 
 
-def assert_ball(volume, geo):
-    """BALL's density within 0.5 % around its centre, and its position within a tenth of a voxel."""
+def ball_errors(volume, geo):
+    """What is wrong with BALL: its mean density within half its radius, relative, and its place, in voxels of the worst axis."""
     x = centres(geo)
     near = np.linalg.norm(x - BALL[0], axis=-1)
-    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005
-    for axis in range(3):
-        inside = near < 30  # farther out, the faint shading of what a cone misses weighs by its distance
-        position = np.average(x[inside][:, axis], weights=volume[inside])
-        assert abs(position - BALL[0][axis]) < 0.1 * geo.dVoxel[axis]
+    inside = near < 30  # farther out, the faint shading of what a cone misses weighs by its distance
+    place = np.average(x[inside], axis=0, weights=volume[inside])
+    return volume[near < 12].mean() / 0.02 - 1, np.max(np.abs(place - BALL[0]) / geo.dVoxel)
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-def test_ball_density_and_position_with_offsets(mode):
-    geo = geometry(mode)
-    volume = fdk(ellipsoids(geo, BALL))
-    assert volume.shape == geo.nVoxel and volume.dtype == np.float32
-    assert_ball(volume, geo)
+def assert_ball(volume, geo):
+    """BALL's density within 0.5 % around its centre, and its position within a tenth of a voxel."""
+    density, place = ball_errors(volume, geo)
+    assert abs(density) < 0.005 and place < 0.1
 
 
 def test_asymmetric_phantom_axis_by_axis():

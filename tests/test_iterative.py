@@ -1,4 +1,4 @@
-"""SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, the analytic ball, bad input."""
+"""SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, bad input."""
 import inspect
 from dataclasses import replace
 
@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.sparse.linalg import lsqr
-from test_fdk import BALL, assert_ball, ellipsoids, geometry
 from test_grid_projector import scan as small
 from test_joseph import matrix
 
@@ -184,22 +183,6 @@ def test_asd_pocs_stops(system):
     met = dict(tviter=5, alpha=0.02, lmbda_red=1., alpha_red=1., maxl2err=1e9, OrderStrategy='ordered')
     assert len(asd_pocs(scan, 100, 5, **met).residuals) < 100  # the data are met at once: the steps come to undo each other
     assert len(asd_pocs(scan, 100, 5, **{**met, 'maxl2err': 1e-9}).residuals) == 101
-
-
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('name, options', [('sart', dict(niter=3)), ('cgls', dict(niter=12))])
-def test_ball_density_and_position(mode, name, options):
-    geo = geometry(mode, circular(40 if name == 'sart' else 120, start=3))
-    assert_ball(ALGORITHMS[name](ellipsoids(geo, BALL), **options).volume, geo)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('name', ['sart', 'os_sart', 'asd_pocs'])
-def test_ball_from_360_views(mode, name):
-    geo = geometry(mode)
-    options = {} if name == 'asd_pocs' else dict(tol=1e-3)
-    assert_ball(ALGORITHMS[name](ellipsoids(geo, BALL), niter=5, **options).volume, geo)
 
 
 @pytest.mark.parametrize('name', ALGORITHMS)
