@@ -70,11 +70,30 @@ def test_the_panel_holds_the_shadow_and_is_no_coarser(mode, angles, offset):
         assert max(s.max() for s in steps) < 1.01 and min(s.min() for s in steps) > 0.85  # and no finer than it must be
 
 
+@pytest.mark.parametrize('degrees', [(0, 0, 90), (0, 0, -88), (180, 0, 0)])
+def test_a_panel_on_its_side_or_from_behind(degrees):
+    geo = geometry(angles=circular(180))
+    volume = fdk(ellipsoids(moved(geo, degrees), *BODIES))
+    assert_ball(volume, geo)
+    assert rms(volume - fdk(ellipsoids(geo, *BODIES)), geo) < 0.03
+
+
 def test_an_axis_off_centre():
     """The source beside the central ray of its panel goes round the axis all the same."""
     geo = moved(geometry(angles=circular(180)), COR=8.)
     assert geo.poses is not None
     assert_ball(fdk(ellipsoids(geo, BALL)), geo)
+
+
+@pytest.mark.parametrize('degrees', [(6, 0, 0), (0, 4, 0), (-6, 3, 0), (0, 0, .3), (0, 0, .7)])
+def test_fan_beam_of_one_row(degrees):
+    geo = geometry(nDetector=(1, 72), nVoxel=(36, 36, 1), dVoxel=(4., 4., 2.), offOrigin=(0., 0., 0.), offDetector=(0., -7.))
+    turned = moved(geo, degrees)
+    centre = np.array([12., -9., 0.])
+    volume = fdk(ellipsoids(turned, (centre, np.full(3, 25.), 0.02)))
+    assert abs(volume[np.linalg.norm(centres(geo) - centre, axis=-1) < 12].mean() / 0.02 - 1) < 0.01
+    with pytest.raises(InputError, match='turned in its plane too far'):
+        upright_geometry(moved(geo, (0, 0, 2)))
 
 
 def test_upright_scans_are_left_alone():

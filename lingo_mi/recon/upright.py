@@ -25,8 +25,8 @@ def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
     scan   all pixels valid; the source moves on a circle about z around the origin, the panel with it
     what   needs such a panel, for messages
 
-    The geometry is `upright_geometry`. Values between pixels are those of cubic splines, and zero where the real panel ends. A
-    scan on a circle before an upright panel is returned as it is.
+    The geometry is `upright_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
+    real panel on. A scan on a circle before an upright panel is returned as it is.
 
     Raises InputError for pixels that are not valid, and for a source or a panel that moves otherwise.
     """
@@ -40,7 +40,8 @@ def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
     for view, to_real in enumerate(_homographies(geometry.frames(), scan.geometry.frames())):
         x, y, w = to_real @ there
         x, y = x / w, y / w
-        seen = (w > 0) & (x > 0) & (x < n_u) & (y > 0) & (y < n_v)
+        # Half a pixel more than there is: a single row that is turned by little lies between two new ones.
+        seen = (w > 0) & (x > -0.5) & (x < n_u + 0.5) & (y > -0.5) & (y < n_v + 0.5)
         value = ndimage.map_coordinates(scan.projections[view], [y - 0.5, x - 0.5], order=3, mode='nearest')
         out[view] = np.where(seen, value, 0).reshape(geometry.nDetector)
     return Scan(geometry, out)
@@ -82,11 +83,16 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     if shadow[:, 2].min() <= 0:
         raise InputError(f'{what} needs a panel behind the axis; a part of this one is beside the source')
     shadow /= shadow[:, 2:]
-    side = np.sort(shadow[:, :2], axis=2)  # [view, u and v, corner]: two corners on either side
-    if np.any(np.abs(side - np.median(side, 0)) > MOVES * np.median(side[..., 3] - side[..., 0], 0)[:, None]):
+    typical = np.median(shadow, 0)
+    if np.any(np.abs(shadow - typical)[:, :2] > MOVES * np.ptp(typical[:2], 1)[:, None]):
         raise InputError(f'{what} needs a panel that keeps its place behind the source; this scan has other poses')
-    (left, inner_left, inner_right, right), (top, *_, bottom) = (
-        (s[:, 0].min(), s[:, 1].max(), s[:, 2].min(), s[:, 3].max()) for s in (side[:, 0], side[:, 1]))
+    across = np.abs(typical[:2, 1] - typical[:2, 0])
+    x, y = (shadow if across[0] > across[1] else shadow[:, :, [0, 2, 1, 3]])[:, :2].swapaxes(0, 1)  # columns may be rows
+    left, inner_left, inner_right, right = _ends(x[:, [0, 2]], x[:, [1, 3]])
+    top, inner_top, inner_bottom, bottom = _ends(y[:, [0, 1]], y[:, [2, 3]])
+    if inner_top >= inner_bottom:
+        raise InputError(f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in its '
+                         'plane too far for its rows')
     if len(geometry) > 1 and not gaps(geometry, 2 * np.pi)[2]:
         if inner_right > -left:
             left = inner_left
@@ -99,6 +105,12 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     return Geometry(DSO, DSD, tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
                     (step_v, step_u), geometry.nVoxel, geometry.dVoxel, angles, geometry.mode, geometry.offOrigin,
                     (-(top + bottom) / 2, (left + right) / 2))
+
+
+def _ends(a, b):
+    """How far two opposite edges [view, end] reach: out and in on the lower side, in and out on the upper one."""
+    low, high = (a, b) if a.mean() < b.mean() else (b, a)
+    return low.min(), low.max(), high.min(), high.max()
 
 
 def _homographies(of: Frames, on: Frames) -> np.ndarray:
