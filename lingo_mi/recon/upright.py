@@ -63,7 +63,8 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side
     where the last row begins to see: `fdk.ray_weights` knows no rows. Else that of a closed circle reaches as far on both.
 
-    Raises InputError where the source leaves a circle about z, or the panel moves against it by more than a tenth of its size.
+    Raises InputError where the source leaves a circle about z, where the panel moves against it by more than a tenth of its
+    size, is turned so far that no line along the circle crosses it, or is not wholly before the source.
     """
     if geometry.poses is None:
         return geometry
@@ -86,13 +87,10 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     typical = np.median(shadow, 0)
     if np.any(np.abs(shadow - typical)[:, :2] > MOVES * np.ptp(typical[:2], 1)[:, None]):
         raise InputError(f'{what} needs a panel that keeps its place behind the source; this scan has other poses')
-    across = np.abs(typical[:2, 1] - typical[:2, 0])
-    x, y = (shadow if across[0] > across[1] else shadow[:, :, [0, 2, 1, 3]])[:, :2].swapaxes(0, 1)  # columns may be rows
-    left, inner_left, inner_right, right = _ends(x[:, [0, 2]], x[:, [1, 3]])
-    top, inner_top, inner_bottom, bottom = _ends(y[:, [0, 1]], y[:, [2, 3]])
+    (left, inner_left, inner_right, right), (top, inner_top, inner_bottom, bottom) = _ends(shadow)
     if inner_top >= inner_bottom:
-        raise InputError(f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in its '
-                         'plane too far for its rows')
+        raise InputError(f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in '
+                         'its plane too far')
     if len(geometry) > 1 and not gaps(geometry, 2 * np.pi)[2]:
         if inner_right > -left:
             left = inner_left
@@ -107,10 +105,14 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
                     (-(top + bottom) / 2, (left + right) / 2))
 
 
-def _ends(a, b):
-    """How far two opposite edges [view, end] reach: out and in on the lower side, in and out on the upper one."""
-    low, high = (a, b) if a.mean() < b.mean() else (b, a)
-    return low.min(), low.max(), high.min(), high.max()
+def _ends(shadow):
+    """How far a shadow's edges [view, 3, corner] reach along both axes: out and in on one side, in and out on the other."""
+    across, down = np.abs(shadow[:, :2, 1:3] - shadow[:, :2, :1]).mean(0).T
+    if across[0] < down[0]:  # a panel on its side: its columns lie along the circle
+        shadow = shadow[:, :, [0, 2, 1, 3]]
+    for edges in (shadow[:, 0, [0, 2]], shadow[:, 0, [1, 3]]), (shadow[:, 1, [0, 1]], shadow[:, 1, [2, 3]]):
+        low, high = sorted(edges, key=np.mean)
+        yield low.min(), low.max(), high.min(), high.max()
 
 
 def _homographies(of: Frames, on: Frames) -> np.ndarray:
