@@ -15,7 +15,7 @@ PANELS = {'(4, -7) mm': (72, (4., -7.)), '(4, 50) mm': (40, (4., 50.))}
 
 SMALL = {'fdk': (360, {}), 'sart': (40, dict(niter=3)), 'os_sart': (60, dict(niter=4, blocksize=6)),
          'sirt': (40, dict(niter=30, lmbda=1.9, lmbda_red=1.)), 'cgls': (120, dict(niter=12)), 'asd_pocs': (40, dict(niter=5))}
-LARGE = {'fdk': {}, 'sart': dict(niter=4, lmbda=.3), 'os_sart': dict(niter=20),
+LARGE = {'fdk': {}, 'sart': dict(niter=5, lmbda_red=.7), 'os_sart': dict(niter=20),
          'sirt': dict(niter=50, lmbda=1.9, lmbda_red=1.), 'cgls': dict(niter=45), 'asd_pocs': dict(niter=3)}
 
 
