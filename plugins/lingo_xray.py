@@ -42,7 +42,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          (Default: `exact`)
      * - pixel
        - |string| or |int|
-       - `centre`, the ray through a pixel's centre; `area`, the mean over the pixel in closed form, at the same cost, for
+       - `centre`, the ray through a pixel's centre; `area`, the mean over the pixel in closed form, at hardly more cost, for
          scenes of Gaussians alone (each footprint convolved with a Gaussian of the pixel's variance: off by a
          thousandth where a standard deviation is a pixel, by the fourth power of their ratio elsewhere); or n, the mean
          over n x n rays, for pixels that are not small against any object. With n, intensities are averaged in

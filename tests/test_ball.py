@@ -10,7 +10,7 @@ from test_iterative import ALGORITHMS
 from lingo_mi.geometry import circular
 from lingo_mi.recon.fdk import fdk
 
-# A panel off the axis by a few pixels, and one that sees 110 mm on one side of the axis, 10 mm on the other.
+# A panel off the axis by a few pixels, and one that reaches 110 mm on one side of the central ray, 10 mm on the other.
 PANELS = {'(4, -7) mm': (72, (4., -7.)), '(4, 50) mm': (40, (4., 50.))}
 
 SMALL = {'fdk': (360, {}), 'sart': (40, dict(niter=3)), 'os_sart': (60, dict(niter=4, blocksize=6)),

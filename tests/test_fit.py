@@ -252,11 +252,13 @@ def test_no_kernel_is_compiled_after_the_first_steps():
     assert not {i: len(hashes) for i, hashes in fresh.items() if i > 5 and hashes}
 
 
-@pytest.mark.parametrize('batch', [1, 2])
-def test_replayed_steps_are_the_traced_ones(scan, batch):
+@pytest.mark.parametrize('masked', [False, True])
+@pytest.mark.parametrize('changes', [dict(loss_scale='dynamic', batch=2), dict(loss_scale='statistic')])
+def test_replayed_steps_are_the_traced_ones(scan, changes, masked):
     """To the last bit, through densifications and with views of two sizes."""
-    settings = SHORT.changed(iterations=20, densify_from=0, densify_every=5, loss_scale='dynamic', batch=batch,
-                             coarse_share=.3)
+    settings = SHORT.changed(iterations=20, densify_from=0, densify_every=5, coarse_share=.3, **changes)
+    if masked:
+        scan = replace(scan, valid=np.random.default_rng(0).random(scan.projections.shape) > .1)
     found = []
     for frozen in (False, True):
         with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):

@@ -6,9 +6,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from lingo_mi.errors import InputError
 from lingo_mi.fit.device import uploaded
 from lingo_mi.xray import replay
-from lingo_mi.xray.cloud import line_integrals
+from lingo_mi.xray.cloud import columns, line_integrals
 from lingo_mi.xray.frame import View, vector64
 from lingo_mi.xray.replay import Replay
 
@@ -29,7 +30,7 @@ def cloud(n, seed=0):
     return mi.Point3f(centre), mi.Vector3f(scale), mi.Vector4f(rotation), *density
 
 
-def image_and_gradients(gaussians, rays, wanted, frozen, **settings):
+def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, **settings):
     """The image and the derivatives by those of the inputs that are wanted, evaluated."""
     with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
         inputs = *(dr.detach(x) for x in gaussians), *(dr.detach(x) for x in (rays.source, rays.corner, rays.u, rays.v))
@@ -37,7 +38,8 @@ def image_and_gradients(gaussians, rays, wanted, frozen, **settings):
         dr.enable_grad(leaves)
         rays = View(*inputs[4:], rays.width, rays.height, rays.parallel, rays.panel)
         image = line_integrals(*inputs[:4], rays, **settings)
-        dr.backward(image * mi.Float(np.random.default_rng(1).normal(size=dr.width(image)).astype(np.float32)))
+        weights = mi.Float(np.random.default_rng(1).normal(size=dr.width(image)).astype(np.float32))
+        dr.backward(image * (weights if weight is None else weight))
         found = [dr.detach(image), *(dr.grad(x) for x in leaves)]
         dr.eval(found)
         return found
@@ -63,6 +65,11 @@ def calls():
         'by the pose, too': (cloud(200), view(), ALL, {}),
         'by the pose alone': (cloud(200), view(), (4, 5, 6, 7), {}),
         'a density for all': ((*cloud(200)[:3], mi.Float(.5)), view(), CLOUD, {}),
+        'another density for all': ((*cloud(200)[:3], mi.Float(.25)), view(), CLOUD, {}),
+        'round': ((cloud(200)[0], mi.Vector3f(cloud(200)[1].x), *cloud(200)[2:]), view(), CLOUD, {}),
+        'a pile': (tuple(type(x)(dr.repeat(x, 3000)) for x in cloud(1)), view(), CLOUD, {}),
+        'equal weights': (cloud(200), view(), CLOUD, dict(weight=2.)),
+        'other equal weights': (cloud(200), view(), CLOUD, dict(weight=3.)),
     }
 
 
@@ -90,6 +97,41 @@ def test_compiles_nothing_anew():
         history = dr.kernel_history()
     fresh = [k['hash'] for k in history if k['type'] == dr.KernelType.JIT and (not k['cache_hit'] or k['cache_disk'])]
     assert len(history) > 40 and not fresh
+
+
+def test_from_rows():
+    """As `lingo_xray` calls it: to the last bit what the columns give."""
+    rows = uploaded(np.concatenate([np.array(x) for x in cloud(200)[:3]]).T.ravel())
+    upstream, found = uploaded(np.random.default_rng(2).normal(size=SIDE ** 2)), []
+    for by_rows in (False, True, True):
+        dr.disable_grad(rows)
+        dr.enable_grad(rows)
+        image = line_integrals(*columns(rows), cloud(200)[3], view(), rows=rows if by_rows else None)
+        dr.backward(image * upstream)
+        found.append((image.numpy(), dr.grad(rows).numpy()))
+    for other in found[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(found[0], other, strict=True))
+    assert all(np.abs(x).max() > 0 for x in found[0])
+
+
+def test_derivatives_alone():
+    """Without the image, as `mi.render` asks for in its backward pass."""
+    gaussians = cloud(200)
+    with_image, without = (image_and_gradients(gaussians, view(), CLOUD, True, primal=primal) for primal in (True, False))
+    assert not np.any(np.array(without[0])) and np.any(np.array(with_image[0]))
+    assert all(np.array_equal(np.array(a), np.array(b)) for a, b in zip(with_image[1:], without[1:], strict=True))
+
+
+def test_an_empty_cloud_is_refused():
+    with pytest.raises(InputError, match='at least one Gaussian'):
+        line_integrals(mi.Point3f(), mi.Vector3f(), mi.Vector4f(), mi.Float(), view())
+
+
+def test_exceptions_are_those_of_the_function():
+    def refuse(x):
+        raise InputError('no')
+    with pytest.raises(InputError, match='no'):
+        Replay(refuse)(mi.Float(1, 2))
 
 
 def test_recordings_are_few():

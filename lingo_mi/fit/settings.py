@@ -26,7 +26,7 @@ class Settings:
     cuboid_step        voxels between the points of `cuboid` (X-Gaussian: 8)
     high_fraction, low_factor, occupancy_voxels, V_S, misses, outside, init_density
                        of `lingo`: see `lingo_mi.lingo.initialise.Settings`; the density 'fdk' becomes 'lsq' where FDK
-                       cannot reconstruct (a source off the circle, invalid pixels)
+                       cannot reconstruct (a source off the circle, a panel that moves against it, invalid pixels)
     fdk_threshold, fdk_rescale
                        of `r2`: see `lingo_mi.fit.r2_init` (R2: 0.05 and 0.15)
     normalise          whether densities are fitted in a unit that makes the largest line integral 1 (own): SSIM's

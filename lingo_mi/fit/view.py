@@ -68,7 +68,6 @@ class Target:
         return image if self.valid is None else dr.select(self.valid, image, 0)
 
 
-
 def footprints_of(gaussians, rays, settings: Settings):
     """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
     if settings.render == 'alpha':
@@ -130,17 +129,17 @@ def add_gradient(gaussians, target: Target, settings: Settings, batch: int):
     view = target.view
     *found, gradients = _REPLAY(
         *gaussians, view.source, view.corner, view.u, view.v, target.pixels, target.weights, target.valid,
-        height=view.height, width=view.width, parallel=view.parallel, settings=settings, batch=batch)
+        height=view.height, width=view.width, parallel=view.parallel, panel=view.panel, settings=settings, batch=batch)
     for x, gradient in zip(gaussians, gradients):
         dr.accum_grad(x, gradient)
     return found
 
 
 def _differentiated(centre, scale, rotation, density, source, corner, u, v, pixels, weights, valid, height, width, parallel,
-                    settings, batch):
+                    panel, settings, batch):
     gaussians = centre, scale, rotation, density
     dr.enable_grad(gaussians)
-    target = Target(View(source, corner, u, v, width, height, parallel, panel=False), pixels, weights, valid)
+    target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)
     return *differentiate(gaussians, target, settings, batch), [dr.grad(x) for x in gaussians]
 
 

@@ -11,7 +11,8 @@ from ..scan import Scan
 
 
 def on_circle(scan: Scan) -> bool:
-    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid."""
+    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid; `upright.is_circular`
+    asks the same of a panel that is turned or tilted."""
     return scan.geometry.poses is None and scan.valid is None
 
 

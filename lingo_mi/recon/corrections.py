@@ -46,7 +46,7 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
         return found
     if not is_circular(scan):
         warnings.warn('scatter stays in the projections for filtered backprojection and initial clouds: its estimate needs a '
-                      'source on a circle and all pixels', stacklevel=2)
+                      'source on a circle with its panel, and all pixels', stacklevel=2)
         return found
     g = scan.geometry
     scatter = effects.scatter.within(g)

@@ -5,8 +5,8 @@ block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray meets is left alone. The parameters have the names of TIGRE for
-Python, and its defaults lmbda, lmbda_red, blocksize and noneg; that of OrderStrategy is TIGRE's for MATLAB.
+where division is by voxel and by pixel, and what no ray meets is left alone. Parameters that TIGRE has carry its names
+for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy that of TIGRE for MATLAB.
 """
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import AccuracyWarning
+from ..errors import AccuracyWarning, InputError
 from .depth import deepest, parts_of
 from .footprint import NAMES, project
 from .frame import View
@@ -45,8 +45,10 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     rows            Float [10 N], what the first three are the `columns` of, if that is so; saves a copy of them
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
-    no extent or no rotation leaves no finite pixel.
+    no extent or no rotation leaves no finite pixel. Raises InputError for an empty cloud.
     """
+    if dr.width(density) == 0:
+        raise InputError('the cloud is empty: it needs at least one Gaussian')
     gaussians = (centre, scale, rotation, density) if rows is None else (rows, density)
     inputs = *gaussians, view.source, view.corner, view.u, view.v
     settings = dict(width=view.width, height=view.height, parallel=view.parallel, panel=view.panel, extent=extent,
@@ -81,7 +83,7 @@ class _Splatted(dr.CustomOp):
         dr.set_grad(leaves, self.grad_in('inputs'))
         image, footprints = _image(*leaves, **self.settings, parts=self.parts)
         dr.forward_to(image)
-        self.set_grad_out((dr.grad(image), footprints.straddles))
+        self.set_grad_out((dr.grad(image), footprints.straddles))  # the latter has no tangent, and keeps its place
 
     def backward(self):
         self.set_grad_in('inputs', _GRADIENT(*self.inputs, self.grad_out()[0], wanted=self.wanted, parts=self.parts,

@@ -19,8 +19,10 @@ MOST = 16  # recordings of a function, the latest ones
 class Replay:
     """A function of Dr.Jit arrays, or None in their place, and of settings, which are hashable keyword arguments.
 
-    It may differentiate within, but no derivatives pass through it, and it must not wait for the device. What it returns is
-    evaluated. `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` has it traced in every call.
+    It may differentiate within, but no derivatives pass through it, and it must not wait for the device. No array may be empty.
+    What it returns is evaluated; what it raises, the caller gets. Whatever else it reads, names of its module for one, is a
+    constant to the recordings, of which new variants, flags and literals make new ones. It is not for several threads at once.
+    `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` has it traced in every call.
     """
 
     def __init__(self, function):
@@ -33,13 +35,16 @@ class Replay:
         self.recordings[key] = recording
         if len(self.recordings) > MOST:
             self.recordings.popitem(last=False)
-        with _uncollected():
-            return recording(*(None if x is None else dr.detach(x) for x in arrays))
+        try:
+            with _uncollected():
+                return recording(*(None if x is None else dr.detach(x) for x in arrays))
+        except RuntimeError as error:  # Dr.Jit's, around what was raised in a recording
+            raise error.__cause__ or error
 
 
 @contextmanager
 def _uncollected():
-    """No garbage is collected: a Mitsuba scene's end, for one, is a call that cannot be recorded, which would kill the process."""
+    """No garbage is collected: a Mitsuba scene's end, for one, cannot be recorded and would kill the process."""
     enabled = gc.isenabled()
     gc.disable()
     try:
