@@ -4,7 +4,7 @@
     python scripts/accuracy.py
     python scripts/accuracy.py --quick
 
-Writes accuracy.json and accuracy.md to --out. The full run (8 to 15 minutes on two cores) also renews docs/figures/ and
+Writes accuracy.json and accuracy.md to --out. The full run (6 to 15 minutes on two cores) also renews docs/figures/ and
 the tables in docs/accuracy.md; --quick (under 3 minutes) leaves them alone, without --docs, and writes its plots to --out.
 """
 import argparse

@@ -19,7 +19,7 @@ from .model import RENEWED, model_of, trusted, weights_of
 from .poses import Poses, gathered, place
 from .scattered import RENEWED as SCATTER_RENEWED, light
 from .settings import Settings
-from .view import Target, add_gradient, differentiate, evaluate, footprints_of, integrals, leaves, pass_on
+from .view import Target, differentiate, differentiate_replayed, evaluate, footprints_of, integrals, leaves, pass_on
 
 
 def _targets(scan, unit, settings):
@@ -168,8 +168,9 @@ class Stepper:
                 target.scattered = uploaded(image.ravel())
 
     def _view(self, leaf, target, batch):
+        """`differentiate` a view: replayed, where nothing but line integrals from known poses is fitted."""
         if self.model is None and self.poses is None and self.settings.render != 'alpha':
-            return add_gradient(leaf, target, self.settings, batch)
+            return differentiate_replayed(leaf, target, self.settings, batch)
         return differentiate(leaf, target, self.settings, batch, self.model, self.share)
 
     def _total_variation(self, gaussians, rng):

@@ -124,7 +124,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, mod
     return dr.detach(loss) * (1 / batch), norm, visible
 
 
-def add_gradient(gaussians, target: Target, settings: Settings, batch: int):
+def differentiate_replayed(gaussians, target: Target, settings: Settings, batch: int):
     """`differentiate` line integrals that are fitted as they are, replayed; the view's pose is a constant."""
     view = target.view
     *found, gradients = _REPLAY(

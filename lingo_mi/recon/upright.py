@@ -69,16 +69,9 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     if geometry.poses is None:
         return geometry
     frames, (n_v, n_u) = geometry.poses, geometry.nDetector
-    out = -frames.source if frames.parallel else frames.source
-    angles = np.arctan2(out[:, 1], out[:, 0])
-    DSO = 0. if frames.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
-    depth = -np.sum(frames.centre(geometry.nDetector)[:, :2] * np.stack([np.cos(angles), np.sin(angles)], 1), 1)
-    DSD = DSO + max(float(depth.mean()), 0.)
+    DSO, DSD, angles = _circle(geometry, what)
     # Its positions are mm from the central ray, along the circle and downwards.
     plane = scanner_frames(angles, DSO, DSD, (0, 0), (1., 1.), frames.parallel)
-    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1.
-    if np.abs(plane.source - frames.source).max() * reach > SAME * min(geometry.dDetector):
-        raise InputError(f'{what} needs a source on a circle about z; this scan has other poses')
     corners = np.array([[0, n_u, 0, n_u], [0, 0, n_v, n_v], [1, 1, 1, 1]], float)
     shadow = _homographies(frames, plane) @ corners
     if shadow[:, 2].min() <= 0:
@@ -103,6 +96,21 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     return Geometry(DSO, DSD, tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
                     (step_v, step_u), geometry.nVoxel, geometry.dVoxel, angles, geometry.mode, geometry.offOrigin,
                     (-(top + bottom) / 2, (left + right) / 2))
+
+
+def _circle(geometry: Geometry, what: str):
+    """DSO, the mean DSD and the angles [view] of the circle about z that the source moves on, InputError where it does not."""
+    frames = geometry.poses
+    out = -frames.source if frames.parallel else frames.source
+    angles = np.arctan2(out[:, 1], out[:, 0])
+    DSO = 0. if frames.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
+    depth = -np.sum(frames.centre(geometry.nDetector)[:, :2] * np.stack([np.cos(angles), np.sin(angles)], 1), 1)
+    DSD = DSO + max(float(depth.mean()), 0.)
+    source = scanner_frames(angles, DSO, DSD, (0, 0), (1., 1.), frames.parallel).source
+    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1.
+    if np.abs(source - frames.source).max() * reach > SAME * min(geometry.dDetector):
+        raise InputError(f'{what} needs a source on a circle about z; this scan has other poses')
+    return DSO, DSD, angles
 
 
 def _ends(shadow):
