@@ -16,7 +16,7 @@ import json
 import os
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -32,7 +32,7 @@ from .fit import checkpoint
 from .fit.device import DeviceState
 from .fit.initial import initial_cloud
 from .fit.loop import extensible, run
-from .fit.settings import METHODS, Settings
+from .fit.settings import Settings, settings_of
 from .phantoms.scanning import scan
 from .progress import Progress
 from .recon.asd_pocs import asd_pocs
@@ -62,12 +62,15 @@ class Scale:
     pixels       along a side of the panel
     n_points     Gaussians that a fit starts with
     iterations   of the fits, where the user names none
+    finer        how many times as many voxels are scanned along each side, where the object has them: the projections then
+                 hold structure that the reconstructed voxels cannot
     """
 
     size: int
     pixels: int
     n_points: int
     iterations: tuple[int, ...]
+    finer: int = 1
 
 
 # An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
@@ -103,17 +106,6 @@ class Volume:
 
     def __str__(self):
         return f'{self.fit}, {self.algorithm}'
-
-
-def settings_of(method: str, **values) -> Settings:
-    """The settings of `name` or `name:setting=value,...`; `values` replace the recipe's own, but not those.
-
-    Raises InputError for an unknown method or setting.
-    """
-    name, _, changes = method.partition(':')
-    if name not in METHODS:
-        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
-    return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))
 
 
 def recipe(fit: Fit, scale: Scale) -> Settings:
@@ -153,12 +145,17 @@ def load_object(name: str, size: int) -> phantoms.Phantom:
     if name in PHANTOMS:
         return phantoms.make(name, size)
     volume = read_volume(_file(name))
-    shape = volume.data.shape
+    return averaged(phantoms.Phantom(volume.data, volume.spacing, name), size)
+
+
+def averaged(thing: phantoms.Phantom, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
+    shape = thing.data.shape
     if max(shape) <= size:
-        return phantoms.Phantom(volume.data, volume.spacing, name)
+        return thing
     smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
-    spacing = tuple(d * n / m for d, n, m in zip(volume.spacing, shape, smaller))
-    return phantoms.Phantom(resize_local_mean(volume.data, smaller).astype(np.float32), spacing, name)
+    spacing = tuple(d * n / m for d, n, m in zip(thing.spacing, shape, smaller))
+    return phantoms.Phantom(resize_local_mean(thing.data, smaller).astype(np.float32), spacing, thing.name)
 
 
 class Cells:
@@ -173,7 +170,7 @@ class Cells:
     def path(self, cell: Fit | Volume) -> Path:
         """Where a cell is stored."""
         fit = cell.fit if isinstance(cell, Volume) else cell
-        of_scan = dict(size=self.scale.size, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
+        of_scan = dict(size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
             options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
@@ -210,9 +207,13 @@ class Cells:
         return found
 
     def _dataset(self, name: str) -> Dataset:
-        thing = load_object(name, self.scale.size)
+        scanned = load_object(name, self.scale.size * self.scale.finer)
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
-            return scan(thing, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
+            found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
+        truth = averaged(scanned, self.scale.size)
+        views = (replace(s, geometry=replace(s.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
+                 for s in (found.train, found.test))
+        return Dataset(*views, truth.data)
 
     def _measured(self, fit: Fit) -> Dataset:
         return choose_views(self.dataset(fit.object), fit.views)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .files.paths import replacing
-from .tables import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume, settings_of
+from .fit.settings import settings_of
+from .tables import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume
 
 TABLES = 'views', 'ct', 'ablation'
 TITLES = dict(views='New views (Table 1 of the paper)', ct='CT reconstruction in two stages (Table 2 of the paper)',
@@ -203,9 +204,10 @@ def write(table: str, table_groups: list[Group], objects, cells: Cells, name: st
     planned = plan(table_groups, objects)
     done = sum(cells.get(cell) is not None for cell in planned)
     scale = cells.scale
-    text = (f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side, {scale.pixels} x '
-            f'{scale.pixels} pixels, {scale.n_points:,} Gaussians to start with; seed {cells.seed}; {done} of {len(planned)} '
-            f'cells.\n\n{markdown(table, table_groups, rows)}\n')
+    finer = f' (scanned on {scale.finer} times as many)' if scale.finer > 1 else ''
+    text = (f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side{finer}, '
+            f'{scale.pixels} x {scale.pixels} pixels, {scale.n_points:,} Gaussians to start with; seed {cells.seed}; {done} of '
+            f'{len(planned)} cells.\n\n{markdown(table, table_groups, rows)}\n')
     cells.folder.mkdir(parents=True, exist_ok=True)
     for kind, content in (('json', json.dumps(rows, indent=1) + '\n'), ('md', text)):
         with replacing(cells.folder / f'{table}.{kind}') as temporary:

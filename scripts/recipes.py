@@ -19,7 +19,7 @@ from pathlib import Path
 
 from lingo_mi.cli import Parser, guard
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS, VOLUMETRIC
+from lingo_mi.fit.settings import METHODS, VOLUMETRIC, settings_of
 
 COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'), ('ssim_2d', 'SSIM', '{:.4f}'),
            ('psnr_3d', 'volume, dB', '{:.2f}'), ('ssim_3d', 'SSIM 3D', '{:.4f}'), ('ipsd', 'IPSD', '{:.4f}'),
@@ -27,20 +27,10 @@ COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', 
            ('seconds_init', 'init, s', '{:.1f}'), ('seconds_fit', 'fit, s', '{:.0f}'))
 
 
-def method(text):
-    """Check a method with settings; returns the text."""
-    name, _, changes = text.partition(':')
-    if name not in METHODS:
-        raise argparse.ArgumentTypeError(f'{name!r} is not one of {", ".join(METHODS)}')
-    if changes and not all('=' in change for change in changes.split(',')):
-        raise argparse.ArgumentTypeError(f'{changes!r} is not name=value,name=value')
-    return text
-
-
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path)
-    p.add_argument('--methods', nargs='+', type=method, default=list(VOLUMETRIC), metavar='METHOD[:name=value,...]',
+    p.add_argument('--methods', nargs='+', default=list(VOLUMETRIC), metavar='METHOD[:name=value,...]',
                    help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})')
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)
@@ -92,6 +82,8 @@ def draw(results, figure):
 
 def main():
     args = arguments()
+    for method in args.methods:
+        settings_of(method)
     results = {(scene.stem, method): result(scene, method, args) for scene in args.scenes for method in args.methods}
     print('| scene | method | ' + ' | '.join(title for _, title, _ in COLUMNS) + ' |')
     print('|---|---|' + '---:|' * len(COLUMNS))

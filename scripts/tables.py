@@ -18,14 +18,16 @@ Each fit and each reconstruction is stored as soon as it is done. After any inte
 tables use what is there. The table, as Markdown and JSON, is renewed after every one of them.
 """
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from lingo_mi.cli import Parser, guard
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.settings import METHODS, settings_of
 from lingo_mi.runtime import use_variant
 
 ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize'
+PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
 
 
 def arguments():
@@ -35,11 +37,14 @@ def arguments():
     p.add_argument('--views', nargs='+', type=int, metavar='N', help='fitted, of 50 (default: 5 10 25; ablation: 25)')
     p.add_argument('--iterations', nargs='+', type=int, metavar='N', help='of the fits; ct and ablation take the largest '
                    '(default: small 5000, paper 5000 15000 30000)')
-    p.add_argument('--methods', nargs='+', choices=METHODS, default=list(METHODS), metavar='METHOD',
-                   help=f'columns of views and ct (default: {" ".join(METHODS)})')
+    p.add_argument('--methods', nargs='+', default=list(PUBLISHED), metavar='METHOD[:name=value,...]',
+                   help=f'columns of views and ct: any of {", ".join(METHODS)}, with settings that differ (default: '
+                        f'{" ".join(PUBLISHED)}, as in the paper)')
     p.add_argument('--algorithms', nargs='+', choices=ALGORITHMS, default=list(ALGORITHMS), metavar='A',
                    help=f'rows of ct (default: {" ".join(ALGORITHMS)})')
     p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')
+    p.add_argument('--finer', type=int, default=1, metavar='N', help='scan N times as many voxels along each side, where an '
+                   'object has them, so that projections hold what the voxels cannot (default: 1)')
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
     p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<scale>)')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -52,7 +57,7 @@ def main():
     from lingo_mi.tables import PHANTOMS, SCALES, SCANNED, VOLUMES, Cells, available
     from lingo_mi.tables_report import groups, plan, write
 
-    scale = SCALES[args.scale]
+    scale = replace(SCALES[args.scale], finer=args.finer)
     views = sorted(set(args.views or ((25,) if args.table == 'ablation' else (5, 10, 25))))
     iterations = sorted(set(args.iterations or scale.iterations))
     if views[0] < 1 or views[-1] > SCANNED:
@@ -61,6 +66,10 @@ def main():
         raise InputError(f'--iterations must be at least 1, not {iterations[0]}')
     if args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if args.finer < 1:
+        raise InputError(f'--finer must be at least 1, not {args.finer}')
+    for method in args.methods:
+        settings_of(method)
     objects = available(dict.fromkeys(args.objects or (*PHANTOMS, *VOLUMES)), print)
     cells = Cells(args.out or Path('out/tables') / args.scale, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from unittest import mock
 
 import mitsuba as mi
@@ -14,6 +15,7 @@ from script import FIT, run
 from lingo_mi import tables
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import write_volume
+from lingo_mi.fit.settings import METHODS
 from lingo_mi.phantoms import make
 from lingo_mi.tables import SCALES, Cells, Fit, Scale, Volume, available, load_object, recipe
 from lingo_mi.tables_report import ABLATION, groups, markdown, plan, results
@@ -28,7 +30,7 @@ def tiny(monkeypatch):
     monkeypatch.setitem(SCALES, 'small', TINY)
     monkeypatch.setattr(tables, 'SCANNED', 25)
     monkeypatch.setattr(tables, 'COMPLETED', 30)
-    monkeypatch.setitem(tables.METHODS, 'fast', tables.METHODS['fast'].changed(iterations=15))
+    monkeypatch.setitem(METHODS, 'fast', METHODS['fast'].changed(iterations=15))
     monkeypatch.setitem(tables.ALGORITHMS, 'sart', (tables.sart, dict(niter=2)))
     monkeypatch.setitem(tables.ALGORITHMS, 'asd-pocs', (tables.asd_pocs, dict(niter=1, tviter=2)))
 
@@ -247,6 +249,23 @@ def test_volumes_are_averaged_down(tmp_path, monkeypatch):
     assert load_object('engine', 64).data.shape == data.shape
 
 
+def test_objects_finer_than_the_voxels(tmp_path):
+    """What is scanned has twice the voxels; what is reconstructed, and its truth, has those of the scale."""
+    scale = replace(TINY, finer=2)
+    coarse, fine = Cells(tmp_path, TINY), Cells(tmp_path, scale)
+    found, usual, scanned = fine.dataset('foot'), coarse.dataset('foot'), make('foot', 32)
+    geometry = found.train.geometry
+    assert (geometry.nVoxel, geometry.dVoxel) == (usual.train.geometry.nVoxel, usual.train.geometry.dVoxel) == ((16,) * 3, (16.,) * 3)
+    np.testing.assert_allclose(found.volume, scanned.data.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5)), atol=1e-5)
+    expected = tables.scan(scanned, 25, 0, pixels=24)
+    np.testing.assert_array_equal(found.train.projections, expected.train.projections)
+    np.testing.assert_array_equal(found.test.projections, expected.test.projections)
+    assert coarse.path(Fit('foot', 4, 'r2')) != fine.path(Fit('foot', 4, 'r2'))
+    code, text, err = script('ct', tmp_path, '--finer', '2', '--views', '4', '--methods', 'r2:n_points=50', '--iterations', '5',
+                             '--algorithms', 'fdk')
+    assert code == 0 and '(scanned on 2 times as many)' in text and 'r2:n_points=50 PSNR' in text, err
+
+
 def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setenv('LINGO_MI_DATA', '')
     (tmp_path / 'views.md').write_text('kept')
@@ -257,7 +276,7 @@ def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
 
 def test_recipes():
     assert recipe(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
-    assert recipe(Fit('foot', 5, 'fast'), TINY).iterations == tables.METHODS['fast'].iterations
+    assert recipe(Fit('foot', 5, 'fast'), TINY).iterations == METHODS['fast'].iterations
     found = recipe(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
     assert (found.V_S, found.n_points, found.loss_scale, recipe(Fit('foot', 5, 'r2'), TINY).n_points) == (1, 70, 'dynamic', 200)
     with pytest.raises(InputError, match='unknown'):
@@ -267,7 +286,8 @@ def test_recipes():
 @pytest.mark.parametrize('args, message', [
     (['views', '--objects', 'hand'], "'hand' is unknown"), (['views', '--views', '26'], '25'),
     (['views', '--views', '0'], '25'), (['ct', '--iterations', '0'], 'at least 1'), (['views', '--seed', '-1'], 'negative'),
-    (['figures'], 'invalid choice'), (['views', '--methods', 'nerf'], 'invalid choice')])
+    (['figures'], 'invalid choice'), (['views', '--methods', 'nerf'], 'unknown'), (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
+    (['ct', '--finer', '0'], 'at least 1')])
 def test_bad_input(args, message, tmp_path):
     code, _, err = run(TABLES, *args, '--out', tmp_path / 'a')
     said = err if isinstance(code, int) else code

@@ -252,3 +252,14 @@ XGAUSSIAN = replace(
 
 METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2, '3dgs': GS3D, 'xgaussian': XGAUSSIAN}
 VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.render == 'integral')  # those that make a volume
+
+
+def settings_of(method: str, **values) -> Settings:
+    """The settings of `name` or `name:setting=value,...`; `values` replace the recipe's own, but not those.
+
+    Raises InputError for an unknown method or setting.
+    """
+    name, _, changes = method.partition(':')
+    if name not in METHODS:
+        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
+    return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))
