@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import json
 import os
 import sys
@@ -51,7 +52,7 @@ NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # num
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (refined, dict(completed_niter=2, niter=20, exact_every=5))}
+              'refined': (refined, {})}
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class Cells:
         of_scan = dict(size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed)
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
-            options = dict(algorithm=ALGORITHMS[cell.algorithm][1], completed=COMPLETED)
+            options = dict(algorithm=_options(cell.algorithm), completed=COMPLETED)
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
@@ -264,7 +265,7 @@ class Cells:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
-        total = sum(n for name, n in options.items() if name.endswith('niter')) or len(views)
+        total = sum(n for name, n in _options(cell.algorithm).items() if name.endswith('niter')) or len(views)
         if cell.algorithm == 'refined':
             stepper, state = self._cloud(cell.fit)
             views, options = dataset.train, options | dict(completed=views, init=stepper.volume(state))
@@ -275,7 +276,7 @@ class Cells:
             result = function(views, **options, progress=progress)
         seconds = time.perf_counter() - begun
         volume = result if isinstance(result, np.ndarray) else result.volume
-        return dict(algorithm=cell.algorithm, options=ALGORITHMS[cell.algorithm][1], method=cell.fit.method, seconds=seconds,
+        return dict(algorithm=cell.algorithm, options=_options(cell.algorithm), method=cell.fit.method, seconds=seconds,
                     psnr_3d=metrics.psnr_3d(volume, dataset.volume), ssim_3d=metrics.ssim_3d(volume, dataset.volume))
 
 
@@ -285,6 +286,13 @@ def _iterations(path: Path) -> int | None:
         return checkpoint.load(path)[1].get('iteration')
     except InputError:
         return None
+
+
+def _options(algorithm: str) -> dict:
+    """All parameters of an algorithm that have a value, those left at their defaults too."""
+    function, options = ALGORITHMS[algorithm]
+    defaults = {name: p.default for name, p in inspect.signature(function).parameters.items() if p.default is not p.empty}
+    return defaults | options
 
 
 def _hash(values: dict) -> str:

@@ -15,7 +15,6 @@ from .files.paths import replacing
 from .fit.settings import settings_of
 from .tables import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume
 
-TABLES = 'views', 'ct', 'ablation'
 TITLES = dict(views='New views (Table 1 of the paper)', ct='CT reconstruction in two stages (Table 2 of the paper)',
               ablation='Parts of LINGO (Table 3 of the paper)')
 LABELS = dict(psnr_2d_r2=('PSNR', '{:.2f}'), ssim_2d=('SSIM', '{:.4f}'), ipsd=('IPSD', '{:.4f}'),

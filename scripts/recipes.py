@@ -44,12 +44,13 @@ def result(scene, method, args) -> dict:
     """The metrics of one fit, run now unless they are there."""
     name, _, changes = method.partition(':')
     changes = [*args.define, *filter(None, changes.split(','))]
+    if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
+        changes.append(f'iterations={args.iterations}')
     folder = args.out / '_'.join([scene.stem, str(args.views), name, *changes])
     if not (folder / 'metrics.json').exists():
         command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', name,
                    '--views', str(args.views), '--out', str(folder)]
         command += [word for change in changes for word in ('-D', change)]
-        command += [] if name == 'fast' else ['--iterations', str(args.iterations)]
         command += ['--resume'] if (folder / 'checkpoint.npz').exists() else []
         print(' '.join(command), file=sys.stderr)
         if code := subprocess.run(command).returncode:

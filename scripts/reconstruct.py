@@ -27,11 +27,9 @@ import numpy as np
 from lingo_mi.cli import Parser, check_input, definitions, guard, input_arguments, read_input, writable_file
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
+from lingo_mi.values import parse
 
 ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'refined', 'voxelize')
-
-# Memory at the peak, over that of the volume and the projections, as measured on volumes of gigabytes.
-COPIES = {'fdk': 2.7, 'sart': 2.7, 'os-sart': 2.7, 'sirt': 2.7, 'cgls': 4.3, 'asd-pocs': 5., 'refined': 5.}
 
 
 def arguments():
@@ -70,11 +68,7 @@ def options(function, given: dict[str, str]) -> dict:
         if name not in known:
             raise InputError(f'-D {name}: neither a parameter of the scene nor of {function.__name__} '
                              f'({", ".join(known) or "it has none"})')
-        kind = float if known[name] is None else type(known[name])
-        try:
-            out[name] = {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
-        except (KeyError, ValueError):
-            raise InputError(f'-D {name}={text}: must be {"true or false" if kind is bool else "a number"}') from None
+        out[name] = parse(f'-D {name}', text, 0. if known[name] is None else known[name])
     return out
 
 
@@ -166,6 +160,7 @@ def main():
 def check_scan(geometry, views: int | None, algorithm: str):
     """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them."""
     from lingo_mi.recon.circle import require_rays
+    from lingo_mi.recon.memory import COPIES
     from lingo_mi.scanning import check_memory
     require_rays(geometry)
     check_memory(geometry, views=views or 0, copies=COPIES.get(algorithm, 0))

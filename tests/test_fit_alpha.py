@@ -1,6 +1,6 @@
 """The baselines by alpha compositing: radiance, starts, densification, fits of tiny scans, and what they leave behind."""
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +10,7 @@ from script import FIT, fit, run as run_script
 from test_fit import assert_equal_states, error_of, geometry, stop_at, tiny_scan
 
 from lingo_mi.errors import InputError
+from lingo_mi.fit import checkpoint
 from lingo_mi.fit.densify import clone, prune, reset_opacity, split
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run, scene_radius
@@ -318,6 +319,13 @@ def test_checkpoints_that_complete_nothing(scan, tmp_path):
     run(scan, settings, initial_cloud(scan, settings), path=path)
     with pytest.raises(InputError, match='result.xml'):
         load_cloud(path)
+    state, extra, arrays = checkpoint.load(path)
+    extra['settings'] = asdict(settings_of('3dgs'))
+    for damaged in ([], {}, extra | dict(settings=3), extra | dict(settings=extra['settings'] | dict(renamed=1)),
+                    {k: v for k, v in extra.items() if k != 'scanner'}):
+        checkpoint.save(path, state, damaged, arrays)
+        with pytest.raises(InputError, match='by this version'):
+            load_cloud(path)
 
 
 def test_help_names_every_method():

@@ -202,8 +202,9 @@ def test_missing_angles(dataset):
 
 @pytest.mark.parametrize('args, message', [
     (['--views', '99'], 'the scan has 8'), (['--views', '-1'], '--views'), (['-D', 'nitre=3'], 'nitre'),
-    (['--algorithm', 'cgls', '-D', 'niter=three'], 'niter=three'),
-    (['--algorithm', 'sart', '-D', 'noneg=2'], 'true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
+    (['--algorithm', 'cgls', '-D', 'niter=three'], "-D niter must be a whole number, not 'three'"),
+    (['--algorithm', 'cgls', '-D', 'niter=2.5'], '-D niter must be a whole number'),
+    (['--algorithm', 'sart', '-D', 'noneg=2'], 'noneg must be true or false'), (['-D', 'effects=some'], "'model' or 'ignore'"),
     (['--algorithm', 'sart', '-D', 'lmbda=5'], 'lmbda'),
     (['--algorithm', 'sart', '-D', 'OrderStrategy=sorted'], 'ordered, random, angularDistance'),
     (['--algorithm', 'sart', '-D', 'seed=-1'], 'seed must be'), (['--algorithm', 'asd-pocs', '-D', 'alpha=inf'], 'alpha must'),

@@ -38,19 +38,17 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
         cloud = cuboid(g.nVoxel, g.half, settings.cuboid_step)
     elif settings.init == 'r2':
         volume = fdk(scan) / unit
-        cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, rescale=settings.fdk_rescale)
+        cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, settings.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)
     else:
         def render(points, density, spacing, views):
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings.changed(weights='equal'), unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
-        density = 'lsq' if settings.init_density == 'fdk' and not is_circular(scan) else settings.init_density
-        chosen = lingo.Settings(
-            n_points=settings.n_points, high_fraction=settings.high_fraction, low_factor=settings.low_factor,
-            resolution=settings.occupancy_voxels, V_S=settings.V_S, density=density,
-            misses=settings.misses, outside=settings.outside)
-        volume = fdk(scan) if density == 'fdk' else None
+        chosen = settings.of_start()
+        if chosen.density == 'fdk' and not is_circular(scan):
+            chosen = replace(chosen, density='lsq')
+        volume = fdk(scan) if chosen.density == 'fdk' else None
         cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume,
                                  scan.valid)
     cloud.info['seconds'] = time.perf_counter() - begun

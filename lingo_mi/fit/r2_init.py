@@ -12,15 +12,14 @@ from ..lingo.voxel_filter import voxel_centres
 
 
 def r2_initialise(volume, half, rng=None, n_points: int = 50_000, threshold: float = 0.05,
-                  relative: bool = False, rescale: float = 0.15) -> InitialCloud:
+                  rescale: float = 0.15) -> InitialCloud:
     """Random voxels of an FDK volume (R2-Gaussian, section 4.1 and its released settings).
 
     volume     [x, y, z], densities (the normalised frame keeps their number)
     half       half the volume's sides in the normalised frame, [3] (`Geometry.half`)
     rng        numpy Generator (default: seed 0)
     n_points   voxels drawn without replacement; where fewer pass the threshold, all of those
-    threshold  voxels above it take part; with `relative`, as a share of the largest voxel (for volumes whose
-               densities are not near 1, such as 1/mm)
+    threshold  voxels above it take part
     rescale    density of a Gaussian over that of its voxel
 
     Points sit at voxel centres.
@@ -30,15 +29,14 @@ def r2_initialise(volume, half, rng=None, n_points: int = 50_000, threshold: flo
     begun = time.perf_counter()
     rng = np.random.default_rng(0) if rng is None else rng
     volume = np.asarray(volume)
-    cut = threshold * float(volume.max()) if relative else threshold
-    cells = np.flatnonzero(volume > cut)
+    cells = np.flatnonzero(volume > threshold)
     if len(cells) == 0:
-        raise InputError(f'no voxel of the FDK volume is above {cut:g} (the largest is {volume.max():g}): '
-                         'lower the threshold, or make it relative')
+        raise InputError(f'no voxel of the FDK volume is above {threshold:g} (the largest is {volume.max():g}): set a lower '
+                         'fdk_threshold, or normalise=true')
     chosen = rng.permutation(cells)[:n_points]
     points = voxel_centres(volume.shape, half, chosen)
     size = 2 * np.asarray(half, float) / volume.shape
     return InitialCloud(points, rescale * volume.ravel()[chosen].astype(float),
                         neighbour_distance(points, fallback=size.min()),
-                        {'method': 'r2', 'threshold': cut, 'cells': len(cells),
+                        {'method': 'r2', 'threshold': threshold, 'cells': len(cells),
                          'seconds': time.perf_counter() - begun})

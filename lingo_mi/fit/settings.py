@@ -5,6 +5,8 @@ import math
 from dataclasses import dataclass, fields, replace
 
 from ..errors import InputError
+from ..lingo import initialise as lingo
+from ..values import parse
 
 
 @dataclass(frozen=True)
@@ -166,8 +168,6 @@ class Settings:
         require(self.sh_every >= 1, f'sh_every must be at least 1, not {self.sh_every}')
         require(self.cuboid_step >= 1, f'cuboid_step must be at least 1, not {self.cuboid_step}')
         require(self.reset_every >= 0, f'reset_every must not be negative, not {self.reset_every}')
-        require(self.outside in ('invalid', 'ignore', 'auto'),
-                f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         require(self.n_points >= 1, f'n_points must be at least 1, not {self.n_points}')
         require(self.loss_scale in ('none', 'dynamic', 'statistic'),
                 f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}")
@@ -178,6 +178,9 @@ class Settings:
         require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
         require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
+        for name in ('decay_steps', 'lambda_ssim', 'lambda_tv', 'epsilon', 'fdk_rescale', 'densify_from', 'densify_until',
+                     'densify_threshold', 'split_size', 'prune_density', 'prune_size'):
+            require(getattr(self, name) >= 0, f'{name} must not be negative, not {getattr(self, name):g}')
         require(self.densify_every >= 1, f'densify_every must be at least 1, not {self.densify_every}')
         for name in ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation', 'rate_opacity', 'rate_radiance',
                      'rate_harmonics'):
@@ -185,6 +188,15 @@ class Settings:
             require(len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}')
         require(len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
                 f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}')
+
+        require(self.occupancy_voxels >= 1, f'occupancy_voxels must be at least 1, not {self.occupancy_voxels}')
+        self.of_start()
+
+    def of_start(self) -> lingo.Settings:
+        """Those of `lingo.initialise`. Raises InputError."""
+        return lingo.Settings(n_points=self.n_points, high_fraction=self.high_fraction, low_factor=self.low_factor,
+                              resolution=self.occupancy_voxels, V_S=self.V_S, density=self.init_density, misses=self.misses,
+                              outside=self.outside)
 
     def rate(self, name: str, iteration: int) -> float:
         """Adam's step size for a parameter (see `lingo_mi.fit.state`) or 'pose' at an iteration, counted from 0."""
@@ -202,25 +214,8 @@ class Settings:
         for name, value in values.items():
             if name not in known:
                 raise InputError(f'unknown setting {name!r}: one of {", ".join(known)}')
-            parsed[name] = _parse(name, value, known[name])
+            parsed[name] = parse(f'setting {name}', value, known[name]) if isinstance(value, str) else value
         return replace(self, **parsed)
-
-
-def _parse(name, value, like):
-    if not isinstance(value, str):
-        return value
-    try:
-        if isinstance(like, tuple):
-            numbers = tuple(float(x) for x in value.split(','))
-            return numbers * 2 if len(numbers) == 1 else numbers
-        if isinstance(like, bool):
-            return {'true': True, 'false': False}[value.lower()]
-        if isinstance(like, int) and float(value) != int(float(value)):
-            raise ValueError
-        return int(float(value)) if isinstance(like, int) else type(like)(value)
-    except (ValueError, KeyError):
-        kind = {bool: 'true or false', int: 'a whole number', float: 'a number', tuple: 'two numbers, first,last'}[type(like)]
-        raise InputError(f'setting {name} must be {kind}, not {value!r}') from None
 
 
 R2 = Settings()

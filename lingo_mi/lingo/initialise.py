@@ -67,6 +67,11 @@ class Settings:
             raise InputError('n_points, resolution and lsq_views must be at least 1')
         if not 0 <= self.high_fraction <= 1:
             raise InputError(f'high_fraction must lie in [0, 1], not {self.high_fraction}')
+        for name in ('low_factor', 'V_S', 'misses'):
+            if getattr(self, name) < 0:
+                raise InputError(f'{name} must not be negative, not {getattr(self, name):g}')
+        if self.outside not in ('invalid', 'ignore', 'auto'):
+            raise InputError(f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         if self.density not in MODES:
             raise InputError(f'density {self.density!r} is unknown: use one of {", ".join(MODES)}')
 

@@ -123,15 +123,19 @@ def _composited(path):
     if not Path(path).exists():
         raise InputError(f'{path}: no such file; {WANTED}')
     state, extra, arrays = checkpoint.load(path)
-    if extra.get('settings', {}).get('render') != 'alpha':
-        raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
-    settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()})
-    geometry = corrected = mi.load_dict(extra['scanner']).geometry
+    try:
+        if extra['settings']['render'] != 'alpha':
+            raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
+        settings = Settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()})
+        scanner, unit, seed = (extra[name] for name in ('scanner', 'unit', 'seed'))
+    except (KeyError, TypeError):
+        raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; {WANTED}') from None
+    geometry = corrected = mi.load_dict(scanner).geometry
     if max(settings.rate_pose) > 0:
         poses = Poses(len(geometry))
         poses.restore(arrays)
         corrected = poses.corrected(geometry)
-    return CompositedCloud(state, settings, geometry, corrected, extra['unit'], extra['seed'])
+    return CompositedCloud(state, settings, geometry, corrected, unit, seed)
 
 
 def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
