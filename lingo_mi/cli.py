@@ -22,10 +22,11 @@ class Parser(argparse.ArgumentParser):
 def guard(main) -> None:
     """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
 
-    Warnings become one line each.
+    Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
     """
     try:
         with warnings.catch_warnings():
+            warnings.simplefilter('ignore', RuntimeWarning)
             warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
             sys.exit(main() or 0)
     except InputError as error:
@@ -35,7 +36,7 @@ def guard(main) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
-        print(f'error: {error.filename or "file"}: {error.strerror or error}', file=sys.stderr)
+        print(f'error: {f"{error.filename}: " if error.filename else ""}{error.strerror or error}', file=sys.stderr)
         sys.exit(2)
     except MemoryError as error:
         print(f'error: not enough memory ({error})', file=sys.stderr)
@@ -85,6 +86,9 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check_input(args) -> None:
     """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
+    for name in ('projections', 'volume'):
+        if getattr(args, name) == '':  # an unset variable of the shell's
+            raise InputError(f'--{name} names no file')
     if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
     if not args.volume and (args.shape or args.dtype or args.mu_water is not None):

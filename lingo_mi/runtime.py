@@ -89,6 +89,8 @@ def use_variant(name: str | None = None) -> str:
             return variant
         except (ImportError, RuntimeError) as error:  # what Mitsuba raises for a missing driver or library
             reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
+    if variant.startswith('cuda'):
+        raise InputError(f'--variant {name}: no NVIDIA GPU can be used; leave it out to run on the CPU')
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
 
 

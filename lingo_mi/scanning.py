@@ -86,7 +86,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, copies: float = 0
 def defaults(path) -> set[str]:
     """Names of a scene file's `<default>` parameters. Raises InputError where the file is missing or no XML."""
     if not Path(path).is_file():
-        raise InputError(f'{path}: there is no such scene')
+        raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')
     try:
         return {node.get('name', '') for node in ElementTree.parse(path).iter('default')}
     except (ElementTree.ParseError, UnicodeDecodeError) as error:

@@ -240,7 +240,7 @@ def _read(props):
         return Geometry.per_view(**plain, height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned))
     if not held_out:
         return geometry(angles), None
-    drawn = np.sort(np.random.default_rng(0).uniform(0, total, held_out)) + start
+    drawn = np.sort(total * np.random.default_rng(0).uniform(0, 1, held_out)) + start
     return geometry(angles), geometry(np.radians(drawn))
 
 

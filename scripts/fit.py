@@ -57,7 +57,10 @@ def main():
     defined = definitions(args.define)
     own = defaults(args.scene)  # a name of the scene goes before a setting's
     given = {k: v for k, v in defined.items() if k not in own}
-    given |= {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
+    options = {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
+    if twice := given.keys() & options.keys():
+        raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
+    given |= options
     unknown = [k for k in given if not hasattr(METHODS[args.method], k)]
     if unknown:
         names = ', '.join(sorted(own)) or 'it has none'
@@ -66,6 +69,8 @@ def main():
     settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
 
+    if args.resume and not (folder / CHECKPOINT).exists():
+        raise InputError(f'{folder / CHECKPOINT}: there is no checkpoint to resume from; run without --resume')
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     scan = read_input(args, scene, args.views, args.seed)
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)

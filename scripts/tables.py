@@ -21,7 +21,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli import Parser, guard, writable_folder
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS, settings_of
 from lingo_mi.runtime import use_variant
@@ -71,7 +71,8 @@ def main():
     for method in args.methods:
         settings_of(method)
     objects = available(dict.fromkeys(args.objects or (*PHANTOMS, *VOLUMES)), print)
-    cells = Cells(args.out or Path('out/tables') / args.scale, scale, args.seed)
+    folder = writable_folder(args.out or Path('out/tables') / args.scale, True, True, '')
+    cells = Cells(folder, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     planned = plan(rows, objects)
     if not planned:

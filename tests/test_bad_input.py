@@ -51,7 +51,7 @@ def test_not_a_scene(tmp_path, text, says):
 
 def test_missing_scene(tmp_path):
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml')
-    assert str(tmp_path) in refused(tmp_path, tmp_path)
+    assert f'{tmp_path}: is a folder' in refused(tmp_path, tmp_path)
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml', '-D', 'size=16')
 
 
@@ -129,6 +129,8 @@ def test_a_cloud_of_nothing(tmp_path):
     (['--views', 'x'], '--views'), (['--method', 'magic'], '--method'), (['--init', 'magic'], '--init'),
     (['--variant', 'magic'], '--variant'), (['--variant', 'scalar_rgb'], '--variant'),
     (['--frobnicate'], '--frobnicate'), (['--projections', 'a.pickle', '--volume', 'b.nii'], 'exclude'),
+    (['--projections', ''], '--projections names no file'), (['--volume', ''], '--volume names no file'),
+    (['--iterations', '3', '-D', 'iterations=4'], 'leave one of them out'), (['-D', 'init=r2', '--init', 'r2'], '--init'),
     (['--mu-water', '0.02'], '--volume'), (['--resume'], 'no checkpoint'),
     (['--seed', '-1'], 'seed')])
 def test_bad_arguments(scene, tmp_path, args, says):
@@ -151,6 +153,9 @@ def test_bad_checkpoints(scene, tmp_path):
     assert 'seed' in refused(tmp_path, scene, '--resume', '--seed', '1', out=out)
     assert 'views' in refused(tmp_path, scene, '--resume', '--views', '4', out=out)
     assert 'extent' in refused(tmp_path, scene, '--resume', '-D', 'extent=4', out=out)
+    nearer = tmp_path / 'nearer.xml'
+    nearer.write_text(scene.read_text().replace('name="DSO" value="100"', 'name="DSO" value="95"'))
+    assert 'the geometry' in refused(tmp_path, nearer, '--resume', out=out)
     whole = (out / 'checkpoint.npz').read_bytes()
     broken = bytearray(whole)
     broken[len(whole) // 2] ^= 255
@@ -200,6 +205,7 @@ def test_more_bad_volumes(scene, tmp_path):
     assert 'dtype' in refused(tmp_path, scene, '--volume', tmp_path / 'ct.raw', '--shape', 2, 2, 2, '--dtype', 'magic')
     (tmp_path / 'slices').mkdir()
     assert 'slices' in refused(tmp_path, scene, '--volume', tmp_path / 'slices')
+    assert 'dtype' in refused(tmp_path, scene, '--volume', tmp_path / 'ct.npy', '--shape', 8, 8, 8)
     # A volume as wide as the source's orbit.
     np.save(tmp_path / 'ct.npy', np.ones((220, 220, 2)))
     assert 'source' in refused(tmp_path, scene, '--volume', tmp_path / 'ct.npy')
@@ -225,12 +231,12 @@ def test_pickle_runs_no_code(scene, tmp_path):
 
 
 @pytest.mark.parametrize('kind, says', [
-    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'zero everywhere'), ('none', 'filled array'),
+    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'nothing to fit'), ('negative', 'no value of the projections is above 0'), ('none', 'filled array'),
     ('no geometry', 'geometry'),
     ('key', 'nDetektor'), ('angles', 'angles'), ('truncated', 'damaged'), ('huge', 'GiB of memory')])
 def test_bad_projections(scene, scan, tmp_path, kind, says):
-    path = tmp_path / 'scan.npy'
-    write_scan(path, replace(scan, projections=scan.projections * 0) if kind == 'zero' else scan, 'npy')
+    path, factor = tmp_path / 'scan.npy', {'zero': 0, 'negative': -1}.get(kind, 1)
+    write_scan(path, replace(scan, projections=scan.projections * factor), 'npy')
     p, text = scan.projections.copy(), path.with_suffix('.yml').read_text()
     if kind in ('NaN', 'shape', 'none'):
         p[2, 3, 4] = np.nan
@@ -239,7 +245,7 @@ def test_bad_projections(scene, scan, tmp_path, kind, says):
         path.write_bytes(path.read_bytes()[:200])
     elif kind == 'no geometry':
         path.with_suffix('.yml').unlink()
-    elif kind != 'zero':
+    elif factor == 1:
         old, new = {'key': ('nDetector', 'nDetektor'), 'angles': ('angles:', 'angles: [1, 2]\nmode: cone #'),
                     'huge': ('nVoxel: [16, 16, 16]', 'nVoxel: [99999, 99999, 99999]')}[kind]
         assert old in text

@@ -1,4 +1,6 @@
 """The fit on tiny scans: it descends, resumes to the bit, compiles nothing late, and refuses what it must."""
+import errno
+import os
 from dataclasses import replace
 
 import drjit as dr
@@ -202,8 +204,25 @@ def test_checkpoint_of_other_settings_is_refused(scan, stored, change):
 
 
 def test_checkpoint_of_another_scan_is_refused(scan, stored):
-    with pytest.raises(InputError, match='views'):
-        run(scan.subset([0, 1]), SHORT.changed(iterations=2), None, path=stored, resume=True)
+    g, settings = scan.geometry, SHORT.changed(iterations=2)
+    for other, what in ((scan.subset([0, 1]), 'views'), (replace(scan, geometry=replace(g, DSO=g.DSO * .9)), 'the geometry'),
+                        (replace(scan, projections=scan.projections * np.float32(1.01)), 'the projections')):
+        with pytest.raises(InputError, match=f'other values of .*{what}'):
+            run(other, settings, None, path=stored, resume=True)
+    almost = replace(scan, projections=scan.projections * np.float32(1 + 1e-6))  # simulated on another machine
+    run(almost, settings, None, path=stored, resume=True)
+
+
+def test_a_full_disk_leaves_the_earlier_checkpoint(scan, stored, monkeypatch):
+    before = stored.read_bytes()
+
+    def savez(file, **_):
+        file.write(b'begun')
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    monkeypatch.setattr(np, 'savez', savez)
+    with pytest.raises(InputError, match='fit.npz: cannot be written'):
+        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+    assert stored.read_bytes() == before and [p.name for p in stored.parent.iterdir()] == [stored.name]
 
 
 @pytest.mark.parametrize('share', [0, .3, .95])

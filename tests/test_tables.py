@@ -295,6 +295,12 @@ def test_bad_input(args, message, tmp_path):
     assert not (tmp_path / 'a').exists()
 
 
+def test_a_file_in_the_place_of_the_folder(tmp_path):
+    (tmp_path / 'a').touch()
+    code, _, err = run(TABLES, 'views', '--objects', 'foot', '--out', tmp_path / 'a')
+    assert code == 2 and 'a: is a file' in err and err.count('\n') == 1
+
+
 def test_a_cell_that_fails_does_not_stop_the_others(tmp_path):
     compute = Cells.compute
 

@@ -22,8 +22,9 @@ def reading(path):
     except FileNotFoundError as error:
         raise InputError(f'{error.filename or path}: there is no such file; check the path') from None
     except OSError as error:
-        raise InputError(f'{error.filename or path}: cannot be read ({error.strerror or one_line(error)}); '
-                         'check the path and its permissions') from None
+        if error.errno is None:  # not the system's, but a format's
+            raise InputError(f'{path}: is damaged ({one_line(error)}); fetch it or write it again') from None
+        raise InputError(f'{error.filename or path}: cannot be read ({error.strerror}); check the path and its permissions') from None
 
 
 @contextmanager

@@ -15,6 +15,7 @@ Values become density by these rules, the first that applies:
 """
 from __future__ import annotations
 
+import gzip
 import hashlib
 import re
 from dataclasses import dataclass
@@ -104,6 +105,8 @@ def _nifti(path):
         with reading(path):
             image = nibabel.load(path)
             data = np.asanyarray(image.dataobj)
+            if path.name.endswith('.gz'):
+                _check_sum(path)
             if isinstance(image, nibabel.Nifti1Image):
                 description = bytes(image.header['descrip'].item()).decode('utf-8', 'replace')
                 to_mm = _TO_MM.get(image.header.get_xyzt_units()[0], 1.)
@@ -117,6 +120,13 @@ def _nifti(path):
     return data, np.diag([to_mm, to_mm, to_mm, 1.]) @ image.affine, description
 
 
+def _check_sum(path):
+    """Raises BadGzipFile where the content is not what was packed; nibabel stops short of the sum at the end."""
+    with gzip.open(path) as file:
+        while file.read(1 << 20):
+            pass
+
+
 def _itk(path):
     sitk = optional('SimpleITK')
     with reading(path):
@@ -124,7 +134,7 @@ def _itk(path):
     try:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
-        raise InputError(f'{path}: cannot be read by SimpleITK ({one_line(error)[-160:]}); '
+        raise InputError(f'{path}: cannot be read by SimpleITK ({one_line(error).split("ERROR: ")[-1]}); '
                          'check the header, and for .mhd the raw file that it names') from None
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
         raise InputError(f'{path}: has {image.GetDimension()} dimensions and '
@@ -282,6 +292,8 @@ def read_volume(path, mu_water: float | None = None, shape=None, dtype=None, spa
     name, description, affine = path.name.lower(), '', None
     if mu_water is not None and not (np.isfinite(mu_water) and mu_water > 0):
         raise InputError(f'mu_water must be positive, in 1/mm, not {mu_water!r}; water at 60 keV has 0.0206')
+    if (shape is None) != (dtype is None) and not name.endswith('.raw'):
+        raise InputError(f'{path}: the shape and the dtype of raw bytes go together; give both or neither')
     if path.is_dir():
         with reading(path):
             tiffs = sorted((f for f in path.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=_natural)

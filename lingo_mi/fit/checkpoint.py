@@ -17,17 +17,23 @@ def save(path, state: State, extra: dict, arrays: dict | None = None):
     """Write a state and plain values (`extra`, as JSON) atomically: a crash leaves the earlier checkpoint whole.
 
     arrays   further NumPy arrays to keep, by name
+
+    Raises InputError if it cannot be written.
     """
     path = Path(path)
     columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
-    temporary = path.with_name(path.name + '.partial')
-    with open(temporary, 'wb') as file:
-        np.savez(file, gradient=state.gradient, seen=state.seen, born=state.born,
-                 extra=np.array(json.dumps(extra, default=np.generic.item)),
-                 **columns, **{f'array.{k}': v for k, v in (arrays or {}).items()})
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    temporary = path.with_name(path.name + '.partial')  # what a kill leaves behind, the next one replaces
+    try:
+        with open(temporary, 'wb') as file:
+            np.savez(file, gradient=state.gradient, seen=state.seen, born=state.born,
+                     extra=np.array(json.dumps(extra, default=np.generic.item)),
+                     **columns, **{f'array.{k}': v for k, v in (arrays or {}).items()})
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f'{path}: cannot be written ({error.strerror or error}); make room, or name another folder') from None
 
 
 def load(path) -> tuple[State, dict, dict]:

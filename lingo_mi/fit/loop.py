@@ -1,6 +1,8 @@
 """The loop of a fit: views in turn, densification, measurements on the way, checkpoints."""
 from __future__ import annotations
 
+import json
+import math
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -61,9 +63,11 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
     average = Average(settings.average)
+    scanned = dict(views=len(scan), scanner=describe(scan.geometry),
+                   signal=float(np.abs(scan.projections).mean(dtype=float)))
     if resume:
         host, extra, arrays = checkpoint.load(path)
-        _same_fit(host, extra, settings, scan, seed, path)
+        _same_fit(host, extra, settings, scanned, seed, path)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
@@ -84,7 +88,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
             checkpoint.save(path, state.host(), dict(
                 seed=seed, rng=rng.bit_generator.state, iteration=iteration,
                 seconds=seconds + time.perf_counter() - clock, history=history, info=info,
-                settings=asdict(settings), views=len(scan), scanner=describe(scan.geometry), unit=stepper.unit),
+                settings=asdict(settings), unit=stepper.unit, **scanned),
                 dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays())
 
     while iteration < settings.iterations:
@@ -186,10 +190,10 @@ def scene_radius(geometry) -> float:
     return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.
 
 
-def _same_fit(host, extra, settings, scan, seed, path):
+def _same_fit(host, extra, settings, scanned, seed, path):
     """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
     damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
-    if not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views'} <= extra.keys():
+    if not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views', 'scanner', 'signal'} <= extra.keys():
         raise damaged
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
@@ -199,8 +203,12 @@ def _same_fit(host, extra, settings, scan, seed, path):
     changed = [k for k in now if before.get(k) != now[k] and k not in free]
     if extra['seed'] != seed:
         changed.append('seed')
-    if extra['views'] != len(scan):
+    if extra['views'] != scanned['views']:
         changed.append('views')
+    elif extra['scanner'] != json.loads(json.dumps(scanned['scanner'], default=np.generic.item)):
+        changed.append('the geometry')
+    elif not math.isclose(extra['signal'], scanned['signal'], rel_tol=1e-4):  # simulated anew, their last digits may differ
+        changed.append('the projections')
     if changed:
         raise InputError(f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
                          'settings, or remove it and start again')

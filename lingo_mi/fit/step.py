@@ -202,5 +202,6 @@ def density_unit(scan: Scan, settings: Settings) -> float:
     """The density that a fit counts as 1: see `Settings.normalise`. Raises InputError for an empty scan."""
     largest = float(scan.projections.max()) * scan.geometry.scale
     if largest <= 0:
-        raise InputError('the projections are zero everywhere: there is nothing to fit')
+        raise InputError('no value of the projections is above 0, so there is nothing to fit: they must be line integrals, '
+                         'ln(I0 / I)')
     return largest if settings.normalise else 1.
