@@ -63,8 +63,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
     average = Average(settings.average)
-    scanned = dict(views=len(scan), scanner=describe(scan.geometry),
-                   signal=float(np.abs(scan.projections).mean(dtype=float)))
+    scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
     if resume:
         host, extra, arrays = checkpoint.load(path)
         _same_fit(host, extra, settings, scanned, seed, path)
