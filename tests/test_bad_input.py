@@ -231,7 +231,7 @@ def test_pickle_runs_no_code(scene, tmp_path):
 
 
 @pytest.mark.parametrize('kind, says', [
-    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'nothing to fit'), ('negative', 'no value of the projections is above 0'), ('none', 'filled array'),
+    ('NaN', 'NaN'), ('shape', 'shape'), ('zero', 'zero everywhere'), ('negative', 'nowhere above zero'), ('none', 'filled array'),
     ('no geometry', 'geometry'),
     ('key', 'nDetektor'), ('angles', 'angles'), ('truncated', 'damaged'), ('huge', 'GiB of memory')])
 def test_bad_projections(scene, scan, tmp_path, kind, says):

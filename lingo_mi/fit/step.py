@@ -7,8 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
 from ..geometry import Geometry
+from ..recon.circle import require_signal
 from ..scan import Scan
 from ..xray.frame import View, vector64
 from ..xray.objects import Ellipsoids
@@ -200,8 +200,5 @@ class Stepper:
 
 def density_unit(scan: Scan, settings: Settings) -> float:
     """The density that a fit counts as 1: see `Settings.normalise`. Raises InputError for an empty scan."""
-    largest = float(scan.projections.max()) * scan.geometry.scale
-    if largest <= 0:
-        raise InputError('no value of the projections is above 0, so there is nothing to fit: they must be line integrals, '
-                         'ln(I0 / I)')
-    return largest if settings.normalise else 1.
+    require_signal(scan, 'fit')
+    return float(scan.projections.max()) * scan.geometry.scale if settings.normalise else 1.

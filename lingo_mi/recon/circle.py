@@ -43,12 +43,12 @@ def require_rays(geometry: Geometry):
     raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')
 
 
-def require_signal(scan: Scan):
-    """Raises InputError for projections of nothing."""
+def require_signal(scan: Scan, purpose: str = 'reconstruct'):
+    """Raises InputError for projections of nothing, which leave nothing to do for that purpose."""
     if not scan.projections.any():
-        raise InputError('the projections are zero everywhere: there is nothing to reconstruct')
+        raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')
     if scan.projections.max() <= 0:
-        raise InputError('the projections are nowhere above zero: there is nothing to reconstruct; check their sign')
+        raise InputError(f'the projections are nowhere above zero: there is nothing to {purpose}; check their sign')
 
 
 def gaps(geometry: Geometry, turn: float):
