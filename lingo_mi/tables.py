@@ -63,6 +63,7 @@ class Scale:
     pixels       along a side of the panel
     n_points     Gaussians that a fit starts with
     iterations   of the fits, where the user names none
+    objects      where the user names none
     finer        how many times as many voxels are scanned along each side, where the object has them: the projections then
                  hold structure that the reconstructed voxels cannot
     """
@@ -71,11 +72,13 @@ class Scale:
     pixels: int
     n_points: int
     iterations: tuple[int, ...]
+    objects: tuple[str, ...]
     finer: int = 1
 
 
 # An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
-SCALES = {'small': Scale(96, 192, 7000, (5000,)), 'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000))}
+SCALES = {'small': Scale(96, 192, 7000, (5000,), ('foot', 'chest', 'engine', 'aneurism')),
+          'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000), (*PHANTOMS, *VOLUMES))}
 
 
 @dataclass(frozen=True)

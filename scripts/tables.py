@@ -8,11 +8,10 @@
 Objects are the phantoms foot and chest and the volumes aneurism, engine, teapot, tooth, chest_lidc0314, abdomen_ts, aorta_ts,
 head_fsrt and jaw_fsrt, as NAME.nii.gz in the folder that LINGO_MI_DATA names; those that are missing are skipped.
 
-Scale small has 96 voxels and 192 pixels a side. On two cores with AVX2 each object and method takes about 10 minutes, with fits
-of 5000 iterations from 5, 10 and 25 views and the volumes made of them: all 11 objects and 5 methods about 9 hours. The volumes
-from measured views alone, above all by ASD-POCS, take about half an hour more and the ablation 2 hours, so all three tables
-about 12 hours. This is estimated from single fits; the whole has not been run. Scale paper has the paper's 256 voxels, 512
-pixels and 30,000 iterations, and is meant for a GPU.
+Scale small has 96 voxels and 192 pixels a side, fits of 5000 iterations from 5, 10 and 25 views, and of the objects foot, chest,
+engine and aneurism. It takes a night on two cores: 5 hours for views and ct together, by the times stored in their cells, and 1
+more for the ablation; half an hour (aneurism) to two hours (chest) an object. Scale paper has the paper's 256 voxels, 512 pixels
+and 30,000 iterations, and all objects; it is meant for a GPU.
 
 Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
 tables use what is there. The table, as Markdown and JSON, is renewed after every one of them.
@@ -33,7 +32,7 @@ PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('table', choices=('views', 'ct', 'ablation'))
-    p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: all)')
+    p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: those of the scale)')
     p.add_argument('--views', nargs='+', type=int, metavar='N', help='fitted, of 50 (default: 5 10 25; ablation: 25)')
     p.add_argument('--iterations', nargs='+', type=int, metavar='N', help='of the fits; ct and ablation take the largest '
                    '(default: small 5000, paper 5000 15000 30000)')
@@ -54,7 +53,7 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.tables import PHANTOMS, SCALES, SCANNED, VOLUMES, Cells, available
+    from lingo_mi.tables import SCALES, SCANNED, Cells, available
     from lingo_mi.tables_report import groups, plan, write
 
     scale = replace(SCALES[args.scale], finer=args.finer)
@@ -70,7 +69,7 @@ def main():
         raise InputError(f'--finer must be at least 1, not {args.finer}')
     for method in args.methods:
         settings_of(method)
-    objects = available(dict.fromkeys(args.objects or (*PHANTOMS, *VOLUMES)), print)
+    objects = available(dict.fromkeys(args.objects or scale.objects), print)
     folder = writable_folder(args.out or Path('out/tables') / args.scale, True, True, '')
     cells = Cells(folder, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)

@@ -21,7 +21,7 @@ from lingo_mi.tables import SCALES, Cells, Fit, Scale, Volume, available, load_o
 from lingo_mi.tables_report import ABLATION, groups, markdown, plan, results
 
 TABLES = FIT.with_name('tables.py')
-TINY = Scale(16, 24, 200, (20,))
+TINY = Scale(16, 24, 200, (20,), ('foot',))
 SHORT = 'r2:densify_from=5,densify_until=100,densify_every=6,densify_threshold=1e-6'
 
 
@@ -216,7 +216,7 @@ def test_killed(tmp_path):
     arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
     code = ('import runpy, sys\nimport lingo_mi\nfrom lingo_mi.runtime import use_variant\n'
             f'use_variant({mi.variant()!r})\nfrom lingo_mi import tables\n'
-            'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,))\ntables.SCANNED = 25\n'
+            'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,), ("foot",))\ntables.SCANNED = 25\n'
             'sys.argv = sys.argv[1:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n')
     command = [TABLES, 'views', '--objects', 'foot', '--out', tmp_path, *arguments, '--variant', mi.variant()]
     cells = Cells(tmp_path, TINY)
