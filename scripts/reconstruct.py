@@ -136,7 +136,7 @@ def main():
             check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm)
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
-                given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent))
+                given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), render=cloud.render)
                 scan = scan.subset(np.arange(len(measured)))
         elif args.start:
             scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
