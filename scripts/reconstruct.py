@@ -11,9 +11,10 @@
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
 pixel. refined, which is the best for few clean views, starts from the cloud's own volume, meets all views first and the
-measured ones then. With --start, the volume is made of the views that the cloud was fitted to, by an iterative algorithm that
-starts from the cloud's own volume; any scan will do. Poses that the fit has corrected are used as it has left them, but not by
-fdk. Where the true volume is known, PSNR and SSIM are printed, with its largest density for full scale, then with 1.
+measured ones then; for measured data add -D subvoxel=1. With --start, the volume is made of the views that the cloud was
+fitted to, by an iterative algorithm that starts from the cloud's own volume; any scan will do. Poses that the fit has
+corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with its
+largest density for full scale, then with 1.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 """
