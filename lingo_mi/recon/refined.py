@@ -13,8 +13,8 @@ from .system import Reconstruction, check_bound, check_counts
 
 
 def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
-            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, subvoxel: float = 0., seed: int = 0,
-            *, completed: Scan, init, render, progress=None) -> Reconstruction:
+            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, subvoxel: float = 0.,
+            seed: int = 0, *, completed: Scan, init, render, progress=None) -> Reconstruction:
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
