@@ -52,7 +52,7 @@ NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # num
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (refined, {}), 'subvoxel': (refined, dict(subvoxel=1.))}
+              'refined': (refined, {}), 'finer': (refined, dict(finer=2, completed_niter=1, niter=3))}
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Fit:
 class Volume:
     """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
 
-    Where the fit's method is 'none', from these views alone; 'refined' and 'subvoxel' start from the cloud's own volume.
+    Where the fit's method is 'none', from these views alone; 'refined' and 'finer' start from the cloud's own volume.
     """
 
     fit: Fit
@@ -271,8 +271,8 @@ class Cells:
         total = sum(n for name, n in _options(cell.algorithm).items() if name.endswith('niter')) or len(views)
         if function is refined:
             stepper, state = self._cloud(cell.fit)
-            views, options = dataset.train, options | dict(completed=views, init=stepper.volume(state),
-                                                           render=lambda geometry: stepper.render(state, geometry))
+            options = options | dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
+            views = dataset.train
         with Progress(label, total) as bar:
             def progress(done, _, residual=None):
                 bar.update(done, residual=residual)

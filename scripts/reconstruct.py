@@ -11,10 +11,10 @@
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
 pixel. refined, which is the best for few clean views, starts from the cloud's own volume, meets all views first and the
-measured ones then; for measured data add -D subvoxel=1. With --start, the volume is made of the views that the cloud was
-fitted to, by an iterative algorithm that starts from the cloud's own volume; any scan will do. Poses that the fit has
-corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with its
-largest density for full scale, then with 1.
+measured ones then; for objects finer than the voxels add -D finer=2. With --start, the volume is made of the views that the
+cloud was fitted to, by an iterative algorithm that starts from the cloud's own volume; any scan will do. Poses that the fit
+has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
+its largest density for full scale, then with 1.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 """
@@ -109,6 +109,7 @@ def main():
     if effects not in ('model', 'ignore') or effects == 'ignore' and (args.complete or args.start):
         raise InputError(f"-D effects={effects}: must be 'model' or 'ignore', and with --complete or --start goes by the fit")
     given = options(run, chosen)
+    finer = given.get('finer', 1)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
@@ -118,10 +119,10 @@ def main():
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
     views = len(cloud.geometry) if cloud else args.views
     if not (args.projections or args.volume):  # their geometry is not known before they are read
-        check_scan(scene.scanner.geometry, views, args.algorithm)
+        check_scan(scene.scanner.geometry, views, args.algorithm, finer)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0)
     scan = dataset.train
-    check_scan(scan.geometry, views, args.algorithm)
+    check_scan(scan.geometry, views, args.algorithm, finer)
     if args.algorithm != 'voxelize':
         require_signal(scan)
     began = time.monotonic()
@@ -134,10 +135,10 @@ def main():
                 raise InputError('filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
                                  'take another --algorithm')
             # refined works on all of the views as sart does
-            check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm)
+            check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm, finer)
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
-                given |= dict(completed=scan, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), render=cloud.render)
+                given |= dict(completed=scan, sample=lambda geometry: voxelize_cloud(cloud.gaussians, geometry, cloud.extent))
                 scan = scan.subset(np.arange(len(measured)))
         elif args.start:
             scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
@@ -158,13 +159,17 @@ def main():
     print(out)
 
 
-def check_scan(geometry, views: int | None, algorithm: str):
-    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them."""
+def check_scan(geometry, views: int | None, algorithm: str, finer: int):
+    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them, on `finer` times
+    as many voxels a side."""
     from lingo_mi.recon.circle import require_rays
     from lingo_mi.recon.memory import COPIES
+    from lingo_mi.recon.refined import divided
+    from lingo_mi.recon.system import check_counts
     from lingo_mi.scanning import check_memory
     require_rays(geometry)
-    check_memory(geometry, views=views or 0, copies=COPIES.get(algorithm, 0))
+    check_counts(finer=finer)
+    check_memory(divided(geometry, finer), views=views or 0, copies=COPIES.get(algorithm, 0))
 
 
 def reconstruct(run, scan, given, Progress):

@@ -25,7 +25,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS, settings_of
 from lingo_mi.runtime import use_variant
 
-ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'subvoxel'
+ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer'
 PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
 
 

@@ -232,11 +232,11 @@ def test_what_is_not_finite_is_no_result(run):
 
 
 @pytest.mark.parametrize('wrong', [dict(alpha=np.inf), dict(seed=-1), dict(maxl2err=np.nan), dict(exact_every=-1),
-                                   dict(subvoxel=2.), dict(subvoxel=np.nan)])
+                                   dict(finer=0), dict(finer=1.5), dict(completed_niter=-1)])
 def test_refined_checks_before_its_passes(wrong):
     scan = Scan(small(n=2), np.ones((2, 17, 21)))
     with pytest.raises(InputError, match=f'{next(iter(wrong))} must be'):
-        refined(scan, completed=scan, init=None, render=None, progress=lambda *_: pytest.fail('has begun'), **wrong)
+        refined(scan, completed=scan, sample=None, progress=lambda *_: pytest.fail('has begun'), **wrong)
 
 
 def test_no_kernel_is_compiled_after_the_first_iterations(system):

@@ -33,7 +33,7 @@ def run(size, pixels, views):
     few, ones = scan.subset(slice(0, None, 4)), np.ones((size,) * 3, np.float32)
     {'fdk': lambda: fdk(scan), 'sart': lambda: sart(scan, niter=1), 'cgls': lambda: cgls(scan, niter=1),
      'asd-pocs': lambda: asd_pocs(scan, niter=1, tviter=2),
-     'refined': lambda: refined(few, 1, 1, 2, completed=scan, init=ones, render=None)}[sys.argv[1]]()
+     'refined': lambda: refined(few, 1, 1, 2, completed=scan, sample=lambda _: ones)}[sys.argv[1]]()
 
 def peak():
     return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))

@@ -25,7 +25,6 @@ from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_
 from lingo_mi.results import compared, volume_quality, write_scene
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scanning import load_scene, render_objects, take_scan, voxelize_cloud
-from lingo_mi.xray import grid
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 
@@ -134,17 +133,19 @@ def test_refined(scene, dataset, fitted, tmp_path):
     then = asd_pocs(measured, 4, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=first)
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), then.volume)
     assert psnr_3d(then.volume, dataset.volume) > psnr_3d(own, dataset.volume) + .5
-    # What the cloud shows beyond its voxels, taken out first.
-    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=2', '-D', 'subvoxel=0.5', '--complete', fitted,
-                       '--views', 12, '--out', tmp_path / 's.nii')
-    assert code == 0, err
-    whole = complete(measured, cloud, 12)
-    images, projected = cloud.render(whole.geometry), grid.project(own, whole.geometry)
-    assert np.linalg.norm(images - projected) > .002 * np.linalg.norm(images)
-    whole = replace(whole, projections=whole.projections - (images - projected) / 2)
-    first = sart(whole, 2, init=own).volume
-    then = asd_pocs(whole.subset([0, 1, 2, 3]), 2, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=first)
-    np.testing.assert_allclose(load(tmp_path / 's.nii'), then.volume, atol=1e-6 * then.volume.max())
+    # Means of smaller voxels, on which the cloud is sampled anew.
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=2', '-D', 'completed_niter=0', '-D', 'finer=2',
+                       '--complete', fitted, '--views', 12, '--out', tmp_path / 's.nii')
+    assert code == 0 and '2/2 (100%)' in err, err
+    g = measured.geometry
+    small = replace(measured, geometry=g.with_volume([2 * n for n in g.nVoxel], [d / 2 for d in g.dVoxel]))
+    own = voxelize_cloud(cloud.gaussians, small.geometry, cloud.extent)
+    then = asd_pocs(small, 2, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=own).volume
+    eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
+    for wrong in ('0', '1000'):  # no voxels, and more than there is memory for
+        code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', f'finer={wrong}', '--complete', fitted, '--views', 12)
+        assert code == 2 and err.count('\n') == 1 and ('finer' if wrong == '0' else 'memory') in err, err
 
 
 # ---- effects ---------------------------------------------------------------------------------------------------------

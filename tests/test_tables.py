@@ -123,7 +123,7 @@ def test_opacities_have_no_row_of_means(tmp_path):
     cells = mock.Mock(get=lambda cell: dict(psnr_3d=30., ssim_3d=.9))
     rows = [(row['second'], row['object']) for row in results(found, ['foot'], cells)]
     assert rows == [(a, name) for a in ('fdk', 'sart', 'asd-pocs') for name in ('foot', 'mean of 1')] + [
-        ('refined', 'foot'), ('subvoxel', 'foot'), ('voxelize', 'foot')]
+        ('refined', 'foot'), ('finer', 'foot'), ('voxelize', 'foot')]
     code, _, err = script('ct', tmp_path / 'a', '--methods', 'xgaussian', '--algorithms', 'refined')
     assert code == 2 and 'refined cannot make a volume of xgaussian' in err and err.count('\n') == 1
     assert not (tmp_path / 'a').exists()
@@ -262,9 +262,9 @@ def test_objects_finer_than_the_voxels(tmp_path):
     np.testing.assert_array_equal(found.test.projections, expected.test.projections)
     assert coarse.path(Fit('foot', 4, 'r2')) != fine.path(Fit('foot', 4, 'r2'))
     code, text, err = script('ct', tmp_path, '--finer', '2', '--views', '4', '--methods', 'r2:n_points=50', '--iterations', '5',
-                             '--algorithms', 'fdk', 'subvoxel')
+                             '--algorithms', 'fdk', 'finer')
     assert code == 0 and '(scanned on 2 times as many)' in text and 'r2:n_points=50 PSNR' in text, err
-    assert '| 4 | subvoxel | foot | – | – |' in text
+    assert '| 4 | finer | foot | – | – |' in text
 
 
 def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):

@@ -114,14 +114,15 @@ class Stepper:
                 progress(i + 1, len(geometry))
         return out * np.float32(self.unit / geometry.scale)
 
-    def volume(self, state: DeviceState) -> np.ndarray | None:
-        """The cloud's density at the voxel centres of the scan's grid, float32 [x, y, z].
+    def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
+        """The cloud's density at the voxel centres of a geometry's grid, float32 [x, y, z] (default: of the scan's).
 
+        The grid must be of the scan's size, whatever its voxels.
         None for alpha compositing: opacities and radiances are no attenuation.
         """
         if self.settings.render == 'alpha':
             return None
-        g = self.geometry
+        g = geometry or self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
         values = voxelize(*state.gaussians(self.settings), grid, self.settings.extent, deep=True)
         return grid.volume(values) * np.float32(self.unit)

@@ -3,55 +3,58 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
+from ..geometry import Geometry
 from ..scan import Scan
-from ..xray import grid
 from .asd_pocs import asd_pocs, check_parameters
 from .sart import sart
-from .system import Reconstruction, check_bound, check_counts
+from .system import Reconstruction, check_counts
 
 
 def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
-            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, subvoxel: float = 0.,
-            seed: int = 0, *, completed: Scan, init, render, progress=None) -> Reconstruction:
+            alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, finer: int = 1,
+            seed: int = 0, *, completed: Scan, sample, progress=None) -> Reconstruction:
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
     wrong is put right by the measured ones. Total variation is smoothed away in long steps, which shorten until they change
     the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
 
-    Structure finer than the voxels, which all real objects have, this takes for density, and makes streaks of it. The cloud,
-    which has no voxels, shows how much there is: its images less the projections of its volume. With `subvoxel` that share of
-    it is taken out of all projections first. It costs as much of what voxels alone would resolve, so it is 0 for an object
-    that was simulated on these very voxels, and 1 for others (docs/results.md, "Better volumes from 25 views").
+    Structure finer than the voxels, which all real objects have, has no place on them and becomes streaks. The cloud has no
+    voxels, so that it may be sampled on smaller ones: with `finer` all of this is done on these, and their means are returned.
+    An object that was simulated on these very voxels has none, and loses by it: hence 1, and 2 for others
+    (docs/results.md, "Better volumes from 25 views").
 
     scan              measured projections and geometry
     niter             passes over the measured views
-    completed_niter   passes over the completed views before
+    completed_niter   passes over the completed views before; 0 for none
     tviter, alpha, alpha_red, rmax, maxl2err, exact_every
                       of `asd_pocs`. The defaults are for clean projections; with noise, maxl2err says how well to meet them
-    subvoxel          from 0 to 1
+    finer             parts along each side of a voxel; time and memory grow with its cube
     seed              of the random orders
     completed         measured views, which come first, and those between (`two_stage.filled`)
-    init              the cloud's volume [x, y, z], density per mm
-    render            the cloud's line integrals [view, v, u] of any views, a function of their geometry; for `subvoxel` alone
+    sample            the cloud's densities per mm [x, y, z] at the voxel centres of a geometry, a function of that
     progress          called as progress(passes done, passes, residual)
 
     The residuals are those of the measured views. Raises InputError as `asd_pocs` does.
     """
-    check_counts(niter=niter, completed_niter=completed_niter)
+    check_counts(finer=finer)
+    check_counts(least=0, completed_niter=completed_niter)
     check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, seed=seed)  # before the passes
-    check_bound('subvoxel', subvoxel, 1.)
-    if subvoxel > 0:
-        finer = np.float32(subvoxel) * (render(completed.geometry) - grid.project(init, completed.geometry))
-        completed = replace(completed, projections=completed.projections - finer)
-        scan = replace(scan, projections=scan.projections - finer[:len(scan)])
-    passes = completed_niter + niter
+    shape, passes = scan.geometry.nVoxel, completed_niter + niter
 
     def of_stage(before):
         return progress and (lambda done, _, residual: progress(before + done, passes, residual))
-    first = sart(completed, completed_niter, init=init, seed=seed, progress=of_stage(0))
-    return asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
-                    exact_every=exact_every, init=first.volume, seed=seed, progress=of_stage(completed_niter))
+    scan, completed = (replace(s, geometry=divided(s.geometry, finer)) for s in (scan, completed))
+    volume = sample(scan.geometry)
+    if completed_niter:
+        volume = sart(completed, completed_niter, init=volume, seed=seed, progress=of_stage(0)).volume
+    found = asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
+                     exact_every=exact_every, init=volume, seed=seed, progress=of_stage(completed_niter))
+    parts = [n for count in shape for n in (count, finer)]
+    return replace(found, volume=found.volume.reshape(parts).mean((1, 3, 5)))
+
+
+def divided(geometry: Geometry, finer: int) -> Geometry:
+    """The same scan of a volume of `finer` times as many voxels along each side."""
+    return geometry.with_volume([finer * n for n in geometry.nVoxel], [d / finer for d in geometry.dVoxel])
