@@ -52,7 +52,7 @@ NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # num
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {'fdk': (fdk, {}), 'sart': (sart, dict(niter=20)), 'asd-pocs': (asd_pocs, dict(niter=10)),
-              'refined': (refined, {}), 'finer': (refined, dict(finer=2, completed_niter=1, niter=3))}
+              'refined': (refined, {}), 'finer': (refined, dict(finer=2, completed_niter=0, niter=4))}
 
 
 @dataclass(frozen=True)
