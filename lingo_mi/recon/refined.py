@@ -19,9 +19,9 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
     wrong is put right by the measured ones. Total variation is smoothed away in long steps, which shorten until they change
     the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
 
-    Structure finer than the voxels, which all real objects have, has no place on them and becomes streaks. The cloud has no
-    voxels, so that it may be sampled on smaller ones: with `finer` all of this is done on these, and their means are returned.
-    An object that was simulated on these very voxels has none, and loses by it: hence 1, and 2 for others
+    Structure finer than the voxels has no place on them and becomes streaks. The cloud has no voxels, so that it may be sampled
+    on smaller ones: with `finer` all of this is done on these, and their means are returned. It pays for clean projections of
+    objects finer than the voxels. One that was simulated on these very voxels is blurred by it, and noise finds more room
     (docs/results.md, "Better volumes from 25 views").
 
     scan              measured projections and geometry
@@ -29,7 +29,7 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
     completed_niter   passes over the completed views before; 0 for none
     tviter, alpha, alpha_red, rmax, maxl2err, exact_every
                       of `asd_pocs`. The defaults are for clean projections; with noise, maxl2err says how well to meet them
-    finer             parts along each side of a voxel; time and memory grow with its cube
+    finer             parts along each side of a voxel; memory grows with its cube
     seed              of the random orders
     completed         measured views, which come first, and those between (`two_stage.filled`)
     sample            the cloud's densities per mm [x, y, z] at the voxel centres of a geometry, a function of that
