@@ -160,15 +160,13 @@ def main():
 
 
 def check_scan(geometry, views: int | None, algorithm: str, finer: int):
-    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them, on `finer` times
-    as many voxels a side."""
+    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them, on `finer`
+    times as many voxels a side."""
     from lingo_mi.recon.circle import require_rays
     from lingo_mi.recon.memory import COPIES
     from lingo_mi.recon.refined import divided
-    from lingo_mi.recon.system import check_counts
     from lingo_mi.scanning import check_memory
     require_rays(geometry)
-    check_counts(finer=finer)
     check_memory(divided(geometry, finer), views=views or 0, copies=COPIES.get(algorithm, 0))
 
 

@@ -144,7 +144,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
     eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
     for wrong in ('0', '1000'):  # no voxels, and more than there is memory for
-        code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', f'finer={wrong}', '--complete', fitted, '--views', 12)
+        code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', f'finer={wrong}', '--complete', fitted,
+                           '--views', 12)
         assert code == 2 and err.count('\n') == 1 and ('finer' if wrong == '0' else 'memory') in err, err
 
 

@@ -37,7 +37,6 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
 
     The residuals are those of the measured views. Raises InputError as `asd_pocs` does.
     """
-    check_counts(finer=finer)
     check_counts(least=0, completed_niter=completed_niter)
     check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, seed=seed)  # before the passes
@@ -56,5 +55,9 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
 
 
 def divided(geometry: Geometry, finer: int) -> Geometry:
-    """The same scan of a volume of `finer` times as many voxels along each side."""
+    """The same scan of a volume of `finer` times as many voxels along each side.
+
+    Raises InputError where that is no number from 1 on.
+    """
+    check_counts(finer=finer)
     return geometry.with_volume([finer * n for n in geometry.nVoxel], [d / finer for d in geometry.dVoxel])
