@@ -21,15 +21,23 @@ MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger on
 
 
 class Work:
-    """Items shared out among teams. blocks, block_cost: UInt32 [N], costs at least 1."""
+    """Items shared out among teams, from arrays that are evaluated:
 
-    def __init__(self, blocks, block_cost):
+    blocks, block_cost   UInt32 [N], costs at least 1
+    ends                 UInt64 [N], the sums of cost up to the end of each item
+    """
+
+    def __init__(self, blocks, block_cost, ends):
         self.count = dr.width(blocks)
         self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
         self.teams = 2 * dr.thread_count() if self.on_cpu else 4096
-        self.blocks, self.block_cost = blocks, block_cost
-        self.ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
-        dr.eval(self.blocks, self.block_cost, self.ends)
+        self.arrays = self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
+
+    @classmethod
+    def of(cls, blocks, block_cost) -> Work:
+        ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
+        dr.eval(blocks, block_cost, ends)
+        return cls(blocks, block_cost, ends)
 
     def shares(self) -> dict:
         """The arguments of a kernel for `each_item`: lane, the begin and end of its share as (item, block), and blocks."""
@@ -51,7 +59,7 @@ class Work:
         if parts > 1:
             which, total = scattered(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
             for part in range(parts):
-                some = Work(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
+                some = Work.of(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
                 total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
                 dr.eval(total)
             return mi.Float(total)

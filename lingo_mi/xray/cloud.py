@@ -13,7 +13,7 @@ from .footprint import NAMES, project
 from .frame import View
 from .replay import Replay
 from .segment import add_straddling
-from .splat import splat
+from .splat import Plan, prepare, splat
 
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
@@ -53,74 +53,112 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     inputs = *gaussians, view.source, view.corner, view.u, view.v
     settings = dict(width=view.width, height=view.height, parallel=view.parallel, panel=view.panel, extent=extent,
                     affine=affine, area=area)
-    image, straddles = dr.custom(_Splatted, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
-    if view.parallel:
-        return image + dr.sum(dr.select(straddles, dr.nan, mi.Float(0)))
-    straddling = dr.compress(straddles)  # waits for the device
-    if (affine or area) and dr.width(straddling):
-        warnings.warn(AccuracyWarning(
-            f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
-            f'the pixel\'s centre is taken, whatever "pixel" and "footprint" say'), stacklevel=3)
-    return add_straddling(image, centre, scale, rotation, density, view, straddling)
+    return dr.custom(_LineIntegrals, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
 
 
-class _Splatted(dr.CustomOp):
-    """The image of what can be splatted, and which Gaussians cannot, Bool [N]. All but tangents is replayed."""
+class _LineIntegrals(dr.CustomOp):
+    """The splat of what can be splatted, of which all but tangents is replayed, and the rest, one by one.
+
+    In how many parts to add up and what the rest is, the host learns from the footprints, before the splat is launched: it then
+    goes on while the device adds up pixels.
+    """
 
     def eval(self, inputs, wanted, settings, primal):
-        self.inputs, self.wanted, self.settings, self.parts = inputs, wanted, settings, 1
+        self.inputs, self.wanted, self.settings, self.parts, self.known = inputs, wanted, settings, 1, None
         if not primal:
-            return dr.zeros(mi.Float, settings['width'] * settings['height']), _STRADDLES(*inputs, **settings)
-        image, straddles, depth = _PRIMAL(*inputs, **settings)
-        self.parts = parts_of(depth)
-        if self.parts > 1:
-            image, _ = _image(*inputs, **settings, parts=self.parts)
-        return image, straddles
+            return dr.zeros(mi.Float, settings['width'] * settings['height'])
+        *prepared, straddles, depth = _PREPARE(*inputs, **settings)
+        self.parts, straddling = parts_of(depth), dr.compress(straddles)  # both wait for the device
+        if (settings['affine'] or settings['area']) and dr.width(straddling):
+            warnings.warn(AccuracyWarning(
+                f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
+                f'the pixel\'s centre is taken, whatever "pixel" and "footprint" say'), stacklevel=4)
+        image = _DRAW(*prepared, *inputs[-POSE:], parts=self.parts, **settings)
+        if any(wanted):
+            self.known = prepared, straddling
+        return _with_rest(image, inputs, settings, straddling)
 
     def forward(self):
-        leaves = tuple(dr.detach(x) for x in self.inputs)
-        dr.enable_grad(leaves)
+        leaves = self._leaves()
         dr.set_grad(leaves, self.grad_in('inputs'))
-        image, footprints = _image(*leaves, **self.settings, parts=self.parts)
+        view, footprints = _footprints(*leaves, **self.settings)
+        image = splat(footprints, view.height, view.width, self.settings['extent'], self.parts) * view.lengths()
+        image = _with_rest(image, leaves, self.settings, dr.compress(footprints.straddles))
         dr.forward_to(image)
-        self.set_grad_out((dr.grad(image), footprints.straddles))  # the latter has no tangent, and keeps its place
+        self.set_grad_out(dr.grad(image))
 
     def backward(self):
-        self.set_grad_in('inputs', _GRADIENT(*self.inputs, self.grad_out()[0], wanted=self.wanted, parts=self.parts,
-                                             **self.settings))
+        if self.known is None:
+            *prepared, straddles, _ = _PREPARE(*self.inputs, **self.settings, deep=False)
+            self.known = prepared, dr.compress(straddles)
+        prepared, straddling = self.known
+        gradients = _GRADIENT(*self.inputs, *prepared, self.grad_out(), wanted=self.wanted, parts=self.parts, **self.settings)
+        if dr.width(straddling) and not self.settings['parallel']:
+            leaves = self._leaves()
+            dr.backward_from(_with_rest(mi.Float(0), leaves, self.settings, straddling) * self.grad_out())
+            gradients = [a + dr.grad(leaf) for a, leaf in zip(gradients, leaves)]
+        self.set_grad_in('inputs', tuple(gradients))
 
     def name(self):
         return 'line integrals'
 
+    def _leaves(self):
+        leaves = tuple(dr.detach(x) for x in self.inputs)
+        dr.enable_grad(leaves)
+        return leaves
 
-def _footprints(*inputs, width, height, parallel, panel, extent, affine, area):
+
+def _read(*inputs, width, height, parallel, panel, **_):
+    """Centres, scales, rotations and densities, and the view, that the inputs are."""
     *shapes, density = inputs[:-POSE]
-    view = View(*inputs[-POSE:], width, height, parallel, panel)
     shapes = columns(*shapes) if len(shapes) == 1 else shapes
-    footprints = project(*shapes, density, view, extent, PIXEL_VARIANCE if area else 0.)
+    return (*shapes, density), View(*inputs[-POSE:], width, height, parallel, panel)
+
+
+def _footprints(*inputs, extent, affine, area, **of_view):
+    gaussians, view = _read(*inputs, **of_view)
+    footprints = project(*gaussians, view, extent, PIXEL_VARIANCE if area else 0.)
     return view, _affine(footprints) if affine else footprints
 
 
-def _image(*inputs, primal=True, parts=1, **settings):
-    view, footprints = _footprints(*inputs, **settings)
-    return splat(footprints, view.height, view.width, settings['extent'], primal, parts) * view.lengths(), footprints
+def _with_rest(image, inputs, settings, indices):
+    """An image with the Gaussians of some indices, which cannot be splatted; in a parallel beam nothing can integrate them."""
+    if dr.width(indices) == 0:
+        return image
+    gaussians, view = _read(*inputs, **settings)
+    return image + dr.nan if view.parallel else add_straddling(image, *gaussians, view, indices)
 
 
-def _primal(*inputs, width, height, **settings):
-    image, f = _image(*inputs, width=width, height=height, **settings)
-    return image, f.straddles, deepest((f.column, f.row), f.area, (width, height))
+def _prepare(*inputs, deep=True, **settings):
+    """What `splat.Plan` takes, then which Gaussians cannot be splatted, Bool [N], and how deep they lie."""
+    view, f = _footprints(*inputs, **settings)
+    found = prepare(f.values, replace(f, values=()))
+    return *found, f.straddles, deepest((f.column, f.row), f.area, (view.width, view.height)) if deep else None
 
 
-def _gradient(*inputs, wanted, parts, **settings):
-    *inputs, upstream = inputs
+def _draw(*arrays, width, height, parallel, panel, extent, parts, **_):
+    view = View(*arrays[-POSE:], width, height, parallel, panel)
+    return Plan(arrays[:-POSE], height, width, extent).image(parts) * view.lengths()
+
+
+def _gradient(*arrays, wanted, parts, extent, **settings):
+    inputs, (*prepared, upstream) = arrays[:len(wanted)], arrays[len(wanted):]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
-    of_pose = any(wanted[-POSE:])  # which changes what the splat's image is multiplied by, too
-    dr.backward_from(_image(*inputs, primal=of_pose, parts=parts, **settings)[0] * upstream)
-    return tuple(dr.grad(x) for x in inputs)
+    view, footprints = _footprints(*inputs, extent=extent, **settings)
+    plan, lengths = Plan(prepared, view.height, view.width, extent), view.lengths()
+    found = plan.gradient(upstream * dr.detach(lengths), dr.detach(footprints.values[3]))
+    if dr.grad_enabled(lengths):
+        dr.set_grad(lengths, plan.image(parts) * upstream)
+        dr.enqueue(dr.ADMode.Backward, lengths)
+    for value, gradient in zip(footprints.values, found):
+        if dr.grad_enabled(value):
+            dr.set_grad(value, gradient)
+            dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    return [dr.grad(x) for x in inputs]
 
 
-_PRIMAL, _GRADIENT = Replay(_primal), Replay(_gradient)
-_STRADDLES = Replay(lambda *inputs, **settings: _footprints(*inputs, **settings)[1].straddles)
+_PREPARE, _DRAW, _GRADIENT = Replay(_prepare), Replay(_draw), Replay(_gradient)
 
 
 def _affine(footprints):

@@ -112,7 +112,7 @@ class MeshPaths:
             return dr.zeros(mi.Float, view.height * view.width)
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
         dr.eval(triangles)
-        work = Work(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn))
+        work = Work.of(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn))
         return work.add_up(_fill, view.height, view.width, vertices=vertices, triangles=triangles, **size,
                            packets=dr.opaque(mi.Int32, packets), bend=dr.opaque(mi.Float, 0. if view.parallel else 1.))
 

@@ -22,80 +22,82 @@ import mitsuba as mi
 from .balance import (LANES, PACKET, Work, deposit, each_item, high_low, load, pack, packets_of, pad, pair, position,
                       repeat, span, times, unpair, whole)
 from .exponential import HALF_LOG2E, exp2_of_negative
-from .footprint import NAMES, Footprints
+from .footprint import DOUBLE, NAMES, Footprints
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float, primal: bool = True, parts: int = 1):
+def splat(footprints: Footprints, height: int, width: int, extent: float, parts: int = 1):
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
-    Differentiable in `footprints.values`, in forward and in reverse mode. With `primal` off the image itself is left at
-    zero, for who only wants derivatives. The footprints are added up in that many `parts` (`depth`).
+    Differentiable in `footprints.values`, in forward and in reverse mode. The footprints are added up in that many `parts`
+    (`depth`).
     """
-    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, primal, parts)
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, parts)
 
 
 class _Splat(dr.CustomOp):
-    def eval(self, values, rest, height, width, extent, primal, parts):
-        self.plan = _Plan(values, rest, height, width, extent, parts)
-        return self.plan.image() if primal else dr.zeros(mi.Float, height * width)
+    def eval(self, values, rest, height, width, extent, parts):
+        self.plan, self.shear, self.parts = Plan(prepare(values, rest), height, width, extent), values[3], parts
+        return self.plan.image(parts)
 
     def forward(self):
-        self.set_grad_out(self.plan.tangent(self.grad_in('values')))
+        self.set_grad_out(self.plan.tangent(self.grad_in('values'), self.shear, self.parts))
 
     def backward(self):
-        self.set_grad_in('values', self.plan.gradient(self.grad_out()))
+        self.set_grad_in('values', self.plan.gradient(self.grad_out(), self.shear))
 
     def name(self):
         return 'splat'
 
 
-class _Plan:
-    """The work of one image: packed footprints, shared out by their pixels."""
+def prepare(values, rest):
+    """Footprints as the kernels take them, evaluated arrays for `Plan`; those of `rest` are evaluated with them."""
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
+    ridge = x + shear * y
+    steps = whole(ridge)
+    (high, low), (ridge, ridge_low) = high_low(shear), high_low(ridge - steps)
+    columns = (amplitude, mx, my, high, e1, e2, e11, e12, e22, ridge, mi.Float(y), pair(low, ridge_low))
+    packed = pack(mi.Vector4f, mi.Float, columns)
+    places = pack(mi.Vector4i, mi.Int32, (rest.column + mi.Int32(steps), rest.row, rest.row_begin, rest.row_end))
+    blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
+    cost = mi.UInt32(rest.width) // PACKET + SETUP
+    dr.eval(packed, places, blocks, cost, rest)  # together: each alone would project all Gaussians again
+    return packed, places, *Work.of(blocks, cost).arrays
 
-    def __init__(self, values, rest, height, width, extent, parts):
-        self.count, self.height, self.width, self.parts = dr.width(values[0]), height, width, parts
-        self.packets = packets_of(width)
-        amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
-        Float64 = dr.float64_array_t(mi.Float)
-        self.types = [type(v) for v in values]
-        self.shear = Float64(shear)
-        ridge = Float64(x) + self.shear * Float64(y)
-        steps = whole(ridge)
-        (shear, shear_low), (ridge, ridge_low) = high_low(self.shear), high_low(ridge - steps)
-        columns = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, ridge, mi.Float(y), pair(shear_low, ridge_low))
-        self.packed = pack(mi.Vector4f, mi.Float, columns)
-        column = rest.column + mi.Int32(steps)
-        self.whole = pack(mi.Vector4i, mi.Int32, (column, rest.row, rest.row_begin, rest.row_end))
-        blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
-        cost = mi.UInt32(rest.width) // PACKET + SETUP
-        dr.eval(self.packed, self.whole, blocks, cost, rest)  # together: each alone would project all Gaussians again
-        self.work = Work(blocks, cost)
-        self.arguments = dict(packed=self.packed, whole=self.whole, extent2=dr.opaque(mi.Float, extent * extent),
-                              packets=dr.opaque(mi.Int32, self.packets))
 
-    def image(self):
-        return self.work.add_up(_draw, self.height, self.width, self.parts, **self.arguments)
+class Plan:
+    """The work of one image: footprints that `prepare` packed, shared out by their pixels."""
 
-    def tangent(self, tangents):
+    def __init__(self, prepared, height: int, width: int, extent: float):
+        packed, places, *work = prepared
+        self.height, self.width, self.work = height, width, Work(*work)
+        self.arguments = dict(packed=packed, whole=places, extent2=dr.opaque(mi.Float, extent * extent),
+                              packets=dr.opaque(mi.Int32, packets_of(width)))
+
+    def image(self, parts: int = 1):
+        """Float [height * width]."""
+        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments)
+
+    def tangent(self, tangents, shear, parts: int = 1):
+        """The image's derivative in a direction of the footprints' numbers, of which `shear` is one."""
         *others, x, y = tangents
         # A needle that moves along itself: in float32 its ridge would seem to move, too.
-        ridge = type(self.shear)(x) + self.shear * type(self.shear)(y)
-        zeros = dr.zeros(mi.Float, self.count)  # a tangent that vanishes has width 1
+        ridge = type(shear)(x) + shear * type(shear)(y)
+        zeros = dr.zeros(mi.Float, self.work.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self.work.add_up(_draw, self.height, self.width, self.parts, **self.arguments, moved=moved)
+        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments, moved=moved)
 
-    def gradient(self, grad_image):
-        """Derivatives of the footprints' numbers, a tuple of Float [N], from that of the image."""
+    def gradient(self, grad_image, shear):
+        """Derivatives by the footprints' numbers, a tuple like them, from that by the image."""
         upstream = pad(grad_image, self.height, self.width)
-        out = [dr.zeros(mi.Float, self.count) for _ in NAMES]
+        out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
         dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
         # The kernel's derivative by y leaves the ridge where it is.
-        out[-1] = type(self.shear)(out[-1]) + self.shear * type(self.shear)(out[-2])
-        return tuple(kind(v) for kind, v in zip(self.types, out))
+        out[-1] = type(shear)(out[-1]) + shear * type(shear)(out[-2])
+        return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, out))
 
 
 def _row(c, w, y, extent2, packets):

@@ -94,7 +94,7 @@ class _Voxelize(dr.CustomOp):
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
         blocks, cost = (mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP
         dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
-        self.work = Work(blocks, cost)
+        self.work = Work.of(blocks, cost)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
         self.arguments = dict(packed=packed, places=places, extent2=dr.opaque(mi.Float, extent * extent),
                               packets=dr.opaque(mi.Int32, self.packets), rows=dr.opaque(mi.Int32, ny))
