@@ -67,8 +67,7 @@ class _LineIntegrals(dr.CustomOp):
         self.inputs, self.wanted, self.settings, self.parts, self.known = inputs, wanted, settings, 1, None
         if not primal:
             return dr.zeros(mi.Float, settings['width'] * settings['height'])
-        *prepared, straddles, depth = _PREPARE(*inputs, **settings)
-        self.parts, straddling = parts_of(depth), dr.compress(straddles)  # both wait for the device
+        prepared, straddling = self._look()
         if (settings['affine'] or settings['area']) and dr.width(straddling):
             warnings.warn(AccuracyWarning(
                 f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
@@ -88,10 +87,7 @@ class _LineIntegrals(dr.CustomOp):
         self.set_grad_out(dr.grad(image))
 
     def backward(self):
-        if self.known is None:
-            *prepared, straddles, _ = _PREPARE(*self.inputs, **self.settings, deep=False)
-            self.known = prepared, dr.compress(straddles)
-        prepared, straddling = self.known
+        prepared, straddling = self.known or self._look(deep=any(self.wanted[-POSE:]))  # a pose needs the image, too
         gradients = _GRADIENT(*self.inputs, *prepared, self.grad_out(), wanted=self.wanted, parts=self.parts, **self.settings)
         if dr.width(straddling) and not self.settings['parallel']:
             leaves = self._leaves()
@@ -102,7 +98,16 @@ class _LineIntegrals(dr.CustomOp):
     def name(self):
         return 'line integrals'
 
+    def _look(self, deep=True):
+        """What `splat.Plan` takes, and the indices of what cannot be splatted; with `deep`, finds in how many parts to add up.
+        Waits for the device."""
+        *prepared, straddles, depth = _PREPARE(*self.inputs, **self.settings, deep=deep)
+        if deep:
+            self.parts = parts_of(depth)
+        return prepared, dr.compress(straddles)
+
     def _leaves(self):
+        """The inputs, differentiable anew."""
         leaves = tuple(dr.detach(x) for x in self.inputs)
         dr.enable_grad(leaves)
         return leaves
@@ -129,7 +134,7 @@ def _with_rest(image, inputs, settings, indices):
     return image + dr.nan if view.parallel else add_straddling(image, *gaussians, view, indices)
 
 
-def _prepare(*inputs, deep=True, **settings):
+def _prepare(*inputs, deep, **settings):
     """What `splat.Plan` takes, then which Gaussians cannot be splatted, Bool [N], and how deep they lie."""
     view, f = _footprints(*inputs, **settings)
     found = prepare(f.values, replace(f, values=()))
