@@ -13,7 +13,7 @@ from .footprint import NAMES, project
 from .frame import View
 from .replay import Replay
 from .segment import add_straddling
-from .splat import Plan, prepare, splat
+from .splat import Plan, by_values, prepare, splat
 
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'   # a footprint's numbers for how |d|^2 varies over it
@@ -87,11 +87,15 @@ class _LineIntegrals(dr.CustomOp):
         self.set_grad_out(dr.grad(image))
 
     def backward(self):
-        prepared, straddling = self.known or self._look(deep=any(self.wanted[-POSE:]))  # a pose needs the image, too
-        gradients = _GRADIENT(*self.inputs, *prepared, self.grad_out(), wanted=self.wanted, parts=self.parts, **self.settings)
+        of_pose = any(self.wanted[-POSE:])  # which changes what the splat's image is multiplied by, too
+        prepared, straddling = self.known or self._look(deep=of_pose)
+        self.known, upstream = None, self.grad_out()
+        found = _GATHER(*prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings)
+        del prepared  # as large as all that follows
+        gradients = _CHAIN(*self.inputs, *found, wanted=self.wanted, **self.settings)
         if dr.width(straddling) and not self.settings['parallel']:
             leaves = self._leaves()
-            dr.backward_from(_with_rest(mi.Float(0), leaves, self.settings, straddling) * self.grad_out())
+            dr.backward_from(_with_rest(mi.Float(0), leaves, self.settings, straddling) * upstream)
             gradients = [a + dr.grad(leaf) for a, leaf in zip(gradients, leaves)]
         self.set_grad_in('inputs', tuple(gradients))
 
@@ -146,24 +150,30 @@ def _draw(*arrays, width, height, parallel, panel, extent, parts, **_):
     return Plan(arrays[:-POSE], height, width, extent).image(parts) * view.lengths()
 
 
-def _gradient(*arrays, wanted, parts, extent, **settings):
-    inputs, (*prepared, upstream) = arrays[:len(wanted)], arrays[len(wanted):]
+def _gather(*arrays, width, height, parallel, panel, extent, image, parts, **_):
+    """What `Plan.gradient` gives, then the derivative by the rays' lengths, Float [pixels], where the `image` is wanted for it."""
+    *prepared, source, corner, u, v, upstream = arrays
+    plan = Plan(prepared, height, width, extent)
+    lengths = View(source, corner, u, v, width, height, parallel, panel).lengths()
+    return *plan.gradient(upstream * lengths), plan.image(parts) * upstream if image else None
+
+
+def _chain(*arrays, wanted, **settings):
+    inputs, (*found, by_lengths) = arrays[:len(wanted)], arrays[len(wanted):]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
-    view, footprints = _footprints(*inputs, extent=extent, **settings)
-    plan, lengths = Plan(prepared, view.height, view.width, extent), view.lengths()
-    found = plan.gradient(upstream * dr.detach(lengths), dr.detach(footprints.values[3]))
-    if dr.grad_enabled(lengths):
-        dr.set_grad(lengths, plan.image(parts) * upstream)
-        dr.enqueue(dr.ADMode.Backward, lengths)
-    for value, gradient in zip(footprints.values, found):
-        if dr.grad_enabled(value):
-            dr.set_grad(value, gradient)
-            dr.enqueue(dr.ADMode.Backward, value)
+    view, footprints = _footprints(*inputs, **settings)
+    ends, gradients = list(footprints.values), list(by_values(found, dr.detach(footprints.values[3])))
+    if by_lengths is not None:
+        ends, gradients = [*ends, view.lengths()], [*gradients, by_lengths]
+    for end, gradient in zip(ends, gradients):
+        if dr.grad_enabled(end):
+            dr.set_grad(end, gradient)
+            dr.enqueue(dr.ADMode.Backward, end)
     dr.traverse(dr.ADMode.Backward)
     return [dr.grad(x) for x in inputs]
 
 
-_PREPARE, _DRAW, _GRADIENT = Replay(_prepare), Replay(_draw), Replay(_gradient)
+_PREPARE, _DRAW, _GATHER, _CHAIN = map(Replay, (_prepare, _draw, _gather, _chain))
 
 
 def _affine(footprints):

@@ -45,7 +45,7 @@ class _Splat(dr.CustomOp):
         self.set_grad_out(self.plan.tangent(self.grad_in('values'), self.shear, self.parts))
 
     def backward(self):
-        self.set_grad_in('values', self.plan.gradient(self.grad_out(), self.shear))
+        self.set_grad_in('values', by_values(self.plan.gradient(self.grad_out()), self.shear))
 
     def name(self):
         return 'splat'
@@ -89,15 +89,21 @@ class Plan:
         dr.eval(moved)
         return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments, moved=moved)
 
-    def gradient(self, grad_image, shear):
-        """Derivatives by the footprints' numbers, a tuple like them, from that by the image."""
+    def gradient(self, grad_image):
+        """Derivatives by the footprints' numbers from that by the image, Float [N] each, the last with the ridge left where it
+        is: see `by_values`."""
         upstream = pad(grad_image, self.height, self.width)
         out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
         dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
-        # The kernel's derivative by y leaves the ridge where it is.
-        out[-1] = type(shear)(out[-1]) + shear * type(shear)(out[-2])
-        return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, out))
+        return out
+
+
+def by_values(found, shear):
+    """Derivatives by the values of `Footprints`, of which `shear` is one, from those that `Plan.gradient` gives."""
+    *others, x, y = found
+    y = type(shear)(y) + shear * type(shear)(x)
+    return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
 
 
 def _row(c, w, y, extent2, packets):
