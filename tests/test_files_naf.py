@@ -287,6 +287,7 @@ BAD = {
     'no DSO': (plain(DSO=...), 'DSO is missing'),
     'DSD < DSO': (plain(DSD=500.), 'DSD >= DSO'),
     'DSO text': (plain(DSO='far'), 'DSO must be numbers'),
+    'DSO yes': (plain(DSO=True), 'DSO must be numbers'),
     'no nDetector': (plain(nDetector=...), 'nDetector is missing'),
     'no dVoxel': (plain(dVoxel=...), 'neither dVoxel nor sVoxel'),
     'd and s disagree': (plain(sVoxel=[1, 1, 1]), 'disagree'),

@@ -12,9 +12,16 @@ from ..scan import Dataset, Scan
 MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 
+def _floats(value) -> np.ndarray:
+    """Raises ValueError or TypeError for what is no number, true and false among it."""
+    if np.asarray(value).dtype == bool:
+        raise ValueError
+    return np.asarray(value, float)
+
+
 def _numbers(values: dict, name: str, where, length: int):
     try:
-        array = np.asarray(values[name], float).ravel()
+        array = _floats(values[name]).ravel()
     except (TypeError, ValueError):
         raise InputError(f'{where}: {name} must be numbers, not {values[name]!r}') from None
     if array.size not in (1, length):
@@ -51,7 +58,7 @@ def _per_view(values, name, where, n, length, default=0.):
     if values.get(name) is None:
         return np.full(length, default) if length > 1 else np.float64(default)
     try:
-        array = np.asarray(values[name], float)
+        array = _floats(values[name])
     except (TypeError, ValueError):
         array = np.zeros(0)
     shape = (n, length) if length > 1 else (n,)
