@@ -26,9 +26,9 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          =============  =======  ========  =================  ======  ==============
          preset         extent   image     worst derivative   time    with gradients
          =============  =======  ========  =================  ======  ==============
-         `draft`        3        6e-03     5e-02              0.7     0.6
+         `draft`        3        6e-03     5e-02              0.6     0.6
          `default`      5        2e-06     4e-05              1.0     1.0
-         `reference`    7        1e-07     2e-07              1.5     1.5
+         `reference`    7        1e-07     2e-07              1.6     1.6
          =============  =======  ========  =================  ======  ==============
 
          (Default: `default`)
