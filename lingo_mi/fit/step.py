@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry import Geometry
 from ..recon.circle import require_signal
 from ..scan import Scan
+from ..xray.chain import leaves, pass_on
 from ..xray.frame import View, vector64
 from ..xray.objects import Ellipsoids
 from ..xray.voxelize import Grid, voxelize
@@ -19,7 +20,7 @@ from .model import RENEWED, model_of, trusted, weights_of
 from .poses import Poses, gathered, place
 from .scattered import RENEWED as SCATTER_RENEWED, light
 from .settings import Settings
-from .view import Target, differentiate, differentiate_replayed, evaluate, footprints_of, integrals, leaves, pass_on
+from .view import Target, differentiate, differentiate_replayed, evaluate, footprints_of, integrals
 
 
 def _targets(scan, unit, settings):
@@ -76,7 +77,7 @@ class Stepper:
                 self.poses.step(view, frames, gathered(target.view), s.rate('pose', iteration), s)
         if s.lambda_tv > 0:
             total += self._total_variation(leaf, rng)
-        pass_on(leaf, gaussians)
+        pass_on(gaussians, map(dr.grad, leaf))
         gradients = {name: dr.grad(value) for name, value in state.values.items()}
         if self.flat:
             gradients['centre'].z, gradients['scale'].z = 0, 0

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..scan import Scan
 from ..xray.alpha import composite, flatten
+from ..xray.chain import leaves, pass_on
 from ..xray.footprint import project
 from ..xray.frame import View
 from ..xray.radiance import seen
@@ -119,7 +120,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, mod
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         visible = dr.select(footprints.seen, mi.Float(1), 0)
     for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
-        pass_on(leaf, footprints.values, flags)
+        pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, visible
 
@@ -144,22 +145,6 @@ def _differentiated(centre, scale, rotation, density, source, corner, u, v, pixe
 
 
 _REPLAY = Replay(_differentiated)
-
-
-def leaves(values):
-    """Copies that gather derivatives, cut off from what the values were made of."""
-    copies = tuple(dr.detach(v) for v in values)
-    dr.enable_grad(copies)
-    return copies
-
-
-def pass_on(leaf, values, flags=dr.ADFlag.Default):
-    """Propagate the derivatives gathered in a leaf through the making of its values."""
-    for value, copy in zip(values, leaf):
-        if dr.grad_enabled(value):
-            dr.set_grad(value, dr.grad(copy))
-            dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward, flags)
 
 
 def evaluate(values):

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import AccuracyWarning, InputError
+from .chain import leaves, pass_on
 from .depth import deepest, parts_of
 from .footprint import NAMES, project
 from .frame import View
@@ -38,7 +39,7 @@ def line_integrals(centre, scale, rotation, density, view, extent: float = 4., p
     density         Float [N], value at the centre
     view            `frame.View`
     extent          cut-off in standard deviations
-    primal          False where only derivatives are wanted: the splatted part of the image is then left at zero
+    primal          False where only derivatives are wanted: the image is then left at zero
     affine          the model of Gaussian splatting (EWA): |d|^2 frozen at each Gaussian's centre
     area            the mean over each pixel's area instead of the ray through its centre: the footprint convolved with a
                     Gaussian of the pixel's variance
@@ -78,11 +79,11 @@ class _LineIntegrals(dr.CustomOp):
         return _with_rest(image, inputs, settings, straddling)
 
     def forward(self):
-        leaves = self._leaves()
-        dr.set_grad(leaves, self.grad_in('inputs'))
-        view, footprints = _footprints(*leaves, **self.settings)
+        leaf = leaves(self.inputs)
+        dr.set_grad(leaf, self.grad_in('inputs'))
+        view, footprints = _footprints(*leaf, **self.settings)
         image = splat(footprints, view.height, view.width, self.settings['extent'], self.parts) * view.lengths()
-        image = _with_rest(image, leaves, self.settings, dr.compress(footprints.straddles))
+        image = _with_rest(image, leaf, self.settings, dr.compress(footprints.straddles))
         dr.forward_to(image)
         self.set_grad_out(dr.grad(image))
 
@@ -94,9 +95,9 @@ class _LineIntegrals(dr.CustomOp):
         del prepared  # as large as all that follows
         gradients = _CHAIN(*self.inputs, *found, wanted=self.wanted, **self.settings)
         if dr.width(straddling) and not self.settings['parallel']:
-            leaves = self._leaves()
-            dr.backward_from(_with_rest(mi.Float(0), leaves, self.settings, straddling) * upstream)
-            gradients = [a + dr.grad(leaf) for a, leaf in zip(gradients, leaves)]
+            leaf = leaves(self.inputs)
+            dr.backward_from(_with_rest(mi.Float(0), leaf, self.settings, straddling) * upstream)
+            gradients = [a + dr.grad(b) for a, b in zip(gradients, leaf)]
         self.set_grad_in('inputs', tuple(gradients))
 
     def name(self):
@@ -109,12 +110,6 @@ class _LineIntegrals(dr.CustomOp):
         if deep:
             self.parts = parts_of(depth)
         return prepared, dr.compress(straddles)
-
-    def _leaves(self):
-        """The inputs, differentiable anew."""
-        leaves = tuple(dr.detach(x) for x in self.inputs)
-        dr.enable_grad(leaves)
-        return leaves
 
 
 def _read(*inputs, width, height, parallel, panel, **_):
@@ -165,11 +160,7 @@ def _chain(*arrays, wanted, **settings):
     ends, gradients = list(footprints.values), list(by_values(found, dr.detach(footprints.values[3])))
     if by_lengths is not None:
         ends, gradients = [*ends, view.lengths()], [*gradients, by_lengths]
-    for end, gradient in zip(ends, gradients):
-        if dr.grad_enabled(end):
-            dr.set_grad(end, gradient)
-            dr.enqueue(dr.ADMode.Backward, end)
-    dr.traverse(dr.ADMode.Backward)
+    pass_on(ends, gradients)
     return [dr.grad(x) for x in inputs]
 
 
