@@ -79,7 +79,7 @@ def plain_view(self, gaussians, target, batch):
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         seen = dr.select(footprints.row_end > footprints.row_begin, mi.Float(1), 0)
-    step.pass_on(leaf, footprints.values)
+    step.pass_on(footprints.values, map(dr.grad, leaf))
     step.evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, seen
 
