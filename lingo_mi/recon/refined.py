@@ -3,11 +3,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from scipy import ndimage
+
 from ..geometry import Geometry
 from ..scan import Scan
 from .asd_pocs import asd_pocs, check_parameters
 from .sart import sart
 from .system import Reconstruction, check_counts
+
+SPREAD = 1.  # standard deviation in voxels of what `structure` means by around a voxel
+FLOOR = .05  # least weight over the root of the mean square
 
 
 def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
@@ -16,7 +22,8 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
-    wrong is put right by the measured ones. Total variation is smoothed away in long steps, which shorten until they change
+    wrong is put right by the measured ones. What a ray lacks is given to its voxels by the `structure` around them: a cloud is
+    wrong at edges, hardly where it is even. Total variation is smoothed away in long steps, which shorten until they change
     the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
 
     Structure finer than the voxels has no place on them and becomes streaks. The cloud has no voxels, so that it may be sampled
@@ -47,11 +54,26 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
     scan, completed = (replace(s, geometry=divided(s.geometry, finer)) for s in (scan, completed))
     volume = sample(scan.geometry)
     if completed_niter:
-        volume = sart(completed, completed_niter, init=volume, seed=seed, progress=of_stage(0)).volume
+        volume = sart(completed, completed_niter, init=volume, weights=structure(volume), seed=seed, progress=of_stage(0)).volume
     found = asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
-                     exact_every=exact_every, init=volume, seed=seed, progress=of_stage(completed_niter))
+                     exact_every=exact_every, init=volume, weights=structure(volume), seed=seed,
+                     progress=of_stage(completed_niter))
     parts = [n for count in shape for n in (count, finer)]
     return replace(found, volume=found.volume.reshape(parts).mean((1, 3, 5)))
+
+
+def structure(volume) -> np.ndarray:
+    """How much a volume [x, y, z] changes around each voxel, as weights for `sart`: the root of the mean square gradient there.
+
+    Nowhere below `FLOOR` of its own root mean square, so that nothing is held fast; ones for a volume that is the same throughout.
+    """
+    square = np.zeros_like(volume)
+    for axis, count in enumerate(volume.shape):
+        if count > 1:
+            square += np.gradient(volume, axis=axis) ** 2
+    ndimage.gaussian_filter(square, SPREAD, output=square)
+    mean = square.mean(dtype=np.float64)
+    return np.sqrt(np.maximum(square, FLOOR ** 2 * mean, out=square)) if mean > 0 else np.ones_like(volume)
 
 
 def divided(geometry: Geometry, finer: int) -> Geometry:

@@ -5,8 +5,14 @@ block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray meets is left alone. Parameters that TIGRE has carry its names
-for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy that of TIGRE for MATLAB.
+where division is by voxel and by pixel, and what no ray meets is left alone. With weights s of the voxels these are the
+same steps for z in x = x_0 + diag(s) z, A diag(s) in A's place:
+
+    x  <-  x + lmbda s (A_b^T W (b - A_b x)) / (A_b^T 1),  W = 1 / (A_b s)
+
+so that of all volumes that meet the projections the one is approached whose change is least, measured in s.
+
+Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy that of TIGRE for MATLAB.
 """
 from __future__ import annotations
 
@@ -50,11 +56,15 @@ def sweep(system: System, x, lmbda: float, parts, noneg: bool):
     A, step = system.A, scalar(lmbda)
     for views in parts:
         ax, path = A.forward(x, views)
+        if system.weights is not None:
+            path = A.select(system.weighed, views)
         error = A.select(system.b, views) - ax
         error = evaluated(dr.select(path > 0, error * dr.rcp(dr.maximum(path, 1e-30)), 0))
 
         def updated(voxel, change, weight, x=x):
             change = dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0)
+            if system.weights is not None:
+                change *= dr.gather(mi.Float, system.weights, voxel)
             value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
             return dr.maximum(value, 0) if noneg else value
         x = evaluated(A.adjoint(error, views, updated))
@@ -62,7 +72,7 @@ def sweep(system: System, x, lmbda: float, parts, noneg: bool):
 
 
 def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1., lmbda_red: float = 0.99,
-            noneg: bool = True, OrderStrategy: str = 'random', init=None, tol: float = 0., seed: int = 0,
+            noneg: bool = True, OrderStrategy: str = 'random', init=None, weights=None, tol: float = 0., seed: int = 0,
             progress=None) -> Reconstruction:
     """Ordered-subset SART.
 
@@ -73,6 +83,7 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     noneg           whether negative densities are set to zero after every update
     OrderStrategy   of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
     init            start volume [x, y, z], density per mm (default: zero)
+    weights         of the voxels [x, y, z], from zero on: how readily each changes beside the others (default: all alike)
     tol             stop when |A x - b| / |b| is no larger
     seed            of the random order
     progress        called as progress(passes done, niter, residual)
@@ -84,7 +95,7 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     check_range('lmbda', lmbda, 0, 2)
     check_range('lmbda_red', lmbda_red, 0, 1)
     check_bound('tol', tol)
-    system, rng = System(scan), np.random.default_rng(seed)
+    system, rng = System(scan, weights), np.random.default_rng(seed)
     blocks(scan.geometry.angles, blocksize, OrderStrategy, rng)  # an unknown order must fail before the work
     x = system.start(init)
     residuals = [system.residual(x)[1]]
@@ -99,12 +110,13 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
 
 
 def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True,
-         OrderStrategy: str = 'random', init=None, tol: float = 0., seed: int = 0, progress=None) -> Reconstruction:
+         OrderStrategy: str = 'random', init=None, weights=None, tol: float = 0., seed: int = 0,
+         progress=None) -> Reconstruction:
     """SART: an update after every view. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, 1, lmbda, lmbda_red, noneg, OrderStrategy, init, tol, seed, progress)
+    return os_sart(scan, niter, 1, lmbda, lmbda_red, noneg, OrderStrategy, init, weights, tol, seed, progress)
 
 
 def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True, init=None,
-         tol: float = 0., progress=None) -> Reconstruction:
+         weights=None, tol: float = 0., progress=None) -> Reconstruction:
     """SIRT: one update from all views. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, noneg, 'ordered', init, tol, progress=progress)
+    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, noneg, 'ordered', init, weights, tol, progress=progress)
