@@ -30,10 +30,10 @@ def run(size, pixels, views):
     project = Joseph(geometry).forward(mi.Float(np.ones(size ** 3, np.float32)), np.arange(views))[0]
     scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
     del project
-    few, ones = scan.subset(slice(0, None, 4)), np.ones((size,) * 3, np.float32)
+    few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
     {'fdk': lambda: fdk(scan), 'sart': lambda: sart(scan, niter=1), 'cgls': lambda: cgls(scan, niter=1),
      'asd-pocs': lambda: asd_pocs(scan, niter=1, tviter=2),
-     'refined': lambda: refined(few, 1, 1, 2, completed=scan, sample=lambda _: ones)}[sys.argv[1]]()
+     'refined': lambda: refined(few, 1, 1, 2, completed=scan, sample=lambda _: ramp)}[sys.argv[1]]()
 
 def peak():
     return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))
