@@ -63,7 +63,7 @@ def output(path: Path, force: bool) -> Path:
 def options(function, given: dict[str, str]) -> dict:
     """The -D values of an algorithm's own parameters, with the types of their defaults."""
     known = {name: p.default for name, p in inspect.signature(function).parameters.items()
-             if p.default is not p.empty and name not in ('init', 'progress')}
+             if p.default is not p.empty and name not in ('init', 'weights', 'completed', 'progress')}
     out = {}
     for name, text in given.items():
         if name not in known:
@@ -93,13 +93,13 @@ def main():
     if args.seed is not None and args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
     from_cloud = args.algorithm in ('refined', 'voxelize')
-    if from_cloud and not args.complete:
+    if args.algorithm == 'voxelize' and not args.complete or args.algorithm == 'refined' and not (args.complete or args.start):
         raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete')
     if args.algorithm == 'voxelize' and args.views:
         raise InputError('--algorithm voxelize makes its volume of the cloud alone: leave out --views')
     if args.complete and not args.views and args.algorithm != 'voxelize':
         raise InputError('--complete needs --views, the number of measured and rendered views together')
-    if args.start and (args.complete or args.views or args.algorithm == 'fdk' or from_cloud):
+    if args.start and (args.complete or args.views or args.algorithm in ('fdk', 'voxelize')):
         raise InputError('--start is for an iterative --algorithm and the views of its fit: leave out --complete and --views')
     run = {'fdk': fdk, 'sart': sart, 'os-sart': os_sart, 'sirt': sirt, 'cgls': cgls, 'asd-pocs': asd_pocs,
            'refined': refined, 'voxelize': voxelize_cloud}[args.algorithm]
@@ -125,9 +125,12 @@ def main():
     check_scan(scan.geometry, views, args.algorithm, finer)
     if args.algorithm != 'voxelize':
         require_signal(scan)
+
+    def sample(geometry):
+        return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
     began = time.monotonic()
     if args.algorithm == 'voxelize':
-        volume, residuals = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent), []
+        volume, residuals = sample(scan.geometry), []
     else:
         if args.complete:
             measured = fitted_views(dataset, cloud.geometry)
@@ -138,11 +141,14 @@ def main():
             check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm, finer)
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
-                given |= dict(completed=scan, sample=lambda geometry: voxelize_cloud(cloud.gaussians, geometry, cloud.extent))
+                given |= dict(completed=scan, sample=sample)
                 scan = scan.subset(np.arange(len(measured)))
         elif args.start:
             scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
-            given['init'] = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
+            if args.algorithm == 'refined':
+                given = dict(completed_niter=0, sample=sample) | given
+            else:
+                given['init'] = sample(scan.geometry)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
         began = time.monotonic()

@@ -20,6 +20,7 @@ from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
 from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
+from lingo_mi.recon.refined import structure
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, missing_angles, without_effects
 from lingo_mi.results import compared, volume_quality, write_scene
@@ -125,12 +126,13 @@ def test_refined(scene, dataset, fitted, tmp_path):
     """From the cloud's volume: passes over all views, then total variation and the measured ones."""
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=4', '--complete', fitted, '--views', 12,
                           '--out', tmp_path / 'v.nii')
-    assert code == 0 and 'refined of 4 views' in text and '6/6 (100%)' in err, err
+    assert code == 0 and 'refined of 4 views' in text and '5/5 (100%)' in err, err
     cloud = load_cloud(fitted)
     measured = fitted_views(dataset, cloud.geometry)
     own = voxelize_cloud(cloud.gaussians, measured.geometry, cloud.extent)
-    first = sart(complete(measured, cloud, 12), 2, init=own).volume
-    then = asd_pocs(measured, 4, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=first)
+    first = sart(complete(measured, cloud, 12), 1, init=own, weights=structure(own)).volume
+    rates = dict(alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5)
+    then = asd_pocs(measured, 4, **rates, init=first, weights=structure(first))
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), then.volume)
     assert psnr_3d(then.volume, dataset.volume) > psnr_3d(own, dataset.volume) + .5
     # Means of smaller voxels, on which the cloud is sampled anew.
@@ -140,9 +142,18 @@ def test_refined(scene, dataset, fitted, tmp_path):
     g = measured.geometry
     small = replace(measured, geometry=g.with_volume([2 * n for n in g.nVoxel], [d / 2 for d in g.dVoxel]))
     own = voxelize_cloud(cloud.gaussians, small.geometry, cloud.extent)
-    then = asd_pocs(small, 2, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5, init=own).volume
+    then = asd_pocs(small, 2, **rates, init=own, weights=structure(own)).volume
     eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
+    # Of the measured views alone, which any scan will do for.
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=2', '--start', fitted,
+                          '--out', tmp_path / 'm.nii')
+    assert code == 0 and 'refined of 4 views' in text and '2/2 (100%)' in err, err
+    own = voxelize_cloud(cloud.gaussians, g, cloud.extent)
+    then = asd_pocs(measured, 2, **rates, init=own, weights=structure(own))
+    np.testing.assert_array_equal(load(tmp_path / 'm.nii'), then.volume)
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'completed_niter=1', '--start', fitted)
+    assert code == 2 and err.count('error') == 1 and 'completed_niter must be 0' in err, err
     for wrong in ('0', '1000'):  # no voxels, and more than there is memory for
         code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', f'finer={wrong}', '--complete', fitted,
                            '--views', 12)
@@ -227,6 +238,7 @@ def test_missing_angles(dataset):
     (['--algorithm', 'voxelize', '--complete', 'no.xml', '--views', '9'], 'leave out --views'),
     (['--out', '/proc/v.nii'], 'cannot write'),
     (['--algorithm', 'refined'], '--complete'), (['--start', 'no.xml'], 'iterative'),
+    (['--algorithm', 'sart', '-D', 'weights=2'], '-D weights: neither'),
     (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),
     (['--algorithm', 'sart', '--start', 'no.xml'], 'no such scene'), (['--complete', 'no.xml'], '--views'),
     (['--complete', 'no.xml', '--views', '9'], 'no such scene'), (['--volume', 'a', '--projections', 'b'], 'exclude'),

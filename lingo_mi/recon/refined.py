@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from ..errors import InputError
 from ..geometry import Geometry
 from ..scan import Scan
 from .asd_pocs import asd_pocs, check_parameters
@@ -16,9 +17,9 @@ SPREAD = 1.  # standard deviation in voxels of what `structure` means by around 
 FLOOR = .05  # least weight over the root of the mean square
 
 
-def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int = 20, alpha: float = 0.12,
+def refined(scan: Scan, niter: int = 20, completed_niter: int = 1, tviter: int = 20, alpha: float = 0.12,
             alpha_red: float = 0.87, rmax: float = 0.65, maxl2err: float = 0., exact_every: int = 5, finer: int = 1,
-            seed: int = 0, *, completed: Scan, sample, progress=None) -> Reconstruction:
+            seed: int = 0, *, sample, completed: Scan | None = None, progress=None) -> Reconstruction:
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone.
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
@@ -38,22 +39,25 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 2, tviter: int =
                       of `asd_pocs`. The defaults are for clean projections; with noise, maxl2err says how well to meet them
     finer             parts along each side of a voxel; memory grows with its cube
     seed              of the random orders
-    completed         measured views, which come first, and those between (`two_stage.filled`)
     sample            the cloud's densities per mm [x, y, z] at the voxel centres of a geometry, a function of that
+    completed         measured views, which come first, and those between (`two_stage.filled`); None where completed_niter is 0
     progress          called as progress(passes done, passes, residual)
 
-    The residuals are those of the measured views. Raises InputError as `asd_pocs` does.
+    The residuals are those of the measured views. Raises InputError as `asd_pocs` does, and where `completed` is missing.
     """
     check_counts(least=0, completed_niter=completed_niter)
     check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, seed=seed)  # before the passes
+    if completed_niter and completed is None:
+        raise InputError('completed_niter must be 0 where no completed views are given')
     shape, passes = scan.geometry.nVoxel, completed_niter + niter
 
     def of_stage(before):
         return progress and (lambda done, _, residual: progress(before + done, passes, residual))
-    scan, completed = (replace(s, geometry=divided(s.geometry, finer)) for s in (scan, completed))
+    scan = replace(scan, geometry=divided(scan.geometry, finer))
     volume = sample(scan.geometry)
     if completed_niter:
+        completed = replace(completed, geometry=divided(completed.geometry, finer))
         volume = sart(completed, completed_niter, init=volume, weights=structure(volume), seed=seed, progress=of_stage(0)).volume
     found = asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, init=volume, weights=structure(volume), seed=seed,
