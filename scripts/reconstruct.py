@@ -6,13 +6,13 @@
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --complete out/x3d_foot/result.xml --views 100
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm voxelize --complete out/x3d_foot/result.xml
     python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm refined --complete out/x3d_foot/result.xml --views 100
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --start out/x3d_foot/result.xml -D niter=8
+    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm refined --start out/x3d_foot/result.xml
 
 The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
 pixel. refined, which is the best for few clean views, starts from the cloud's own volume, meets all views first and the
 measured ones then; for objects finer than the voxels add -D finer=2. With --start, the volume is made of the views that the
-cloud was fitted to, by an iterative algorithm that starts from the cloud's own volume; any scan will do. Poses that the fit
+cloud was fitted to, by refined or an iterative algorithm, from the cloud's own volume; any scan will do. Poses that the fit
 has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
 its largest density for full scale, then with 1.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
@@ -41,7 +41,7 @@ def arguments():
                    '--complete: measured and rendered ones together')
     p.add_argument('--complete', metavar='F', help='result.xml of a fit, from which missing views of a circle are rendered; '
                    'checkpoint.npz of one by 3dgs or xgaussian')
-    p.add_argument('--start', metavar='F', help='result.xml of a fit, whose volume an iterative algorithm starts from')
+    p.add_argument('--start', metavar='F', help='result.xml of a fit, whose volume refined or an iterative algorithm starts from')
     p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument('--seed', type=int, metavar='N', help="of a simulated detector's noise (default: 0; with --complete and "
