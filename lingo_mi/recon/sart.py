@@ -12,7 +12,8 @@ same steps for z in x = x_0 + diag(s) z, A diag(s) in A's place:
 
 so that of all volumes that meet the projections the one is approached whose change is least, measured in s.
 
-Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy that of TIGRE for MATLAB.
+Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy
+that of TIGRE for MATLAB.
 """
 from __future__ import annotations
 
