@@ -93,8 +93,9 @@ def main():
     if args.seed is not None and args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
     from_cloud = args.algorithm in ('refined', 'voxelize')
-    if args.algorithm == 'voxelize' and not args.complete or args.algorithm == 'refined' and not (args.complete or args.start):
-        raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete')
+    if from_cloud and not (args.complete or args.start and args.algorithm == 'refined'):
+        raise InputError(f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete'
+                         + (' or --start' if args.algorithm == 'refined' else ''))
     if args.algorithm == 'voxelize' and args.views:
         raise InputError('--algorithm voxelize makes its volume of the cloud alone: leave out --views')
     if args.complete and not args.views and args.algorithm != 'voxelize':
