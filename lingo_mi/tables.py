@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import inspect
 import json
 import os
 import sys
@@ -40,6 +39,7 @@ from .recon.asd_pocs import asd_pocs
 from .recon.fdk import fdk
 from .recon.refined import refined
 from .recon.sart import sart
+from .recon.system import options_of
 from .recon.two_stage import filled
 from .results import CHECKPOINT, measure, versions
 from .scan import Dataset, Scan
@@ -295,8 +295,7 @@ def _iterations(path: Path) -> int | None:
 def _options(algorithm: str) -> dict:
     """All parameters of an algorithm that have a value, those left at their defaults too."""
     function, options = ALGORITHMS[algorithm]
-    defaults = {name: p.default for name, p in inspect.signature(function).parameters.items() if p.default is not p.empty}
-    return defaults | options
+    return options_of(function) | options
 
 
 def _hash(values: dict) -> str:

@@ -25,8 +25,8 @@ NOTES = dict(
           f'2. A recipe whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
     ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
        f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts there, with a pass over all views '
-       f'and then passes over the measured ones (`finer`: the latter alone, on voxels of half the size, whose means it gives); all need '
-       f'densities, which `3dgs` and `xgaussian` do not have. {_PAPER_IS}',
+       f'and then passes over the measured ones (`finer`: the latter alone, on voxels of half the size, whose means it gives); all '
+       f'need densities, which `3dgs` and `xgaussian` do not have. {_PAPER_IS}',
     ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
              f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}')
 SECOND = dict(views='iterations', ct='algorithm', ablation='scale, start, voxels')

@@ -19,7 +19,6 @@ Beam hardening and scatter that the scene's tube names are taken out of the proj
 given; with --complete and --start, those that the fit has modelled.
 """
 import argparse
-import inspect
 import time
 from pathlib import Path
 
@@ -62,9 +61,8 @@ def output(path: Path, force: bool) -> Path:
 
 def options(function, given: dict[str, str]) -> dict:
     """The -D values of an algorithm's own parameters, with the types of their defaults."""
-    known = {name: p.default for name, p in inspect.signature(function).parameters.items()
-             if p.default is not p.empty and name not in ('init', 'weights', 'completed', 'progress')}
-    out = {}
+    from lingo_mi.recon.system import options_of
+    known, out = options_of(function), {}
     for name, text in given.items():
         if name not in known:
             raise InputError(f'-D {name}: neither a parameter of the scene nor of {function.__name__} '
@@ -138,8 +136,7 @@ def main():
             if args.algorithm == 'fdk' and cloud.corrected.poses is not None and measured.geometry.poses is None:
                 raise InputError('filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
                                  'take another --algorithm')
-            # refined works on all of the views as sart does
-            check_scan(measured.geometry, args.views, 'sart' if args.algorithm == 'refined' else args.algorithm, finer)
+            check_scan(measured.geometry, args.views, args.algorithm, finer)
             scan = complete(measured, cloud, args.views)
             if args.algorithm == 'refined':
                 given |= dict(completed=scan, sample=sample)
@@ -179,8 +176,8 @@ def check_scan(geometry, views: int | None, algorithm: str, finer: int):
 
 def reconstruct(run, scan, given, Progress):
     """Volume and residual history of an algorithm, with a progress bar."""
-    passes = {name: p.default for name, p in inspect.signature(run).parameters.items() if name.endswith('niter')}
-    total = sum((passes | {name: given[name] for name in passes if name in given}).values()) or len(scan)
+    from lingo_mi.recon.system import options_of
+    total = sum(n for name, n in (options_of(run) | given).items() if name.endswith('niter')) or len(scan)
     with Progress(run.__name__, total) as bar:
         def progress(done, _, residual=None):
             bar.update(done, residual=residual)

@@ -1,6 +1,7 @@
 """What the iterative algorithms share: the linear system A x = b of a scan on the device, and what they return."""
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 
 import drjit as dr
@@ -13,6 +14,7 @@ from ..xray.joseph import Joseph
 from ..xray.pair import ExactPair
 from .circle import on_circle
 
+INPUTS = 'init', 'weights', 'completed', 'progress'  # of algorithms: what they work on and report to, not options
 PARTIAL = 4096  # terms of a sum that are added in float32
 LARGE = 1e18    # of parameters without a bound of their own: what is above has no square in float32
 DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the projections'
@@ -97,6 +99,12 @@ class System:
     def volume(self, x) -> np.ndarray:
         """A device volume as float32 [x, y, z]. Raises InputError where it is not finite."""
         return finite(x.numpy().reshape(self.geometry.nVoxel))
+
+
+def options_of(function) -> dict:
+    """The parameters of an algorithm that are options, and their defaults."""
+    return {name: p.default for name, p in inspect.signature(function).parameters.items()
+            if p.default is not p.empty and name not in INPUTS}
 
 
 def evaluated(x):
