@@ -20,7 +20,7 @@ from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
 from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
-from lingo_mi.recon.refined import structure
+from lingo_mi.recon.refined import excess_width, structure
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, missing_angles, without_effects
 from lingo_mi.results import compared, volume_quality, write_scene
@@ -130,8 +130,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
     cloud = load_cloud(fitted)
     measured = fitted_views(dataset, cloud.geometry)
     own = voxelize_cloud(cloud.gaussians, measured.geometry, cloud.extent)
-    first = sart(complete(measured, cloud, 12), 1, init=own, weights=structure(own)).volume
-    rates = dict(alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5)
+    rates = dict(blur=excess_width(measured.geometry), alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0, exact_every=5)
+    first = sart(complete(measured, cloud, 12), 1, init=own, weights=structure(own), blur=rates['blur']).volume
     then = asd_pocs(measured, 4, **rates, init=first, weights=structure(first))
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), then.volume)
     assert psnr_3d(then.volume, dataset.volume) > psnr_3d(own, dataset.volume) + .5
@@ -142,7 +142,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
     g = measured.geometry
     small = replace(measured, geometry=g.with_volume([2 * n for n in g.nVoxel], [d / 2 for d in g.dVoxel]))
     own = voxelize_cloud(cloud.gaussians, small.geometry, cloud.extent)
-    then = asd_pocs(small, 2, **rates, init=own, weights=structure(own)).volume
+    finer = rates | dict(blur=excess_width(small.geometry))
+    then = asd_pocs(small, 2, **finer, init=own, weights=structure(own)).volume
     eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
     # Of the measured views alone, which any scan will do for.

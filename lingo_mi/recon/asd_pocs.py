@@ -76,7 +76,7 @@ def check_parameters(*, niter, tviter, alpha, alpha_red, rmax, maxl2err, exact_e
 def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1., lmbda_red: float = 0.99, tviter: int = 20,
              alpha: float = 0.002, alpha_red: float = 0.95, rmax: float = 0.95, maxl2err: float | None = None,
              noneg: bool = True, OrderStrategy: str = 'random', exact_every: int = 0, init=None, weights=None,
-             seed: int = 0, progress=None) -> Reconstruction:
+             blur=None, seed: int = 0, progress=None) -> Reconstruction:
     """Adaptive steepest descent, projection onto convex sets.
 
     scan         projections and geometry
@@ -97,6 +97,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
                  first pass and after every so many; 0 for none
     init         start volume [x, y, z], density per mm (default: zero)
     weights      of the voxels in the data step, see `os_sart`
+    blur         of what a data step changes, see `os_sart`
     seed         of the random order
     progress     called as progress(passes done, niter, residual)
 
@@ -107,7 +108,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     """
     check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, seed=seed, blocksize=blocksize, lmbda=lmbda, lmbda_red=lmbda_red)
-    system, rng = System(scan, weights), np.random.default_rng(seed)
+    system, rng = System(scan, weights, blur), np.random.default_rng(seed)
     angles, size = scan.geometry.angles, scan.geometry.nVoxel
     blocks(angles, blocksize, OrderStrategy, rng)
     x = system.start(init)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import sqrt
 
 import numpy as np
 from scipy import ndimage
@@ -24,8 +25,9 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 1, tviter: int =
 
     The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
     wrong is put right by the measured ones. What a ray lacks is given to its voxels by the `structure` around them: a cloud is
-    wrong at edges, hardly where it is even. Total variation is smoothed away in long steps, which shorten until they change
-    the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
+    wrong at edges, hardly where it is even. Where pixels are wider than voxels, what a pass changes is blurred to their width
+    (`excess_width`). Total variation is smoothed away in long steps, which shorten until they change the volume by `rmax` of
+    what the data do. Where Joseph's projector is off, the projections are corrected for it.
 
     Structure finer than the voxels has no place on them and becomes streaks. The cloud has no voxels, so that it may be sampled
     on smaller ones: with `finer` all of this is done on these, and their means are returned. It pays for clean projections of
@@ -55,12 +57,13 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 1, tviter: int =
     def of_stage(before):
         return progress and (lambda done, _, residual: progress(before + done, passes, residual))
     scan = replace(scan, geometry=divided(scan.geometry, finer))
-    volume = sample(scan.geometry)
+    volume, blur = sample(scan.geometry), excess_width(scan.geometry)
     if completed_niter:
         completed = replace(completed, geometry=divided(completed.geometry, finer))
-        volume = sart(completed, completed_niter, init=volume, weights=structure(volume), seed=seed, progress=of_stage(0)).volume
+        volume = sart(completed, completed_niter, init=volume, weights=structure(volume), blur=blur, seed=seed,
+                      progress=of_stage(0)).volume
     found = asd_pocs(scan, niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
-                     exact_every=exact_every, init=volume, weights=structure(volume), seed=seed,
+                     exact_every=exact_every, init=volume, weights=structure(volume), blur=blur, seed=seed,
                      progress=of_stage(completed_niter))
     parts = [n for count in shape for n in (count, finer)]
     return replace(found, volume=found.volume.reshape(parts).mean((1, 3, 5)))
@@ -78,6 +81,17 @@ def structure(volume) -> np.ndarray:
     ndimage.gaussian_filter(square, SPREAD, output=square)
     mean = square.mean(dtype=np.float64)
     return np.sqrt(np.maximum(square, FLOOR ** 2 * mean, out=square)) if mean > 0 else np.ones_like(volume)
+
+
+def excess_width(geometry: Geometry) -> tuple[float, float, float]:
+    """The Gaussian that makes voxels as wide as pixels at the axis, twice, as `blur` for `sart`: deviations (x, y, z), voxels.
+
+    Variances add up, and that of a box is a twelfth of its width's square; twice, since a pixel's width comes in with A and
+    with A^T. Zero where pixels are no wider than voxels.
+    """
+    at_axis = geometry.DSO / geometry.DSD if geometry.mode == 'cone' else 1.
+    v, u = (at_axis * d for d in geometry.dDetector)
+    return tuple(sqrt(max((pixel / voxel) ** 2 - 1, 0) / 6) for pixel, voxel in zip((u, u, v), geometry.dVoxel))
 
 
 def divided(geometry: Geometry, finer: int) -> Geometry:

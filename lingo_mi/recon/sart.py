@@ -12,10 +12,19 @@ same steps for z in x = x_0 + diag(s) z, A diag(s) in A's place:
 
 so that of all volumes that meet the projections the one is approached whose change is least, measured in s.
 
+Pixels wider than the voxels see little of what is as fine as these, and steps for them leave the rays' own pattern. A `blur` G,
+a Gaussian, smooths what a pass P of these steps has changed:
+
+    x  <-  max(x + G (P(x) - x), 0)
+
+It leaves alone what P leaves alone, so that what is approached in the end still meets the projections.
+
 Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy
 that of TIGRE for MATLAB.
 """
 from __future__ import annotations
+
+from math import exp
 
 import drjit as dr
 import mitsuba as mi
@@ -54,7 +63,7 @@ def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
 
 def sweep(system: System, x, lmbda: float, parts, noneg: bool):
     """One pass over all blocks: the new volume, on the device."""
-    A, step = system.A, scalar(lmbda)
+    A, step, start = system.A, scalar(lmbda), x
     for views in parts:
         ax, path = A.forward(x, views)
         if system.weights is not None:
@@ -69,12 +78,29 @@ def sweep(system: System, x, lmbda: float, parts, noneg: bool):
             value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
             return dr.maximum(value, 0) if noneg else value
         x = evaluated(A.adjoint(error, views, updated))
+    if system.blur is not None:
+        x = start + blurred(x - start, system.geometry.nVoxel, system.blur)
+        x = evaluated(dr.maximum(x, 0) if noneg else x)
     return x
 
 
+def blurred(volume, size, deviations):
+    """A volume (mi.Float [voxels]) convolved with a Gaussian of these standard deviations, in voxels along x, y, z.
+
+    Cut off at 4 of them; beyond the border the volume is mirrored. Deviations above the volume's own side count as that.
+    """
+    tensor = mi.TensorXf(volume, size)
+    for axis, (deviation, count) in enumerate(zip(deviations, size)):
+        if deviation > 0:
+            s = min(deviation, count)
+            tensor = dr.convolve(tensor, lambda x, s=s: exp(-.5 * (x / s) ** 2), 4 * s, axis=axis, boundary='reflect',
+                                 normalize=True)
+    return tensor.array
+
+
 def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1., lmbda_red: float = 0.99,
-            noneg: bool = True, OrderStrategy: str = 'random', init=None, weights=None, tol: float = 0., seed: int = 0,
-            progress=None) -> Reconstruction:
+            noneg: bool = True, OrderStrategy: str = 'random', init=None, weights=None, blur=None, tol: float = 0.,
+            seed: int = 0, progress=None) -> Reconstruction:
     """Ordered-subset SART.
 
     scan            projections and geometry
@@ -85,6 +111,7 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     OrderStrategy   of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
     init            start volume [x, y, z], density per mm (default: zero)
     weights         of the voxels [x, y, z], from zero on: how readily each changes beside the others (default: all alike)
+    blur            of what a pass changes: standard deviations in voxels along x, y, z (default: none)
     tol             stop when |A x - b| / |b| is no larger
     seed            of the random order
     progress        called as progress(passes done, niter, residual)
@@ -96,7 +123,7 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     check_range('lmbda', lmbda, 0, 2)
     check_range('lmbda_red', lmbda_red, 0, 1)
     check_bound('tol', tol)
-    system, rng = System(scan, weights), np.random.default_rng(seed)
+    system, rng = System(scan, weights, blur), np.random.default_rng(seed)
     blocks(scan.geometry.angles, blocksize, OrderStrategy, rng)  # an unknown order must fail before the work
     x = system.start(init)
     residuals = [system.residual(x)[1]]
@@ -111,13 +138,13 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
 
 
 def sart(scan: Scan, niter: int = 20, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True,
-         OrderStrategy: str = 'random', init=None, weights=None, tol: float = 0., seed: int = 0,
+         OrderStrategy: str = 'random', init=None, weights=None, blur=None, tol: float = 0., seed: int = 0,
          progress=None) -> Reconstruction:
     """SART: an update after every view. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, 1, lmbda, lmbda_red, noneg, OrderStrategy, init, weights, tol, seed, progress)
+    return os_sart(scan, niter, 1, lmbda, lmbda_red, noneg, OrderStrategy, init, weights, blur, tol, seed, progress)
 
 
 def sirt(scan: Scan, niter: int = 100, lmbda: float = 1., lmbda_red: float = 0.99, noneg: bool = True, init=None,
-         weights=None, tol: float = 0., progress=None) -> Reconstruction:
+         weights=None, blur=None, tol: float = 0., progress=None) -> Reconstruction:
     """SIRT: one update from all views. Parameters as in `os_sart`."""
-    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, noneg, 'ordered', init, weights, tol, progress=progress)
+    return os_sart(scan, niter, len(scan), lmbda, lmbda_red, noneg, 'ordered', init, weights, blur, tol, progress=progress)

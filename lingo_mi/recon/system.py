@@ -14,7 +14,7 @@ from ..xray.joseph import Joseph
 from ..xray.pair import ExactPair
 from .circle import on_circle
 
-INPUTS = 'init', 'weights', 'completed', 'progress'  # of algorithms: what they work on and report to, not options
+INPUTS = 'init', 'weights', 'blur', 'completed', 'progress'  # of algorithms: what they work on and report to, not options
 PARTIAL = 4096  # terms of a sum that are added in float32
 LARGE = 1e18    # of parameters without a bound of their own: what is above has no square in float32
 DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the projections'
@@ -35,19 +35,27 @@ class Reconstruction:
 class System:
     """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm: `measured`, or as
     `correct` has shifted them. `weights` [x, y, z] of the voxels, where there are any, and `weighed` (mi.Float [view, u, v]), the
-    rays' integrals of them, are for `sart.sweep`.
+    rays' integrals of them, and `blur` are for `sart.sweep`.
 
     The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
     are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
     """
 
-    def __init__(self, scan: Scan, weights=None):
+    def __init__(self, scan: Scan, weights=None, blur=None):
         self.geometry = scan.geometry
         self.A = Joseph(scan.geometry) if on_circle(scan) else ExactPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.
         self.weights = self.weighed = None
+        self.blur = None
+        if blur is not None:
+            if len(blur) != 3:
+                raise InputError(f'blur must be three standard deviations, along x, y, z, not {blur!r}')
+            for deviation in blur:
+                check_bound('blur', deviation)
+            if any(blur):
+                self.blur = tuple(blur)
         if weights is not None:
             if np.min(weights) < 0:
                 raise InputError('the weights of the voxels must not be negative')
