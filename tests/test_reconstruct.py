@@ -20,9 +20,10 @@ from lingo_mi.geometry import circular
 from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
 from lingo_mi.recon.asd_pocs import asd_pocs
 from lingo_mi.recon.fdk import fdk
-from lingo_mi.recon.refined import excess_width, structure
+from lingo_mi.recon.refined import structure
 from lingo_mi.recon.sart import sart
 from lingo_mi.recon.two_stage import as_corrected, complete, fitted_views, load_cloud, missing_angles, without_effects
+from lingo_mi.recon.wide_pixels import excess_width
 from lingo_mi.results import compared, volume_quality, write_scene
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scanning import load_scene, render_objects, take_scan, voxelize_cloud

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import sqrt
 
 import numpy as np
 from scipy import ndimage
@@ -13,6 +12,7 @@ from ..scan import Scan
 from .asd_pocs import asd_pocs, check_parameters
 from .sart import sart
 from .system import Reconstruction, check_counts
+from .wide_pixels import excess_width
 
 SPREAD = 1.  # standard deviation in voxels of what `structure` means by around a voxel
 FLOOR = .05  # least weight over the root of the mean square
@@ -81,17 +81,6 @@ def structure(volume) -> np.ndarray:
     ndimage.gaussian_filter(square, SPREAD, output=square)
     mean = square.mean(dtype=np.float64)
     return np.sqrt(np.maximum(square, FLOOR ** 2 * mean, out=square)) if mean > 0 else np.ones_like(volume)
-
-
-def excess_width(geometry: Geometry) -> tuple[float, float, float]:
-    """The Gaussian that makes voxels as wide as pixels at the axis, twice, as `blur` for `sart`: deviations (x, y, z), voxels.
-
-    Variances add up, and that of a box is a twelfth of its width's square; twice, since a pixel's width comes in with A and
-    with A^T. Zero where pixels are no wider than voxels.
-    """
-    at_axis = geometry.DSO / geometry.DSD if geometry.mode == 'cone' else 1.
-    v, u = (at_axis * d for d in geometry.dDetector)
-    return tuple(sqrt(max((pixel / voxel) ** 2 - 1, 0) / 6) for pixel, voxel in zip((u, u, v), geometry.dVoxel))
 
 
 def divided(geometry: Geometry, finer: int) -> Geometry:

@@ -17,14 +17,13 @@ a Gaussian, smooths what a pass P of these steps has changed:
 
     x  <-  max(x + G (P(x) - x), 0)
 
-It leaves alone what P leaves alone, so that what is approached in the end still meets the projections.
+It leaves alone what P leaves alone, so that what is approached in the end still meets the projections. Voxels between rays
+that are met by none change as those around them (`wide_pixels.Between`).
 
 Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy
 that of TIGRE for MATLAB.
 """
 from __future__ import annotations
-
-from math import exp
 
 import drjit as dr
 import mitsuba as mi
@@ -33,6 +32,7 @@ import numpy as np
 from ..errors import InputError
 from ..scan import Scan
 from .system import Reconstruction, System, check_bound, check_counts, check_range, evaluated, scalar
+from .wide_pixels import blurred
 
 ORDERS = ('ordered', 'random', 'angularDistance')
 
@@ -78,24 +78,14 @@ def sweep(system: System, x, lmbda: float, parts, noneg: bool):
             value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
             return dr.maximum(value, 0) if noneg else value
         x = evaluated(A.adjoint(error, views, updated))
+    if system.between is None and system.blur is None:
+        return x
+    change = x - start
+    if system.between is not None:
+        change = system.between.filled(change)
     if system.blur is not None:
-        x = start + blurred(x - start, system.geometry.nVoxel, system.blur)
-        x = evaluated(dr.maximum(x, 0) if noneg else x)
-    return x
-
-
-def blurred(volume, size, deviations):
-    """A volume (mi.Float [voxels]) convolved with a Gaussian of these standard deviations, in voxels along x, y, z.
-
-    Cut off at 4 of them; beyond the border the volume is mirrored. Deviations above the volume's own side count as that.
-    """
-    tensor = mi.TensorXf(volume, size)
-    for axis, (deviation, count) in enumerate(zip(deviations, size)):
-        if deviation > 0:
-            s = min(deviation, count)
-            tensor = dr.convolve(tensor, lambda x, s=s: exp(-.5 * (x / s) ** 2), 4 * s, axis=axis, boundary='reflect',
-                                 normalize=True)
-    return tensor.array
+        change = blurred(change, system.geometry.nVoxel, system.blur)
+    return evaluated(dr.maximum(start + change, 0) if noneg else start + change)
 
 
 def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1., lmbda_red: float = 0.99,

@@ -13,6 +13,7 @@ from ..scan import Scan
 from ..xray.joseph import Joseph
 from ..xray.pair import ExactPair
 from .circle import on_circle
+from .wide_pixels import Between, pitch
 
 INPUTS = 'init', 'weights', 'blur', 'completed', 'progress'  # of algorithms: what they work on and report to, not options
 PARTIAL = 4096  # terms of a sum that are added in float32
@@ -35,7 +36,7 @@ class Reconstruction:
 class System:
     """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm: `measured`, or as
     `correct` has shifted them. `weights` [x, y, z] of the voxels, where there are any, and `weighed` (mi.Float [view, u, v]), the
-    rays' integrals of them, and `blur` are for `sart.sweep`.
+    rays' integrals of them, and `blur` are for `sart.sweep`; `between` are the voxels that rays leave out (or None).
 
     The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
     are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
@@ -47,6 +48,7 @@ class System:
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.
+        self.between = Between(self.geometry, self.A, self.views) if max(pitch(self.geometry)) >= 2 else None
         self.weights = self.weighed = None
         self.blur = None
         if blur is not None:
