@@ -18,7 +18,7 @@ a Gaussian, smooths what a pass P of these steps has changed:
     x  <-  max(x + G (P(x) - x), 0)
 
 It leaves alone what P leaves alone, so that what is approached in the end still meets the projections. Voxels between rays
-that are met by none change as those around them (`wide_pixels.Between`).
+that are met by hardly any change as those around them (`wide_pixels.Between`).
 
 Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy
 that of TIGRE for MATLAB.

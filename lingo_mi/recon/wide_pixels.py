@@ -12,6 +12,8 @@ import mitsuba as mi
 
 from ..geometry import Geometry
 
+LEAST = .1  # A^T 1 over its mean around a voxel, above which it counts as met
+
 
 def pitch(geometry: Geometry) -> tuple[float, float, float]:
     """The distance between rays at the axis, (x, y, z) voxels: columns are as far apart along x and y, rows along z."""
@@ -30,17 +32,19 @@ def excess_width(geometry: Geometry) -> tuple[float, float, float]:
 
 
 class Between:
-    """The voxels between rays that are met by none, as far as those around them are met.
+    """The voxels between rays, met by none, or by few with a corner, among voxels that are met.
 
     geometry   of the scan
     A, views   its projector and views
 
-    Beyond the rays, where less than half of what is around a voxel is met, nothing counts as between.
+    Few and small steps leave such a voxel behind those around it, which meet the projections without it. Beyond the rays, where
+    less than half of what is around a voxel is met, nothing counts as between.
     """
 
     def __init__(self, geometry: Geometry, A, views):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
-        self.met = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views) > 0
+        weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
+        self.met = weight > LEAST * blurred(weight, self.size, self.deviations)
         share = blurred(dr.select(self.met, mi.Float(1), 0), self.size, self.deviations)
         self.share = dr.select(self.met | (share < .5), 0, share)  # of what is met around a voxel between rays, 0 elsewhere
         dr.eval(self.met, self.share)
