@@ -22,7 +22,6 @@ from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.refined import refined, structure
 from lingo_mi.recon.sart import blocks, os_sart, sart, sirt
 from lingo_mi.recon.two_stage import complete
-from lingo_mi.recon.wide_pixels import blurred, excess_width
 from lingo_mi.scan import Scan
 from lingo_mi.xray.grid import project
 from lingo_mi.xray.joseph import Joseph
@@ -99,15 +98,6 @@ def test_weights_that_are_none(system, value, why):
     for weights, why in ((np.full(shape, value), why), (np.ones((2, *shape[1:])), 'shape')):
         with pytest.raises(InputError, match=f'weights.*{why}'):
             sart(system[0], 1, weights=weights)
-
-
-def test_blurred_is_that_of_scipy():
-    rng = np.random.default_rng(0)
-    for size, deviations in (((9, 8, 7), (.5, 1.2, .3)), ((9, 8, 7), (2, 0, 0)), ((6, 5, 1), (0, .4, 1)), ((3, 4, 5), (3, 4, 5))):
-        volume = rng.normal(size=size)
-        np.testing.assert_allclose(blurred(mi.Float(volume.ravel()), size, deviations).numpy().reshape(size),
-                                   gaussian_filter(volume, deviations, radius=[int(4 * s) for s in deviations]), atol=1e-6)
-    np.testing.assert_allclose(blurred(mi.Float(volume.ravel()), size, (1e18,) * 3).numpy(), volume.mean(), atol=.1)
 
 
 def test_blurred_sart_is_the_transcription(system):
@@ -316,45 +306,6 @@ def test_structure_is_where_a_volume_changes():
     np.testing.assert_array_equal(structure(volume + 1), weights)
     np.testing.assert_array_equal(structure(np.ones((4, 4, 4), np.float32)), 1)
     assert structure(volume[:, :, :1]).max() > .5  # a single slice
-
-
-def test_excess_width():
-    """Magnified 1.5 times, pixels are 2 mm wide and 4 mm high at the axis."""
-    geo = Geometry(400, 600, (8, 8), (6, 3), (4, 4, 4), (1, 2, 2), circular(3))
-    np.testing.assert_allclose(excess_width(geo), (.5 ** .5, 0, .5 ** .5), rtol=1e-6)
-    np.testing.assert_allclose(excess_width(replace(geo, dVoxel=(2.01, 2.01, 4.01))), 0)
-    np.testing.assert_allclose(excess_width(replace(geo, mode='parallel', dDetector=(2, 1))), (0, 0, 0))
-    np.testing.assert_allclose(excess_width(replace(geo, mode='parallel', dDetector=(4, 2))), (.5 ** .5, 0, .5 ** .5))
-
-
-@pytest.mark.parametrize('name', ['sart', 'os_sart', 'sirt', 'asd_pocs'])
-def test_voxels_between_rays(name):
-    """Rows 2.3 voxels apart at the axis leave some voxels there out: they become like those around them. Beyond the panel only total
-    variation changes anything."""
-    made = phantoms.Phantom(np.ones((24, 24, 36), np.float32), (2., 2., 1.), 'block')
-    geo = default_geometry(made, circular(30), 64)
-    geo = replace(geo, nDetector=(8, 64), dDetector=(2.3 * geo.DSD / geo.DSO, geo.dDetector[1]))
-    A = Joseph(geo)
-    met = A.adjoint(dr.ones(mi.Float, 30 * A.pixels), np.arange(30)).numpy().reshape(geo.nVoxel) > 0
-    assert not met[11:13, 11:13, 10:26].all() and not met[:, :, 0].any()
-    found = ALGORITHMS[name](Scan(geo, project(made.data, geo)), 8).volume
-    centre = found[11:13, 11:13, 9:27]
-    assert np.abs(centre - 1).max() < .03, centre[0, 0]
-    assert found[:, :, :5].max() < (.03 if name == 'asd_pocs' else 1e-6)
-
-
-def test_wide_pixels_leave_no_pattern():
-    """Pixels twice as wide as the voxels: a start that is right but for something smooth is mended smoothly."""
-    made = phantoms.make('foot', 48)
-    geo = default_geometry(made, circular(12, 180.), 24)
-    assert min(excess_width(geo)) > .5
-    scan = Scan(geo, project(made.data, geo))
-    wrong = np.float32(.1 * made.data.max()) * np.asarray(gaussian_filter(np.float32(made.data > 0), 3), np.float32)
-    start = made.data + wrong
-    found = refined(scan, 4, 0, 1, completed=scan, sample=lambda _: start).volume
-    plain = asd_pocs(scan, 4, tviter=1, alpha=.12, alpha_red=.87, rmax=.65, maxl2err=0., exact_every=5, init=start,
-                     weights=structure(start)).volume
-    assert psnr_3d(found, made.data) > psnr_3d(plain, made.data) + .5, [psnr_3d(v, made.data) for v in (found, plain, start)]
 
 
 def test_refined_puts_what_is_missing_where_the_structure_is():

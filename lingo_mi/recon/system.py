@@ -13,7 +13,7 @@ from ..scan import Scan
 from ..xray.joseph import Joseph
 from ..xray.pair import ExactPair
 from .circle import on_circle
-from .wide_pixels import Between, pitch
+from .wide_pixels import Between
 
 INPUTS = 'init', 'weights', 'blur', 'completed', 'progress'  # of algorithms: what they work on and report to, not options
 PARTIAL = 4096  # terms of a sum that are added in float32
@@ -48,7 +48,7 @@ class System:
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.
-        self.between = Between(self.geometry, self.A, self.views) if max(pitch(self.geometry)) >= 2 else None
+        self.between = Between.of(self.geometry, self.A, self.views)
         self.weights = self.weighed = None
         self.blur = None
         if blur is not None:

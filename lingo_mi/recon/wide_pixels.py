@@ -41,6 +41,11 @@ class Between:
     less than half of what is around a voxel is met, nothing counts as between.
     """
 
+    @classmethod
+    def of(cls, geometry: Geometry, A, views) -> Between | None:
+        """None where rays are too close for there to be any."""
+        return cls(geometry, A, views) if max(pitch(geometry)) >= 2 else None
+
     def __init__(self, geometry: Geometry, A, views):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
         weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
