@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..scan import Scan
 from .fdk import fdk
-from .sart import blocks, sweep
+from .sart import passes, sweep
 from .system import LARGE, Reconstruction, System, check_bound, check_counts, check_range, dot, evaluated, norm, scalar
 from .upright import is_circular
 
@@ -108,9 +107,8 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
     """
     check_parameters(niter=niter, tviter=tviter, alpha=alpha, alpha_red=alpha_red, rmax=rmax, maxl2err=maxl2err,
                      exact_every=exact_every, seed=seed, blocksize=blocksize, lmbda=lmbda, lmbda_red=lmbda_red)
-    system, rng = System(scan, weights, blur), np.random.default_rng(seed)
-    angles, size = scan.geometry.angles, scan.geometry.nVoxel
-    blocks(angles, blocksize, OrderStrategy, rng)
+    order, size = passes(scan.geometry.angles, blocksize, OrderStrategy, seed), scan.geometry.nVoxel
+    system = System(scan, weights, blur)
     x = system.start(init)
     if maxl2err is None:
         maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if is_circular(scan) else 0.
@@ -120,7 +118,7 @@ def asd_pocs(scan: Scan, niter: int = 50, blocksize: int = 1, lmbda: float = 1.,
         if exact_every and k % exact_every == 0:
             system.correct(x)
         start = x
-        x = sweep(system, x, lmbda, blocks(angles, blocksize, OrderStrategy, rng), noneg)
+        x = sweep(system, x, lmbda, next(order), noneg)
         residuals.append(system.residual(x)[1])
         error = residuals[-1] * system.size_b
         data_change = evaluated(x - start)

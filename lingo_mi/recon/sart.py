@@ -61,6 +61,16 @@ def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
     return [parts[i] for i in out]
 
 
+def passes(angles, blocksize: int, order: str, seed: int):
+    """The `blocks` of one pass after another, without end. Raises InputError for an unknown order, before any of them."""
+    rng = np.random.default_rng(seed)
+
+    def drawn():
+        return blocks(angles, blocksize, order, rng)
+    drawn()  # for its error alone
+    return iter(drawn, None)
+
+
 def sweep(system: System, x, lmbda: float, parts, noneg: bool):
     """One pass over all blocks: the new volume, on the device."""
     A, step, start = system.A, scalar(lmbda), x
@@ -113,14 +123,14 @@ def os_sart(scan: Scan, niter: int = 50, blocksize: int = 20, lmbda: float = 1.,
     check_range('lmbda', lmbda, 0, 2)
     check_range('lmbda_red', lmbda_red, 0, 1)
     check_bound('tol', tol)
-    system, rng = System(scan, weights, blur), np.random.default_rng(seed)
-    blocks(scan.geometry.angles, blocksize, OrderStrategy, rng)  # an unknown order must fail before the work
+    order = passes(scan.geometry.angles, blocksize, OrderStrategy, seed)
+    system = System(scan, weights, blur)
     x = system.start(init)
     residuals = [system.residual(x)[1]]
     for k in range(niter):
         if residuals[-1] <= tol:
             break
-        x = sweep(system, x, lmbda * lmbda_red ** k, blocks(scan.geometry.angles, blocksize, OrderStrategy, rng), noneg)
+        x = sweep(system, x, lmbda * lmbda_red ** k, next(order), noneg)
         residuals.append(system.residual(x)[1])
         if progress:
             progress(k + 1, niter, residuals[-1])
