@@ -16,7 +16,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.geometry import Geometry, circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms.scanning import default_geometry
-from lingo_mi.recon.asd_pocs import asd_pocs, tv_gradient
+from lingo_mi.recon.asd_pocs import asd_pocs, tv_floor, tv_gradient
 from lingo_mi.recon.cgls import cgls
 from lingo_mi.recon.fdk import fdk
 from lingo_mi.recon.refined import refined, structure
@@ -176,25 +176,30 @@ def total_variation(x, epsilon):
     return np.sqrt(square + epsilon * square.max() if epsilon < 1e-3 else square + epsilon).sum()
 
 
-def tv_slope(x):
+def largest_slope(x):
+    return sum(np.diff(x, axis=a, prepend=x.take([0], a)) ** 2 for a in range(3)).max()
+
+
+def tv_slope(x, floor):
     """The derivative of `total_variation`, term by term."""
     d = [np.diff(x, axis=a, prepend=x.take([0], a)) for a in range(3)]
-    square = sum(v ** 2 for v in d)
-    w = [v / np.sqrt(square + 1e-8 * square.max()) for v in d]
+    w = [v / np.sqrt(sum(v ** 2 for v in d) + floor) for v in d]
     return sum(v - np.append(v, np.zeros_like(v.take([0], a)), a).take(np.arange(1, v.shape[a] + 1), a)
                for a, v in enumerate(w))
 
 
 def test_tv_gradient():
     x = np.random.default_rng(0).random((5, 4, 6))
-    expected = tv_slope(x)
-    result = tv_gradient(mi.Float(np.float32(x).ravel()), x.shape).numpy()
+    expected = tv_slope(x, 1e-8 * largest_slope(x))
+    volume = mi.Float(np.float32(x).ravel())
+    result = tv_gradient(volume, x.shape, tv_floor(volume, x.shape)).numpy()
     np.testing.assert_allclose(result, expected.ravel(), atol=2e-5)
     rng = np.random.default_rng(1)
     direction = 1e-5 * rng.normal(size=x.shape)
     change = total_variation(x + direction, 1e-8) - total_variation(x - direction, 1e-8)
     assert abs(change / 2 - (expected * direction).sum()) < 1e-4 * abs(change)
-    assert not tv_gradient(dr.full(mi.Float, 3., 120), x.shape).numpy().any()
+    even = dr.full(mi.Float, 3., 120)
+    assert not tv_gradient(even, x.shape, tv_floor(even, x.shape)).numpy().any()
 
 
 def test_asd_pocs_is_the_transcription(system):
@@ -208,9 +213,9 @@ def test_asd_pocs_is_the_transcription(system):
         errors.append(np.linalg.norm(A @ x - b))
         data = np.linalg.norm(x - start)
         step = 0.2 * data if step is None else step
-        start = x
+        start, floor = x, 1e-8 * largest_slope(x.reshape(shape))
         for _ in range(5):
-            slope = tv_slope(x.reshape(shape)).ravel()
+            slope = tv_slope(x.reshape(shape), floor).ravel()
             x = x - step * slope / np.linalg.norm(slope)
         if np.linalg.norm(x - start) > 0.6 * data and errors[-1] > maxl2err:
             step *= 0.5

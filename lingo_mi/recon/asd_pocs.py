@@ -15,7 +15,7 @@ from .sart import passes, sweep
 from .system import LARGE, Reconstruction, System, check_bound, check_counts, check_range, dot, evaluated, norm, scalar
 from .upright import is_circular
 
-EPSILON = 1e-8   # added to the squared gradient, relative to its largest value in the volume: TV is not smooth at zero
+EPSILON = 1e-8   # added to the squared gradient, relative to its largest value before a pass's descent: TV is not smooth at zero
 LMBDA_MIN = 0.005
 
 
@@ -32,18 +32,27 @@ def _neighbours(size):
     return before, after
 
 
-def tv_gradient(volume, size):
+def _differences(volume, before):
+    """Backward differences along x, y, z; zero at the border."""
+    return mi.Vector3f([volume - dr.gather(mi.Float, volume, i) for i in before])
+
+
+def tv_floor(volume, size):
+    """What `tv_gradient` adds to squared gradients, a number on the device: `EPSILON` of the largest in the volume."""
+    before, _ = _neighbours(size)
+    return evaluated(dr.maximum(EPSILON * dr.max(dr.squared_norm(_differences(volume, before))), 1e-30))
+
+
+def tv_gradient(volume, size, floor):
     """Derivative of the total variation, mi.Float [voxels], times voxels' own unit.
 
-    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + epsilon), with backward differences that are zero at the
-    border (Sidky and Pan, equation 3), epsilon a 1e-8th of the largest sum of squares. Voxels count as cubes.
+    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + floor), with backward differences that are zero at the
+    border (Sidky and Pan, equation 3). Voxels count as cubes.
     """
     before, after = _neighbours(size)
-    difference = [volume - dr.gather(mi.Float, volume, i) for i in before]
-    square = evaluated(difference[0] ** 2 + difference[1] ** 2 + difference[2] ** 2)
-    floor = dr.maximum(EPSILON * dr.max(square), 1e-30)
-    inverse = evaluated(dr.rsqrt(square + floor))
-    total = (difference[0] + difference[1] + difference[2]) * inverse
+    difference = _differences(volume, before)
+    inverse = evaluated(dr.rsqrt(dr.squared_norm(difference) + floor))
+    total = dr.sum(difference) * inverse
     for i in after:  # at the border the difference is zero
         total -= (dr.gather(mi.Float, volume, i) - volume) * dr.gather(mi.Float, inverse, i)
     return evaluated(total)
@@ -51,8 +60,9 @@ def tv_gradient(volume, size):
 
 def minimise_tv(volume, size, step: float, tviter: int):
     """`tviter` steps of length `step` (a norm of the change) down the total variation."""
+    floor = tv_floor(volume, size)
     for _ in range(tviter):
-        gradient = tv_gradient(volume, size)
+        gradient = tv_gradient(volume, size, floor)
         length = norm(gradient)
         if length == 0:
             break
