@@ -66,17 +66,17 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     return LoadedScene(scene, scanner, path)
 
 
-def check_memory(*geometries: Geometry | None, views: int = 0, copies: float = 0):
+def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0):
     """Refuse, before anything is allocated, a scan that this process cannot hold.
 
     views    of all geometries together (0: as many as they have)
-    copies   of volume and projections that an algorithm needs at its peak (0: the least there is, the voxels as read, fitted
-             and compared, and the projections as measured and rendered)
+    needed   bytes that an algorithm takes at its peak (0: the least there is, the voxels as read, fitted and compared, and the
+             projections as measured and rendered)
     """
     known = [g for g in geometries if g is not None]
     views = views or sum(map(len, known))
     voxels, pixels = math.prod(known[0].nVoxel), views * math.prod(known[0].nDetector)
-    needed = 4 * (copies * (voxels + pixels) if copies else 3 * voxels + 2 * pixels)
+    needed = needed or 4 * (3 * voxels + 2 * pixels)
     if needed > (has := room()):
         size = [' x '.join(map(str, counts)) for counts in (known[0].nVoxel, known[0].nDetector)]
         raise InputError(f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2 ** 30:,.1f} GiB of '

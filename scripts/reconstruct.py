@@ -167,11 +167,12 @@ def check_scan(geometry, views: int | None, algorithm: str, finer: int):
     """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them, on `finer`
     times as many voxels a side."""
     from lingo_mi.recon.circle import require_rays
-    from lingo_mi.recon.memory import COPIES
+    from lingo_mi.recon.memory import NEEDS, needed
     from lingo_mi.recon.refined import divided
     from lingo_mi.scanning import check_memory
     require_rays(geometry)
-    check_memory(divided(geometry, finer), views=views or 0, copies=COPIES.get(algorithm, 0))
+    geometry, views = divided(geometry, finer), views or len(geometry)
+    check_memory(geometry, views=views, needed=needed(algorithm, geometry, views) if algorithm in NEEDS else 0)
 
 
 def reconstruct(run, scan, given, Progress):

@@ -22,6 +22,11 @@ def pitch(geometry: Geometry) -> tuple[float, float, float]:
     return tuple(distance / d for distance, d in zip((u, u, v), geometry.dVoxel))
 
 
+def leave_voxels_out(geometry: Geometry) -> bool:
+    """Whether rays are so far apart that voxels lie between them."""
+    return max(pitch(geometry)) >= 2
+
+
 def excess_width(geometry: Geometry) -> tuple[float, float, float]:
     """The Gaussian that makes voxels as wide as pixels at the axis, twice, as `blur` for `sart`: deviations (x, y, z), voxels.
 
@@ -44,7 +49,7 @@ class Between:
     @classmethod
     def of(cls, geometry: Geometry, A, views) -> Between | None:
         """None where rays are too close for there to be any."""
-        return cls(geometry, A, views) if max(pitch(geometry)) >= 2 else None
+        return cls(geometry, A, views) if leave_voxels_out(geometry) else None
 
     def __init__(self, geometry: Geometry, A, views):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
