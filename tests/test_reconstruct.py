@@ -313,7 +313,7 @@ def test_too_many_views_and_too_little_memory(scene, fitted, tmp_path, monkeypat
     assert 'at most 100000' in refused(scene, '--complete', fitted, '--views', 1_000_000, *out)
     assert 'GiB of memory' in refused(scene, '--complete', fitted, '--views', 10_000_000, *out)
     size = 4 * (24 ** 3 + 8 * 32 * 40)
-    monkeypatch.setattr('lingo_mi.scanning.room', lambda: 3.5 * size)
+    monkeypatch.setattr('lingo_mi.scanning.room', lambda: 3.8 * size)
     assert run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', *out)[0] == 0
     for algorithm in 'cgls', 'asd-pocs':
         assert 'at least' in refused(scene, '--algorithm', algorithm, '-D', 'niter=1', *out, '--force')
