@@ -170,14 +170,14 @@ def test_cgls_is_lsqr_and_its_residual_falls(system):
     close(cgls(scan, 4, start), start.ravel() + cgls(shifted, 4).volume.ravel())
 
 
+def squared_gradient(x):
+    return sum(np.diff(x, axis=a, prepend=x.take([0], a)) ** 2 for a in range(3))
+
+
 def total_variation(x, epsilon):
     """Sidky and Pan, equation 3, with backward differences that are zero at the border."""
-    square = sum(np.diff(x, axis=a, prepend=x.take([0], a)) ** 2 for a in range(3))
+    square = squared_gradient(x)
     return np.sqrt(square + epsilon * square.max() if epsilon < 1e-3 else square + epsilon).sum()
-
-
-def largest_slope(x):
-    return sum(np.diff(x, axis=a, prepend=x.take([0], a)) ** 2 for a in range(3)).max()
 
 
 def tv_slope(x, floor):
@@ -190,7 +190,7 @@ def tv_slope(x, floor):
 
 def test_tv_gradient():
     x = np.random.default_rng(0).random((5, 4, 6))
-    expected = tv_slope(x, 1e-8 * largest_slope(x))
+    expected = tv_slope(x, 1e-8 * squared_gradient(x).max())
     volume = mi.Float(np.float32(x).ravel())
     result = tv_gradient(volume, x.shape, tv_floor(volume, x.shape)).numpy()
     np.testing.assert_allclose(result, expected.ravel(), atol=2e-5)
@@ -213,7 +213,7 @@ def test_asd_pocs_is_the_transcription(system):
         errors.append(np.linalg.norm(A @ x - b))
         data = np.linalg.norm(x - start)
         step = 0.2 * data if step is None else step
-        start, floor = x, 1e-8 * largest_slope(x.reshape(shape))
+        start, floor = x, 1e-8 * squared_gradient(x.reshape(shape)).max()
         for _ in range(5):
             slope = tv_slope(x.reshape(shape), floor).ravel()
             x = x - step * slope / np.linalg.norm(slope)

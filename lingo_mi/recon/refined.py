@@ -70,7 +70,7 @@ def refined(scan: Scan, niter: int = 20, completed_niter: int = 1, tviter: int =
 
 
 def met(scan: Scan, niter: int, volume, blur, seed: int, progress) -> np.ndarray:
-    """A volume after `sart` from this one, weighted by its own `structure`; without the residuals, which cost a quarter more."""
+    """A volume after `sart` from this one, weighted by its own `structure`; without residuals, which nobody reads."""
     system, order = System(scan, structure(volume), blur), passes(scan.geometry.angles, 1, 'random', seed)
     x = system.start(volume)
     for k in range(niter):
