@@ -4,7 +4,7 @@
 class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, where, and how to mend it.
 
-    Scripts print it and exit with code 2 (see `lingo_mi.cli.guard`).
+    Scripts print it and exit with code 2 (see `lingo_mi.cli.common.guard`).
     """
 
 

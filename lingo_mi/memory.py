@@ -1,4 +1,5 @@
 """How much memory this process may take."""
+
 from __future__ import annotations
 
 import math
@@ -43,6 +44,7 @@ def _address_space() -> float:
     """What is left of RLIMIT_AS (`ulimit -v`): code, and what Dr.Jit has set aside, have taken some of it."""
     try:
         import resource
+
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit == resource.RLIM_INFINITY:
             return math.inf

@@ -16,16 +16,17 @@ compare with.
 References: Zha et al., "R2-Gaussian", NeurIPS 2024 (the forms above); Wang et al., "Image quality assessment:
 from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 """
+
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from .errors import InputError
+from lingo_mi.errors import InputError
 
-WINDOW = np.exp(-np.arange(-5, 6) ** 2 / (2 * 1.5 ** 2))
+WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()
-C1, C2 = 0.01 ** 2, 0.03 ** 2
+C1, C2 = 0.01**2, 0.03**2
 
 
 def psnr_2d_r2(images, truth) -> float:
@@ -35,7 +36,7 @@ def psnr_2d_r2(images, truth) -> float:
     positive pixel is compared undivided.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
-    return _mean(_psnr(*views, 1.) for views in _own_maximum(images, truth))
+    return _mean(_psnr(*views, 1.0) for views in _own_maximum(images, truth))
 
 
 def psnr_2d(images, truth, peak: float | None = None) -> float:
@@ -74,7 +75,7 @@ def psnr_3d(volume, truth) -> float:
 
     volume, truth : [x, y, z]. The number means what it says where the truth's densities fill [0, 1].
     """
-    return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.)
+    return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.0)
 
 
 def ssim_3d(volume, truth) -> float:
@@ -89,8 +90,13 @@ def ssim_3d(volume, truth) -> float:
         a, b = np.moveaxis(volume, axis, 0), np.moveaxis(truth, axis, 0)
         if min(a.shape[1:]) > 1 or max(a.shape) == 1:
             # One slice at a time: its few temporaries stay in the cache.
-            means.append(_mean(ssim_map(np.ascontiguousarray(x), np.ascontiguousarray(y)).mean()
-                               for x, y in zip(a, b) if y.max() > 0))
+            means.append(
+                _mean(
+                    ssim_map(np.ascontiguousarray(x), np.ascontiguousarray(y)).mean()
+                    for x, y in zip(a, b)
+                    if y.max() > 0
+                )
+            )
     return _mean(means)
 
 
@@ -123,6 +129,7 @@ def ssim_map(a, b, axes=(0, 1)) -> np.ndarray:
     The window is a Gaussian of sigma 1.5, 11 wide along each of the `axes`, the image is continued by zeros, variances are
     not debiased: the form of the SSIM loss of 3D Gaussian Splatting.
     """
+
     def blur(x):
         for axis in axes:
             x = correlate1d(x, WINDOW, axis, mode='constant')
@@ -131,8 +138,7 @@ def ssim_map(a, b, axes=(0, 1)) -> np.ndarray:
     ma, mb = blur(a), blur(b)
     mab, mm = ma * mb, ma * ma + mb * mb
     # The two variances enter as a sum only, which saves one of five blurs.
-    return ((2 * mab + C1) * (2 * (blur(a * b) - mab) + C2)
-            / ((mm + C1) * (blur(a * a + b * b) - mm + C2)))
+    return (2 * mab + C1) * (2 * (blur(a * b) - mab) + C2) / ((mm + C1) * (blur(a * a + b * b) - mm + C2))
 
 
 def _pair(a, b, what, axes):
@@ -143,8 +149,7 @@ def _pair(a, b, what, axes):
     for x, name in ((a, 'result'), (b, 'truth')):
         if not np.isfinite(x).all():
             at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
-            raise InputError(f'the {what} of the {name} contain NaN or infinity, '
-                             f'first at {axes} = {list(at)}')
+            raise InputError(f'the {what} of the {name} contain NaN or infinity, first at {axes} = {list(at)}')
     return a, b
 
 
@@ -159,12 +164,12 @@ def _peak(truth, peak):
 def _own_maximum(images, truth):
     for a, b in zip(images, truth):
         if b.max() > 0:
-            yield a / (a.max() if a.max() > 0 else 1.), b / b.max()
+            yield a / (a.max() if a.max() > 0 else 1.0), b / b.max()
 
 
 def _psnr(a, b, peak):
     error = float(np.mean((a - b) ** 2))
-    return float(10 * np.log10(peak ** 2 / error)) if error > 0 else np.inf
+    return float(10 * np.log10(peak**2 / error)) if error > 0 else np.inf
 
 
 def _mean(values):

@@ -3,6 +3,7 @@
 On a terminal: a bar with the time gone and left. Elsewhere (a file, a pipe, a batch system): one plain line
 about every 10 % or 10 seconds, without control characters.
 """
+
 from __future__ import annotations
 
 import os
@@ -10,10 +11,14 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 
-LABELS = {'psnr': 'PSNR {:.2f} dB', 'psnr_2d': 'PSNR {:.2f} dB', 'psnr_3d': '3D {:.2f} dB',
-          'gaussians': '{:,} Gaussians'}
-REDRAW = 0.25   # seconds between two redraws on a terminal
-LINE = 10.      # seconds between two plain lines, where 10 % takes longer
+LABELS = {
+    'psnr': 'PSNR {:.2f} dB',
+    'psnr_2d': 'PSNR {:.2f} dB',
+    'psnr_3d': '3D {:.2f} dB',
+    'gaussians': '{:,} Gaussians',
+}
+REDRAW = 0.25  # seconds between two redraws on a terminal
+LINE = 10.0  # seconds between two plain lines, where 10 % takes longer
 
 
 class Progress:
@@ -36,11 +41,10 @@ class Progress:
 
     def __enter__(self) -> Progress:
         self._began = self._drawn = time.monotonic()
-        self._shown = self.start   # steps at the latest drawing
+        self._shown = self.start  # steps at the latest drawing
         if self._file.isatty() and os.environ.get('TERM') != 'dumb':
             self._bar = _bar(self._file)
-            self._task = self._bar.add_task(self.description, total=self.total, completed=self.start,
-                                            fields='')
+            self._task = self._bar.add_task(self.description, total=self.total, completed=self.start, fields='')
             self._bar.start()
         return self
 
@@ -75,7 +79,7 @@ class Progress:
             self._bar.update(self._task, completed=self._done, fields='  '.join(shown))
             return
         elapsed = now - self._began
-        share = self._done / self.total if self.total else 1.
+        share = self._done / self.total if self.total else 1.0
         parts = [f'{self._done}/{self.total} ({share:.0%})', *shown, f'{_clock(elapsed)} elapsed']
         if self.start < self._done < self.total:
             parts.append(f'{_clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
@@ -92,14 +96,28 @@ def track(iterable: Iterable, description: str, total: int | None = None) -> Ite
 
 def _bar(file):
     from rich.console import Console
-    from rich.progress import (BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn,
-                               TimeRemainingColumn)
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     # Few redraws: the thread that makes them must not compete with the loop.
-    return Progress(TextColumn('{task.description}'), BarColumn(bar_width=None), MofNCompleteColumn(),
-                    TextColumn('{task.fields[fields]}', style='cyan'), TimeElapsedColumn(),
-                    TimeRemainingColumn(), TextColumn('left'), console=Console(file=file),
-                    refresh_per_second=1 / REDRAW, expand=True)
+    return Progress(
+        TextColumn('{task.description}'),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn('{task.fields[fields]}', style='cyan'),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn('left'),
+        console=Console(file=file),
+        refresh_per_second=1 / REDRAW,
+        expand=True,
+    )
 
 
 def _text(name, value):

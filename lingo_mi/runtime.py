@@ -1,4 +1,5 @@
-"""Backend choice: find libLLVM before Dr.Jit loads, choose a variant, register the plugins; find a scene's data."""
+"""Backend choice: find libLLVM before Dr.Jit loads, and choose a variant of Mitsuba."""
+
 from __future__ import annotations
 
 import ctypes
@@ -9,10 +10,12 @@ import sys
 import warnings
 from pathlib import Path
 
-from .errors import InputError
+from lingo_mi.errors import InputError
 
-LLVM_HELP = ('Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '
-             'elsewhere install LLVM and set DRJIT_LIBLLVM_PATH to its libLLVM shared library.')
+LLVM_HELP = (
+    'Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '
+    'elsewhere install LLVM and set DRJIT_LIBLLVM_PATH to its libLLVM shared library.'
+)
 
 
 def find_libllvm() -> str | None:
@@ -23,8 +26,12 @@ def find_libllvm() -> str | None:
     """
     if os.environ.get('DRJIT_LIBLLVM_PATH'):
         return os.environ['DRJIT_LIBLLVM_PATH']
-    for root in dict.fromkeys((sys.prefix, *(str(Path(p).parents[2]) for p in sys.path if p.endswith('site-packages')))):
-        found = sorted(glob.glob(os.path.join(root, 'lib', 'libLLVM.so*')) + glob.glob(os.path.join(root, 'lib', 'libLLVM-*.so')))
+    for root in dict.fromkeys(
+        (sys.prefix, *(str(Path(p).parents[2]) for p in sys.path if p.endswith('site-packages')))
+    ):
+        found = sorted(
+            glob.glob(os.path.join(root, 'lib', 'libLLVM.so*')) + glob.glob(os.path.join(root, 'lib', 'libLLVM-*.so'))
+        )
         if found:
             os.environ['DRJIT_LIBLLVM_PATH'] = found[0]
             return found[0]
@@ -54,8 +61,11 @@ def mend_llvm():
         rows = re.findall(rb'^ +\d+ +LLVM +\w+ .*? (\d+)(?: +\d+ K?i?B)? *$', whos(), re.MULTILINE)
         alive = any(int(size) not in (1, _COLOUR_SAMPLES) for size in rows)
     if alive:
-        warnings.warn(f'Dr.Jit runs on LLVM {dr.detail.llvm_version()[0]}, which cannot compile its kernels: '
-                      'import lingo_mi before mi.set_variant, or set DRJIT_LIBLLVM_PATH', stacklevel=3)
+        warnings.warn(
+            f'Dr.Jit runs on LLVM {dr.detail.llvm_version()[0]}, which cannot compile its kernels: '
+            'import lingo_mi before mi.set_variant, or set DRJIT_LIBLLVM_PATH',
+            stacklevel=3,
+        )
         return
     library[_SHUTDOWN](0)
     library[_INIT](1 << 1 | 1 << 2)  # CUDA and LLVM
@@ -85,6 +95,7 @@ def use_variant(name: str | None = None) -> str:
         try:
             mi.set_variant(variant)
             import drjit as dr
+
             dr.eval(mi.Float(0) + dr.opaque(mi.Float, 1))  # an unusable backend fails at the first kernel
             return variant
         except (ImportError, RuntimeError) as error:  # what Mitsuba raises for a missing driver or library
@@ -92,35 +103,3 @@ def use_variant(name: str | None = None) -> str:
     if variant.startswith('cuda'):
         raise InputError(f'--variant {name}: no NVIDIA GPU can be used; leave it out to run on the CPU')
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
-
-
-def data_file(name: str, parameter: str) -> str:
-    """The path of a file that a scene names: beside the scene or here, else in the folder that LINGO_MI_DATA names.
-
-    parameter   the scene's `<default>` by which a user can name another file, for the message
-
-    Raises InputError, in one line, where there is no such file.
-    """
-    import mitsuba as mi
-    found = Path(str(mi.file_resolver().resolve(name)))
-    folder = os.environ.get('LINGO_MI_DATA')
-    if not found.exists() and folder:
-        found = Path(folder) / name
-    if not found.exists():
-        where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
-        raise InputError(f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
-                         f'that holds it, or name your file: -D {parameter}=FILE')
-    return str(found)
-
-
-def watch_variants():
-    """Register the plugins with the active variant, and again with whichever is set later."""
-    import mitsuba as mi
-
-    def register(*_):
-        if 'ad' in mi.variant().split('_'):
-            from . import plugins
-            plugins.register()
-    mi.detail.add_variant_callback(register)
-    if mi.variant() is not None:
-        register()

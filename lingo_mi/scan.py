@@ -1,12 +1,13 @@
 """A scan: projections and their geometry. Pure NumPy."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .errors import InputError
-from .geometry import Geometry
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
 
 
 @dataclass(frozen=True)
@@ -30,20 +31,25 @@ class Scan:
         p = np.asarray(self.projections, np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
         if p.shape != expected:
-            raise InputError(f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}')
+            raise InputError(
+                f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}'
+            )
         if self.valid is not None:
             valid = np.asarray(self.valid)
             if valid.shape != expected or valid.dtype != bool:
-                raise InputError(f'the mask of valid pixels must be true or false and of the shape of the projections, '
-                                 f'{expected}, not {valid.dtype} of the shape {valid.shape}')
+                raise InputError(
+                    f'the mask of valid pixels must be true or false and of the shape of the projections, '
+                    f'{expected}, not {valid.dtype} of the shape {valid.shape}'
+                )
             if not valid.any():
                 raise InputError('no pixel of the scan is valid')
             object.__setattr__(self, 'valid', None if valid.all() else valid)
             p = np.where(valid, p, np.float32(0))
         if not np.isfinite(p).all():
             view = int(np.argwhere(~np.isfinite(p))[0, 0])
-            raise InputError(f'the projections contain NaN or infinity (first in view {view}): '
-                             'mask or repair those pixels first')
+            raise InputError(
+                f'the projections contain NaN or infinity (first in view {view}): mask or repair those pixels first'
+            )
         object.__setattr__(self, 'projections', p)
 
     def __len__(self) -> int:
@@ -51,8 +57,12 @@ class Scan:
 
     def subset(self, index) -> Scan:
         """The views `index` only."""
-        return replace(self, geometry=self.geometry.subset(index), projections=self.projections[index],
-                       valid=None if self.valid is None else self.valid[index])
+        return replace(
+            self,
+            geometry=self.geometry.subset(index),
+            projections=self.projections[index],
+            valid=None if self.valid is None else self.valid[index],
+        )
 
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
@@ -64,19 +74,28 @@ class Scan:
         rows, columns = (n // f for n, f in zip(g.nDetector, by))
 
         def blocks(values):
-            return values[:, :rows * by[0], :columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
+            return values[:, : rows * by[0], : columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
+
         p = blocks(self.projections).mean((2, 4))
         valid = None if self.valid is None else blocks(self.valid).all((2, 4))
         step = tuple(d * f for d, f in zip(g.dDetector, by))
         if g.poses is not None:
             poses = replace(g.poses, u=g.poses.u * by[1], v=g.poses.v * by[0])
-            return replace(self, geometry=replace(g, nDetector=(rows, columns), dDetector=step, poses=poses), projections=p,
-                           valid=valid)
+            return replace(
+                self,
+                geometry=replace(g, nDetector=(rows, columns), dDetector=step, poses=poses),
+                projections=p,
+                valid=valid,
+            )
         # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
         lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
         offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
-        return replace(self, geometry=replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset),
-                       projections=p, valid=valid)
+        return replace(
+            self,
+            geometry=replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset),
+            projections=p,
+            valid=valid,
+        )
 
     @property
     def normalised(self) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 A class that derives from a Mitsuba class belongs to one variant, so every file here is loaded anew for each variant.
 """
+
 import importlib
 import sys
 
@@ -25,3 +26,15 @@ def register():
         path = f'{__name__}.{module}'
         loaded = importlib.reload(sys.modules[path]) if path in sys.modules else importlib.import_module(path)
         getattr(mi, registrar)(name, loaded.create)
+
+
+def watch_variants():
+    """Register the plugins with the active variant, and again with whichever is set later."""
+
+    def on_variant(*_):
+        if 'ad' in mi.variant().split('_'):
+            register()
+
+    mi.detail.add_variant_callback(on_variant)
+    if mi.variant() is not None:
+        on_variant()

@@ -1,4 +1,5 @@
 """The emitter `ct_beam`: the X-rays of one view as light for Mitsuba's own integrators."""
+
 import drjit as dr
 import mitsuba as mi
 
@@ -21,7 +22,7 @@ class CTBeam(mi.Emitter):
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
     def aim(self, view):
-        """Shine at the panel of a `lingo_mi.xray.frame.View`."""
+        """Shine at the panel of a `lingo_mi.projectors.view.View`."""
         across = dr.cross(view.u, view.v)
         self.parallel, self.size = view.parallel, dr.opaque(mi.Vector2f, (view.width, view.height))
         self.source, self.corner = mi.Vector3f(view.source), mi.Vector3f(view.corner)

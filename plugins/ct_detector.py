@@ -1,4 +1,5 @@
 """The film `ct_detector`: what a flat panel makes of the photons that reach it."""
+
 import mitsuba as mi
 
 from lingo_mi.effects.detector import Detector
@@ -61,8 +62,16 @@ class CTDetector(mi.Film):
         except InputError as error:
             raise InputError(f'ct_detector {props.id()!r}: {error}') from None
         super().__init__(props)
-        self.film = mi.load_dict(dict(type='hdrfilm', width=self.size()[0], height=self.size()[1],
-                                      rfilter=dict(type='box'), component_format='float32', pixel_format='luminance'))
+        self.film = mi.load_dict(
+            dict(
+                type='hdrfilm',
+                width=self.size()[0],
+                height=self.size()[1],
+                rfilter=dict(type='box'),
+                component_format='float32',
+                pixel_format='luminance',
+            )
+        )
 
     def base_channels_count(self):
         return self.film.base_channels_count()

@@ -1,11 +1,12 @@
 """The medium `ct_volume`: a CT volume or a phantom as Mitsuba's own heterogeneous medium."""
+
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.phantoms import make
-from lingo_mi.runtime import data_file
+from lingo_mi.scene.data_files import data_file
 
 
 def create(props):
@@ -46,9 +47,13 @@ def create(props):
     """
     filename, phantom = props.get('filename', ''), props.get('phantom', '')
     size, seed = props.get('size', 256), props.get('seed', 0)
-    mu_water, scale = props.get('mu_water', 0.), props.get('scale', 1.)
-    for key, value, kinds in (('filename', filename, str), ('phantom', phantom, str),
-                              ('mu_water', mu_water, (int, float)), ('scale', scale, (int, float))):
+    mu_water, scale = props.get('mu_water', 0.0), props.get('scale', 1.0)
+    for key, value, kinds in (
+        ('filename', filename, str),
+        ('phantom', phantom, str),
+        ('mu_water', mu_water, (int, float)),
+        ('scale', scale, (int, float)),
+    ):
         if not isinstance(value, kinds):
             raise InputError(f'ct_volume: {key} = {value!r} is of the wrong type')
     to_world = props.get('to_world', mi.ScalarTransform4f())
@@ -60,4 +65,4 @@ def create(props):
         data = read_volume(data_file(filename, 'volume'), mu_water=mu_water or None).data
     grid = np.ascontiguousarray(data.transpose(2, 1, 0))[..., None]
     volume = dict(type='gridvolume', grid=mi.VolumeGrid(grid), to_world=to_world, raw=True)
-    return mi.load_dict(dict(type='heterogeneous', sigma_t=volume, scale=scale, albedo=0., id=props.id()))
+    return mi.load_dict(dict(type='heterogeneous', sigma_t=volume, scale=scale, albedo=0.0, id=props.id()))

@@ -1,4 +1,5 @@
 """The phase function `klein_nishina`: Compton scattering of X-rays."""
+
 import mitsuba as mi
 
 from lingo_mi.effects.compton import scattering

@@ -1,12 +1,13 @@
 """The integrator `lingo_xray`: exact X-ray line integrals, forward and backward."""
+
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
-from lingo_mi.xray.objects import find_objects
-from lingo_mi.xray.quality import Quality
-from lingo_mi.xray.sensors import view_of
+from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors.objects import find_objects
+from lingo_mi.projectors.sensors import view_of
 
 
 class LingoXray(mi.ad.integrators.common.ADIntegrator):
@@ -58,7 +59,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     Beer-Lambert line integrals through everything in the scene that attenuates:
 
     - `ellipsoids` shapes with a `density` attribute: a cloud of 3D Gaussians, in closed form (see
-      `lingo_mi.xray.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
+      `lingo_mi.projectors.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
     - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation;
     - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
 
@@ -77,8 +78,12 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.quality = Quality.of(props.get('accuracy', 'default'), props.get('extent', None),
-                                  props.get('footprint', 'exact'), props.get('pixel', 'centre'))
+        self.quality = Quality.of(
+            props.get('accuracy', 'default'),
+            props.get('extent', None),
+            props.get('footprint', 'exact'),
+            props.get('pixel', 'centre'),
+        )
         self.output = props.get('output', 'line_integral')
         if self.output not in ('line_integral', 'transmission'):
             raise InputError(f"lingo_xray: output is 'line_integral' or 'transmission', not {self.output!r}")

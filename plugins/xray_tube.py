@@ -1,4 +1,5 @@
 """The emitter `xray_tube`: the photons of a scan, by energy, the focal spot that they come from, and how they scatter."""
+
 import drjit as dr
 import mitsuba as mi
 
@@ -116,6 +117,13 @@ class XRayTube(mi.Emitter):
 
 create = XRayTube
 
-_DEFAULTS = dict(energy=None, kvp=None, angle=12., filtration='Al 2.5', reference=None, material='', split='', bands=4)
-_SCATTER = dict(scatter=0, scatter_grid='16', scatter_orders=-1, scatter_voxels=64, scatter_energies=3, scatter_seed=0,
-                scatter_box='')
+_DEFAULTS = dict(energy=None, kvp=None, angle=12.0, filtration='Al 2.5', reference=None, material='', split='', bands=4)
+_SCATTER = dict(
+    scatter=0,
+    scatter_grid='16',
+    scatter_orders=-1,
+    scatter_voxels=64,
+    scatter_energies=3,
+    scatter_seed=0,
+    scatter_box='',
+)

@@ -7,12 +7,13 @@
 Writes accuracy.json and accuracy.md to --out. The full run (6 to 15 minutes on two cores) also renews docs/figures/ and
 the tables in docs/accuracy.md; --quick (under 3 minutes) leaves them alone, without --docs, and writes its plots to --out.
 """
+
 import argparse
 import sys
 import time
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.runtime import use_variant
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -23,8 +24,9 @@ def arguments():
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
     p.add_argument('--docs', action='store_true', help='renew docs/ after a quick run, too')
-    p.add_argument('--figures', type=Path, metavar='DIR',
-                   help='folder of the plots (default: docs/figures, or --out if quick)')
+    p.add_argument(
+        '--figures', type=Path, metavar='DIR', help='folder of the plots (default: docs/figures, or --out if quick)'
+    )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
@@ -32,12 +34,14 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.accuracy import FULL, QUICK, measure
-    from lingo_mi.accuracy.report import write
+    from lingo_mi.studies.accuracy import FULL, QUICK, measure
+    from lingo_mi.studies.accuracy.report import write
 
     begun = time.perf_counter()
-    found = measure(QUICK if args.quick else FULL,
-                    lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr))
+    found = measure(
+        QUICK if args.quick else FULL,
+        lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr),
+    )
     renew = args.docs or not args.quick
     figures = args.figures or (DOCS / 'figures' if renew else args.out)
     write(found, args.out, figures, DOCS / 'accuracy.md' if renew else None)

@@ -12,6 +12,7 @@ in the bounding box of a Gaussian's footprint. The limit needs g++.
 Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
 against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out. What was not measured is null in the JSON.
 """
+
 import argparse
 import json
 import shutil
@@ -22,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
-EPSILON = .0128     # mm, 1e-4 of half the volume's side: where the tree errs least
-TRIES = 5           # in a turn, of which the best counts, as in limit.cpp
-PIXELS = 400        # of which errors are measured
+EPSILON = 0.0128  # mm, 1e-4 of half the volume's side: where the tree errs least
+TRIES = 5  # in a turn, of which the best counts, as in limit.cpp
+PIXELS = 400  # of which errors are measured
 MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
 TREE = 'bvh_forward_ms', 'bvh_backward_ms', 'bvh_image_error', 'bvh_gradient_error'
 
@@ -38,14 +39,19 @@ def arguments():
     p.add_argument('--gaussians', type=int, default=50_000)
     p.add_argument('--size', type=int, default=512, help='pixels along a side of the square panel')
     p.add_argument('--pixels', type=float, default=234, help="mean pixels in a Gaussian's box")
-    p.add_argument('--extent', type=float, default=3., help='cut-off in standard deviations')
+    p.add_argument('--extent', type=float, default=3.0, help='cut-off in standard deviations')
     p.add_argument('--repeats', type=int, default=15, help='turns')
     p.add_argument('--no-bvh', dest='bvh', action='store_false', help="leave out Mitsuba's tree")
     p.add_argument('--json', type=Path, help='write the numbers there')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     args = p.parse_args()
-    for name, low, high in (('gaussians', 1, 10_000_000), ('size', 8, 8192), ('pixels', 1, MOST_PIXELS), ('extent', 1, 20),
-                            ('repeats', 1, 10_000)):
+    for name, low, high in (
+        ('gaussians', 1, 10_000_000),
+        ('size', 8, 8192),
+        ('pixels', 1, MOST_PIXELS),
+        ('extent', 1, 20),
+        ('repeats', 1, 10_000),
+    ):
         if not low <= getattr(args, name) <= high:
             raise InputError(f'--{name} must be from {low} to {high}, not {getattr(args, name):g}')
     return args
@@ -74,10 +80,10 @@ def cloud(args):
     centre = rng.uniform(-80, 80, (n, 3))
     # A box of 2 extent sigma on a side; magnified 1.5 times, on pixels of 512 / size mm. 1.16: the spread of the scales.
     sigma = np.sqrt(args.pixels) / (2 * args.extent) / 1.5 * 512 / args.size / 1.16
-    scale = sigma * np.exp(rng.normal(0, .35, (n, 3)))
+    scale = sigma * np.exp(rng.normal(0, 0.35, (n, 3)))
     rotation = rng.normal(size=(n, 4))
     data = np.concatenate([centre, scale, rotation / np.linalg.norm(rotation, axis=1, keepdims=True)], 1)
-    return data.astype(np.float32), rng.uniform(.1, 1, (n, 1)).astype(np.float32)
+    return data.astype(np.float32), rng.uniform(0.1, 1, (n, 1)).astype(np.float32)
 
 
 def against_tree(scene, sensor, data, density, args, ours_ms) -> dict:
@@ -85,16 +91,16 @@ def against_tree(scene, sensor, data, density, args, ours_ms) -> dict:
     import drjit as dr
     import mitsuba as mi
 
-    from lingo_mi.closed_form import NAMES, rays_and_gradients
-    from lingo_mi.xray.alternatives import Tree, rays
-    from lingo_mi.xray.sensors import view_of
+    from lingo_mi.projectors.sensors import view_of
+    from lingo_mi.studies.alternatives import Tree, rays
+    from lingo_mi.studies.closed_form import NAMES, rays_and_gradients
 
     view, rng = view_of(sensor), np.random.default_rng(1)
-    chosen = np.sort(rng.permutation(args.size ** 2)[:PIXELS])
-    weights = np.zeros(args.size ** 2, np.float32)
+    chosen = np.sort(rng.permutation(args.size**2)[:PIXELS])
+    weights = np.zeros(args.size**2, np.float32)
     weights[chosen] = rng.normal(size=len(chosen))
     source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
-    directions = corner + np.outer(chosen % args.size + .5, u) + np.outer(chosen // args.size + .5, v) - source
+    directions = corner + np.outer(chosen % args.size + 0.5, u) + np.outer(chosen // args.size + 0.5, v) - source
     columns = data[:, :3], data[:, 3:6], data[:, 6:], density[:, 0]
     starts = np.broadcast_to(source, directions.shape)
     image, gradients = rays_and_gradients(columns, starts, directions, weights[chosen])
@@ -117,19 +123,25 @@ def against_tree(scene, sensor, data, density, args, ours_ms) -> dict:
     out = dict(zip(('image_error', 'gradient_error'), errors(ours.numpy().ravel(), grads[0].reshape(-1, 10), grads[1])))
 
     tree = Tree(mi.TensorXf(data), mi.TensorXf(density), args.extent, EPSILON)
-    start = rays(view, 2 * 128.)
+    start = rays(view, 2 * 128.0)
     upstream = mi.Float(weights)
     tree.image(*(type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start))  # builds the tree
     found, out['bvh_forward_ms'] = timed(tree.image, *start)
     by, out['bvh_backward_ms'] = timed(tree.gradients, *start, upstream)
     worst = errors(found.numpy(), by[0].numpy().reshape(-1, 10), by[1].numpy())
     out |= dict(zip(('bvh_image_error', 'bvh_gradient_error'), worst))
-    print(f'tree      {out["bvh_forward_ms"]:7.0f} ms forward, {out["bvh_backward_ms"]:.0f} ms backward '
-          f'(epsilon {EPSILON:g} mm)')
-    print(f'          {out["bvh_forward_ms"] / ours_ms["forward"]:.0f} and {out["bvh_backward_ms"] / ours_ms["backward"]:.0f} '
-          'times ours')
-    print(f'errors    image {out["image_error"]:.1e}, worst derivative {out["gradient_error"]:.1e}; '
-          f'tree {out["bvh_image_error"]:.1e}, {out["bvh_gradient_error"]:.1e}; on {len(chosen)} pixels')
+    print(
+        f'tree      {out["bvh_forward_ms"]:7.0f} ms forward, {out["bvh_backward_ms"]:.0f} ms backward '
+        f'(epsilon {EPSILON:g} mm)'
+    )
+    print(
+        f'          {out["bvh_forward_ms"] / ours_ms["forward"]:.0f} and {out["bvh_backward_ms"] / ours_ms["backward"]:.0f} '
+        'times ours'
+    )
+    print(
+        f'errors    image {out["image_error"]:.1e}, worst derivative {out["gradient_error"]:.1e}; '
+        f'tree {out["bvh_image_error"]:.1e}, {out["bvh_gradient_error"]:.1e}; on {len(chosen)} pixels'
+    )
     return out
 
 
@@ -139,17 +151,29 @@ def main():
     import drjit as dr
     import mitsuba as mi
 
-    from lingo_mi.xray.footprint import project
-    from lingo_mi.xray.objects import find_objects
-    from lingo_mi.xray.sensors import view_of
+    from lingo_mi.projectors.footprint import project
+    from lingo_mi.projectors.objects import find_objects
+    from lingo_mi.projectors.sensors import view_of
 
     data, density = cloud(args)
     pixel = 512 / args.size
-    scene = mi.load_dict(dict(
-        type='scene', integrator=dict(type='lingo_xray', extent=args.extent),
-        cloud=dict(type='ellipsoids', data=mi.TensorXf(data), density=mi.TensorXf(density)),
-        scanner=dict(type='ct_scanner', DSO=1000., DSD=1500., nDetector=str(args.size), dDetector=str(pixel),
-                     nVoxel='256', dVoxel='1', views=50)))
+    scene = mi.load_dict(
+        dict(
+            type='scene',
+            integrator=dict(type='lingo_xray', extent=args.extent),
+            cloud=dict(type='ellipsoids', data=mi.TensorXf(data), density=mi.TensorXf(density)),
+            scanner=dict(
+                type='ct_scanner',
+                DSO=1000.0,
+                DSD=1500.0,
+                nDetector=str(args.size),
+                dDetector=str(pixel),
+                nVoxel='256',
+                dVoxel='1',
+                views=50,
+            ),
+        )
+    )
     params = mi.traverse(scene)
     for name in ('cloud.data', 'cloud.density'):
         dr.enable_grad(params[name])
@@ -157,7 +181,7 @@ def main():
     thing = find_objects(scene)[0]
     f = project(thing.centre, thing.scale, thing.rotation, thing.density, view_of(sensors[0]), args.extent)
     pairs = float(dr.sum(mi.Float(f.row_end - f.row_begin) * f.width)[0])
-    upstream = dr.full(mi.TensorXf, .5, (args.size, args.size, 1))
+    upstream = dr.full(mi.TensorXf, 0.5, (args.size, args.size, 1))
     dr.eval(upstream)
 
     def seconds(sensor):
@@ -190,8 +214,10 @@ def main():
     for name, time_taken in times.items():
         result[f'{name}_ms'] = 1e3 * float(time_taken)
         result[f'{name}_ns_per_pair'] = 1e9 * float(time_taken) / pairs
-    print(f'{variant}, {args.gaussians} Gaussians, {args.size} x {args.size} pixels, cut-off {args.extent:g} sigma, '
-          f'{pairs / 1e6:.1f} M pairs; medians of {args.repeats} turns')
+    print(
+        f'{variant}, {args.gaussians} Gaussians, {args.size} x {args.size} pixels, cut-off {args.extent:g} sigma, '
+        f'{pairs / 1e6:.1f} M pairs; medians of {args.repeats} turns'
+    )
     for k, name in enumerate(times):
         result[f'limit_{name}_ns_per_pair'] = None
         line = f'{name:9} {result[name + "_ms"]:7.1f} ms  {result[name + "_ns_per_pair"]:5.2f} ns a pair'

@@ -13,6 +13,7 @@ backprojects by interpolating the panel, ours by the matched transpose.
 
 RTK comes with `pip install -e '.[reference]'`, diffct with `pip install diffct torch`; what is not installed is left out.
 """
+
 import argparse
 import json
 import os
@@ -22,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
@@ -43,10 +44,10 @@ def ours(geometry, scan, volume):
     import drjit as dr
     import mitsuba as mi
 
-    from lingo_mi.recon.fdk import fdk
-    from lingo_mi.recon.sart import blocks, sweep
-    from lingo_mi.recon.system import System
-    from lingo_mi.xray.joseph import Joseph
+    from lingo_mi.projectors.joseph import Joseph
+    from lingo_mi.reconstruction.fdk import fdk
+    from lingo_mi.reconstruction.sart import blocks, sweep
+    from lingo_mi.reconstruction.system import System
 
     joseph, views = Joseph(geometry), np.arange(len(geometry))
 
@@ -60,9 +61,10 @@ def ours(geometry, scan, volume):
 
     def sart():
         system = System(scan)
-        x = sweep(system, system.start(None), 1., blocks(geometry.angles, 1, 'ordered', None), True)
+        x = sweep(system, system.start(None), 1.0, blocks(geometry.angles, 1, 'ordered', None), True)
         dr.eval(x)
         return system.volume(x)
+
     return dict(projector=project, transpose=transpose, FDK=lambda: fdk(scan), SART=sart)
 
 
@@ -70,18 +72,22 @@ def rtk(geometry, scan, volume, cores):
     """RTK's operations, or None where it is not installed."""
     try:
         import itk
+
         itk.RTK  # noqa: B018 - loads it
     except (ImportError, AttributeError):
         return None
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'tests'))
-    import rtk as bridge
+    from helpers import rtk as bridge
+
     itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(cores)
     return dict(
         projector=lambda: bridge.project(volume, geometry, itk),
         transpose=lambda: bridge.backproject(scan, itk),
         FDK=lambda: bridge.reconstruct('FDK', scan, itk),
-        SART=lambda: bridge.reconstruct('SART', scan, itk, NumberOfIterations=1, NumberOfProjectionsPerSubset=1, Lambda=1.,
-                                        EnforcePositivity=True))
+        SART=lambda: bridge.reconstruct(
+            'SART', scan, itk, NumberOfIterations=1, NumberOfProjectionsPerSubset=1, Lambda=1.0, EnforcePositivity=True
+        ),
+    )
 
 
 def diffct(geometry, scan, volume, cores):
@@ -92,7 +98,7 @@ def diffct(geometry, scan, volume, cores):
     except ImportError:
         return None
     torch.set_num_threads(cores)
-    frames = geometry.frames()
+    frames = geometry.rays()
     pixel, voxel = geometry.dDetector[::-1], geometry.dVoxel[::-1]
     place = [frames.source, frames.centre(geometry.nDetector), frames.u / pixel[0], frames.v / pixel[1]]
     trajectory = tuple(torch.tensor(np.ascontiguousarray(x), dtype=torch.float32) for x in place)
@@ -109,8 +115,10 @@ def diffct(geometry, scan, volume, cores):
     def reconstruct():
         angles = torch.tensor(geometry.angles, dtype=torch.float32)
         return fdk(views(), trajectory, geometry.nVoxel[::-1], angles, **shapes).numpy().transpose(2, 1, 0)
-    return dict(projector=project, transpose=lambda: projector.backproject(views()).numpy().transpose(2, 1, 0),
-                FDK=reconstruct)
+
+    return dict(
+        projector=project, transpose=lambda: projector.backproject(views()).numpy().transpose(2, 1, 0), FDK=reconstruct
+    )
 
 
 def compare(packages, repeats: int) -> dict:
@@ -136,7 +144,9 @@ def compare(packages, repeats: int) -> dict:
     for (operation, name), taken in seconds.items():
         entry = out.setdefault(operation, {})[name] = dict(seconds=float(np.median(taken)))
         if name != 'ours':
-            entry |= dict(ratio=entry['seconds'] / out[operation]['ours']['seconds'], deviation=deviation[operation, name])
+            entry |= dict(
+                ratio=entry['seconds'] / out[operation]['ours']['seconds'], deviation=deviation[operation, name]
+            )
     return out
 
 
@@ -148,14 +158,15 @@ def main():
     import drjit as dr
 
     from lingo_mi import phantoms
-    from lingo_mi.geometry import Geometry, circular
+    from lingo_mi.geometry.base import Geometry, circular
     from lingo_mi.scan import Scan
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
     dr.set_thread_count(cores)
     volume = phantoms.make('shepp_logan', args.size).data
-    geometry = Geometry(1000., 1500., (args.size, args.size), 512 / args.size, volume.shape, 256 / args.size,
-                        circular(args.views))
+    geometry = Geometry(
+        1000.0, 1500.0, (args.size, args.size), 512 / args.size, volume.shape, 256 / args.size, circular(args.views)
+    )
     empty = Scan(geometry, np.zeros((args.views, args.size, args.size), np.float32))
     scan = Scan(geometry, ours(geometry, empty, volume)['projector']())
     packages = dict(ours=ours(geometry, scan, volume))
@@ -166,16 +177,25 @@ def main():
         else:
             packages[name] = functions
     result = compare(packages, args.repeats)
-    print(f'{args.size}^3 voxels, {args.views} views of {args.size} x {args.size} pixels, {cores} cores, medians of '
-          f'{args.repeats} repeats')
+    print(
+        f'{args.size}^3 voxels, {args.views} views of {args.size} x {args.size} pixels, {cores} cores, medians of '
+        f'{args.repeats} repeats'
+    )
     for operation, found in result.items():
         parts = [f'{operation:9} ours {found["ours"]["seconds"]:8.3f} s']
-        parts += [f'{name} {x["seconds"]:8.3f} s, ratio {x["ratio"]:6.2f}, deviation {x["deviation"]:.2g}'
-                  for name, x in found.items() if name != 'ours']
+        parts += [
+            f'{name} {x["seconds"]:8.3f} s, ratio {x["ratio"]:6.2f}, deviation {x["deviation"]:.2g}'
+            for name, x in found.items()
+            if name != 'ours'
+        ]
         print('   '.join(parts))
     if args.json:
-        args.json.write_text(json.dumps(dict(size=args.size, views=args.views, cores=cores, repeats=args.repeats,
-                                             operations=result), indent=1) + '\n')
+        args.json.write_text(
+            json.dumps(
+                dict(size=args.size, views=args.views, cores=cores, repeats=args.repeats, operations=result), indent=1
+            )
+            + '\n'
+        )
 
 
 if __name__ == '__main__':

@@ -8,10 +8,11 @@ Simulates each scene of scenes/effects/ with its effect, fits a cloud that ignor
 scan without it. Writes effects.json to --out, where results of other effects are kept, the pictures to docs/figures/effects/,
 and the table into docs/effects.md.
 """
+
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.runtime import use_variant
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -19,7 +20,9 @@ DOCS = Path(__file__).resolve().parents[1] / 'docs'
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('--only', nargs='+', metavar='NAME', help='these effects, by the names of their scenes (default: all)')
+    p.add_argument(
+        '--only', nargs='+', metavar='NAME', help='these effects, by the names of their scenes (default: all)'
+    )
     p.add_argument('--out', type=Path, default=Path('out/effects'), metavar='D', help='folder of the results')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
@@ -28,7 +31,7 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.effects_report import EXPERIMENTS, make_table, measure, write
+    from lingo_mi.studies.effects import EXPERIMENTS, make_table, measure, write
 
     for name in args.only or EXPERIMENTS:
         numbers = write({name: measure(name)}, args.out, DOCS / 'figures' / 'effects', DOCS / 'effects.md')

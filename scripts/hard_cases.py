@@ -8,11 +8,12 @@ Every line is a case that tests/test_hard_cases.py asserts: relative errors of t
 Gaussians' parameters, in float32 against float64 (tests/hard_cases.py says how they are counted). The exit code is 1
 where a case misses its tolerance.
 """
+
 import argparse
 import sys
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.runtime import use_variant
 
 
@@ -27,7 +28,8 @@ def main():
     args = arguments()
     use_variant(args.variant)
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'tests'))
-    from hard_cases import cases, check, markdown, measure
+    from helpers.hard_cases import cases, check, markdown, measure
+
     results, missed = [], 0
     for case in cases(steps=10_000):
         try:

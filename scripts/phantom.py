@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
 """Make a test object and, if asked, a noise-free scan of it."""
+
 import argparse
 from pathlib import Path
 
 from lingo_mi import phantoms
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.errors import InputError
 
 EPILOG = """\
@@ -39,24 +40,37 @@ SUMMARY = {
 
 def arguments():
     listing = '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
-    parser = Parser(description=__doc__, epilog=EPILOG.format(list=listing),
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(
+        description=__doc__, epilog=EPILOG.format(list=listing), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('name', nargs='?', metavar='NAME', help='which phantom, see below')
     parser.add_argument('--list', action='store_true', help='print the names and exit')
-    parser.add_argument('--size', type=int, default=256, metavar='N',
-                        help='voxels a side, 8 to 512 (default 256)')
-    parser.add_argument('--seed', type=int, default=0, metavar='S',
-                        help='texture, vessels, random Gaussians and held-out angles (default 0)')
-    parser.add_argument('--out', type=Path, metavar='F.nii.gz',
-                        help='where to write the volume; for mesh and gaussians also F.ply')
-    parser.add_argument('--projections', type=Path, metavar='PATH',
-                        help='where to write a scan: a .pickle file or a new folder')
-    parser.add_argument('--kind', choices=('naf', 'r2', 'exr'), default='naf',
-                        help='format of the scan: naf writes a pickle, r2 and exr a folder (default naf)')
-    parser.add_argument('--views', type=int, default=50, metavar='N',
-                        help='training views, and as many test views (default 50)')
-    parser.add_argument('--variant',
-                        help='Mitsuba variant for foot and chest (default cuda_ad_mono, else llvm_ad_mono)')
+    parser.add_argument('--size', type=int, default=256, metavar='N', help='voxels a side, 8 to 512 (default 256)')
+    parser.add_argument(
+        '--seed',
+        type=int,
+        default=0,
+        metavar='S',
+        help='texture, vessels, random Gaussians and held-out angles (default 0)',
+    )
+    parser.add_argument(
+        '--out', type=Path, metavar='F.nii.gz', help='where to write the volume; for mesh and gaussians also F.ply'
+    )
+    parser.add_argument(
+        '--projections', type=Path, metavar='PATH', help='where to write a scan: a .pickle file or a new folder'
+    )
+    parser.add_argument(
+        '--kind',
+        choices=('naf', 'r2', 'exr'),
+        default='naf',
+        help='format of the scan: naf writes a pickle, r2 and exr a folder (default naf)',
+    )
+    parser.add_argument(
+        '--views', type=int, default=50, metavar='N', help='training views, and as many test views (default 50)'
+    )
+    parser.add_argument(
+        '--variant', help='Mitsuba variant for foot and chest (default cuda_ad_mono, else llvm_ad_mono)'
+    )
     parser.add_argument('--force', action='store_true', help='overwrite existing files (never folders)')
     return parser.parse_args(), listing
 
@@ -64,7 +78,7 @@ def arguments():
 def check(args):
     """Everything that can be refused before the work begins."""
     if args.name is None:
-        raise InputError(f"name a phantom: one of {', '.join(phantoms.names())}")
+        raise InputError(f'name a phantom: one of {", ".join(phantoms.names())}')
     if args.out is None and args.projections is None:
         raise InputError('nothing to write: give --out, --projections or both')
     if args.views < 1:
@@ -76,16 +90,19 @@ def check(args):
         if path.is_dir() and path == args.out:
             raise InputError(f'{path}: is a folder; give a file name that ends in .nii.gz')
         if path.exists() and not (args.force and path.is_file()):
-            raise InputError(f'{path}: exists already; ' + ('add --force to overwrite it' if path.is_file()
-                                                             else 'remove the folder or give another name'))
+            raise InputError(
+                f'{path}: exists already; '
+                + ('add --force to overwrite it' if path.is_file() else 'remove the folder or give another name')
+            )
         if not path.absolute().parent.is_dir():
             raise InputError(f'{path}: the folder {path.parent} does not exist; make it first')
     if args.out is not None and not args.out.name.endswith(('.nii', '.nii.gz')):
         if args.out.suffix != '.ply':
             raise InputError(f'{args.out}: volumes are written as NIfTI; give a name that ends in .nii.gz')
         if args.name not in ('gaussians', 'mesh'):
-            raise InputError(f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in '
-                             '.nii.gz')
+            raise InputError(
+                f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in .nii.gz'
+            )
 
 
 def bolts_beside(path):
@@ -97,11 +114,13 @@ def write_ply(path, phantom):
     """The phantom's own form: Gaussians, or the flange and its bolts."""
     if phantom.name == 'gaussians':
         from lingo_mi.files.ply import write_ply
+
         cloud = phantom.analytic
         write_ply(path, cloud.centres, cloud.scales, cloud.quaternions, cloud.density)
         print(f'{path}: {len(cloud)} Gaussians')
         return
     from lingo_mi.phantoms.mesh import bolts
+
     for name, mesh in ((path, phantom.analytic.mesh), (bolts_beside(path), bolts())):
         mesh.export(name)
         print(f'{name}: {len(mesh.faces)} triangles')
@@ -118,14 +137,17 @@ def run():
         write_ply(args.out, phantom)
     elif args.out:
         from lingo_mi.files.volumes import write_volume
+
         write_volume(args.out, phantom.data, phantom.spacing, phantom.origin, 'normalised')
         print(f'{args.out}: {args.name}, {args.size}^3 voxels of {phantom.spacing[0]:g} mm')
     if args.projections:
         from lingo_mi.files.scans import write_scan
-        from lingo_mi.phantoms.scanning import scan
+        from lingo_mi.phantoms.x3d_scan import scan
         from lingo_mi.progress import Progress
+
         if phantom.analytic is None:
             from lingo_mi.runtime import use_variant
+
             use_variant(args.variant)
         with Progress('Project', 2 * args.views) as bar:
             dataset = scan(phantom, args.views, args.seed, lambda done, _: bar.update(done))

@@ -11,30 +11,47 @@ exchanged alone.
 Runs scripts/fit.py for each combination that has no result yet in --out (an interrupted one goes on where it stopped), then
 draws all histories and prints a Markdown table. --iterations is for all but fast, which keeps its own number.
 """
+
 import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard
+from lingo_mi.cli.common import Parser, guard
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS, VOLUMETRIC, settings_of
 
-COLUMNS = (('psnr_2d', 'views, dB', '{:.2f}'), ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'), ('ssim_2d', 'SSIM', '{:.4f}'),
-           ('psnr_3d', 'volume, dB', '{:.2f}'), ('ssim_3d', 'SSIM 3D', '{:.4f}'), ('ipsd', 'IPSD', '{:.4f}'),
-           ('ipsd_targets', 'born', '{:,}'), ('gaussians', 'Gaussians', '{:,}'), ('iterations', 'iterations', '{}'),
-           ('seconds_init', 'init, s', '{:.1f}'), ('seconds_fit', 'fit, s', '{:.0f}'))
+COLUMNS = (
+    ('psnr_2d', 'views, dB', '{:.2f}'),
+    ('psnr_2d_r2', 'views (R2), dB', '{:.2f}'),
+    ('ssim_2d', 'SSIM', '{:.4f}'),
+    ('psnr_3d', 'volume, dB', '{:.2f}'),
+    ('ssim_3d', 'SSIM 3D', '{:.4f}'),
+    ('ipsd', 'IPSD', '{:.4f}'),
+    ('ipsd_targets', 'born', '{:,}'),
+    ('gaussians', 'Gaussians', '{:,}'),
+    ('iterations', 'iterations', '{}'),
+    ('seconds_init', 'init, s', '{:.1f}'),
+    ('seconds_fit', 'fit, s', '{:.0f}'),
+)
 
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path)
-    p.add_argument('--methods', nargs='+', default=list(VOLUMETRIC), metavar='METHOD[:name=value,...]',
-                   help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})')
+    p.add_argument(
+        '--methods',
+        nargs='+',
+        default=list(VOLUMETRIC),
+        metavar='METHOD[:name=value,...]',
+        help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})',
+    )
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)
-    p.add_argument('-D', dest='define', action='append', default=[], metavar='name=value', help='for every fit, see fit.py')
+    p.add_argument(
+        '-D', dest='define', action='append', default=[], metavar='name=value', help='for every fit, see fit.py'
+    )
     p.add_argument('--out', type=Path, default=Path('out/recipes'), help='folder of the results')
     p.add_argument('--figure', type=Path, help='picture of the curves (default: recipes.png in --out)')
     return p.parse_args()
@@ -48,8 +65,17 @@ def result(scene, method, args) -> dict:
         changes.append(f'iterations={args.iterations}')
     folder = args.out / '_'.join([scene.stem, str(args.views), name, *changes])
     if not (folder / 'metrics.json').exists():
-        command = [sys.executable, str(Path(__file__).with_name('fit.py')), str(scene), '--method', name,
-                   '--views', str(args.views), '--out', str(folder)]
+        command = [
+            sys.executable,
+            str(Path(__file__).with_name('fit.py')),
+            str(scene),
+            '--method',
+            name,
+            '--views',
+            str(args.views),
+            '--out',
+            str(folder),
+        ]
         command += [word for change in changes for word in ('-D', change)]
         command += ['--resume'] if (folder / 'checkpoint.npz').exists() else []
         print(' '.join(command), file=sys.stderr)
@@ -73,9 +99,12 @@ def draw(results, figure):
             if not points:  # 3dgs and xgaussian make no volume
                 continue
             axis.semilogx(*zip(*points), '.-', label=f'{method}, {metrics["iterations"]} iterations')
-            axis.set(title=scene if row == 0 else None, xlabel='time in steps [s]',
-                     ylabel=f'PSNR, {"held-out views" if row == 0 else "volume"} [dB]')
-            axis.grid(alpha=.3, which='both')
+            axis.set(
+                title=scene if row == 0 else None,
+                xlabel='time in steps [s]',
+                ylabel=f'PSNR, {"held-out views" if row == 0 else "volume"} [dB]',
+            )
+            axis.grid(alpha=0.3, which='both')
             axis.legend()
     figure.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(figure, dpi=90)

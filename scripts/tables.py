@@ -16,11 +16,12 @@ and 30,000 iterations, and all objects; it is meant for a GPU.
 Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
 tables use what is there. The table, as Markdown and JSON, is renewed after every one of them.
 """
+
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from lingo_mi.cli import Parser, guard, writable_folder
+from lingo_mi.cli.common import Parser, guard, writable_folder
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import METHODS, settings_of
 from lingo_mi.runtime import use_variant
@@ -34,16 +35,38 @@ def arguments():
     p.add_argument('table', choices=('views', 'ct', 'ablation'))
     p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: those of the scale)')
     p.add_argument('--views', nargs='+', type=int, metavar='N', help='fitted, of 50 (default: 5 10 25; ablation: 25)')
-    p.add_argument('--iterations', nargs='+', type=int, metavar='N', help='of the fits; ct and ablation take the largest '
-                   '(default: small 5000, paper 5000 15000 30000)')
-    p.add_argument('--methods', nargs='+', default=list(PUBLISHED), metavar='METHOD[:name=value,...]',
-                   help=f'columns of views and ct: any of {", ".join(METHODS)}, with settings that differ (default: '
-                        f'{" ".join(PUBLISHED)}, as in the paper)')
-    p.add_argument('--algorithms', nargs='+', choices=ALGORITHMS, default=list(ALGORITHMS[:-1]), metavar='A',
-                   help=f'rows of ct, of {", ".join(ALGORITHMS)} (default: all but the last)')
+    p.add_argument(
+        '--iterations',
+        nargs='+',
+        type=int,
+        metavar='N',
+        help='of the fits; ct and ablation take the largest (default: small 5000, paper 5000 15000 30000)',
+    )
+    p.add_argument(
+        '--methods',
+        nargs='+',
+        default=list(PUBLISHED),
+        metavar='METHOD[:name=value,...]',
+        help=f'columns of views and ct: any of {", ".join(METHODS)}, with settings that differ (default: '
+        f'{" ".join(PUBLISHED)}, as in the paper)',
+    )
+    p.add_argument(
+        '--algorithms',
+        nargs='+',
+        choices=ALGORITHMS,
+        default=list(ALGORITHMS[:-1]),
+        metavar='A',
+        help=f'rows of ct, of {", ".join(ALGORITHMS)} (default: all but the last)',
+    )
     p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')
-    p.add_argument('--finer', type=int, default=1, metavar='N', help='scan N times as many voxels along each side, where an '
-                   'object has them, so that projections hold what the voxels cannot (default: 1)')
+    p.add_argument(
+        '--finer',
+        type=int,
+        default=1,
+        metavar='N',
+        help='scan N times as many voxels along each side, where an '
+        'object has them, so that projections hold what the voxels cannot (default: 1)',
+    )
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
     p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<scale>)')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -53,8 +76,8 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.tables import SCALES, SCANNED, Cells, available
-    from lingo_mi.tables_report import groups, plan, write
+    from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells, available
+    from lingo_mi.studies.tables.report import groups, plan, write
 
     scale = replace(SCALES[args.scale], finer=args.finer)
     views = sorted(set(args.views or ((25,) if args.table == 'ablation' else (5, 10, 25))))
@@ -75,8 +98,10 @@ def main():
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     planned = plan(rows, objects)
     if not planned:
-        raise InputError(f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
-                         'are no densities; add other --algorithms or --methods')
+        raise InputError(
+            f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
+            'are no densities; add other --algorithms or --methods'
+        )
     missing = [cell for cell in planned if cells.get(cell) is None]
     failed = {}
     try:

@@ -1,4 +1,5 @@
 """What all tests share: the variant, slow tests, and the folder of test volumes."""
+
 import os
 from pathlib import Path
 
@@ -24,6 +25,7 @@ def pytest_collection_modifyitems(config, items):
 def variant() -> str:
     """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
     from lingo_mi.runtime import use_variant
+
     return use_variant(os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono'))
 
 
@@ -39,7 +41,8 @@ def data() -> Path:
 @pytest.fixture(scope='module')
 def scene(tmp_path_factory) -> Path:
     """A file of a scene that fits in a second."""
-    from script import SCENE
+    from helpers.script import SCENE
+
     path = tmp_path_factory.mktemp('scene') / 'tiny.xml'
     path.write_text(SCENE)
     return path

@@ -1,21 +1,24 @@
 """How much memory this process may take: control groups as Linux shows them, and limits of address space in one line."""
+
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from script import FIT, SCENE
 
+from helpers.script import FIT, SCENE
 from lingo_mi import memory
 
 
 def test_limits_of_control_groups(tmp_path):
     """Those of the group and of all around it; in a container a group's own path may not be there."""
+
     def write(name, text):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
         return path
+
     v2 = write('v2', '0::/job/step\n')
     write('cgroup/job/step/memory.max', 'max\n')
     write('cgroup/job/memory.max', '1000000\n')
@@ -30,9 +33,17 @@ def test_limits_of_control_groups(tmp_path):
 @pytest.mark.skipif(not Path('/proc/self/statm').exists(), reason='asks Linux for the address space in use')
 def test_too_little_address_space_is_one_line(tmp_path):
     (tmp_path / 'scene.xml').write_text(SCENE.replace('value="24, 24, 24"', 'value="1000, 1000, 1000"'))
-    command = [sys.executable, FIT.with_name('reconstruct.py'), tmp_path / 'scene.xml', '--variant', 'llvm_ad_mono', '--out',
-               tmp_path / 'v.nii']
-    done = subprocess.run(['bash', '-c', 'ulimit -v 10000000; exec "$@"', 'bash', *map(str, command)], capture_output=True,
-                          text=True)
+    command = [
+        sys.executable,
+        FIT.with_name('reconstruct.py'),
+        tmp_path / 'scene.xml',
+        '--variant',
+        'llvm_ad_mono',
+        '--out',
+        tmp_path / 'v.nii',
+    ]
+    done = subprocess.run(
+        ['bash', '-c', 'ulimit -v 10000000; exec "$@"', 'bash', *map(str, command)], capture_output=True, text=True
+    )
     assert done.returncode == 2 and done.stderr.startswith('error: ') and done.stderr.count('\n') == 1, done.stderr
     assert 'GiB of memory' in done.stderr

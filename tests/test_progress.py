@@ -1,4 +1,5 @@
 """The progress bar: plain where nobody watches, a bar on a terminal, and never in the loop's way."""
+
 import io
 import time
 
@@ -20,15 +21,14 @@ def test_plain_lines_about_every_tenth(capsys):
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == '' and len(lines) == 10
-    assert lines[0].startswith('Fit: 100/1000 (10%), loss 0.01235, PSNR 31.23 dB, 51,234 Gaussians, '
-                               'note warm, 0:00')
+    assert lines[0].startswith('Fit: 100/1000 (10%), loss 0.01235, PSNR 31.23 dB, 51,234 Gaussians, note warm, 0:00')
     assert 'left' in lines[0] and 'left' not in lines[-1]
     assert lines[-1].startswith('Fit: 1000/1000 (100%)')
     assert ''.join(lines).isprintable()
 
 
 def test_plain_line_after_ten_seconds(capsys, monkeypatch):
-    now = [0.]
+    now = [0.0]
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
     with Progress('Fit', 1_000_000) as p:
         for i in range(25):
@@ -41,10 +41,10 @@ def test_plain_line_after_ten_seconds(capsys, monkeypatch):
 
 
 def test_resumed_loop_counts_its_own_pace(capsys, monkeypatch):
-    now = [0.]
+    now = [0.0]
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
     with Progress('Fit', 1000, start=800) as p:
-        now[0] = 10.
+        now[0] = 10.0
         p.update(900)
     assert capsys.readouterr().err == 'Fit: 900/1000 (90%), 0:10 elapsed, 0:10 left\n'
 
@@ -62,7 +62,7 @@ def test_values_are_read_only_when_drawn(capsys):
 def test_update_is_cheap(monkeypatch, terminal):
     monkeypatch.setattr('sys.stderr', Terminal() if terminal else io.StringIO())
     monkeypatch.setenv('TERM', 'xterm')
-    with Progress('Fit', 10 ** 9) as p:
+    with Progress('Fit', 10**9) as p:
         start = time.perf_counter()
         for i in range(20_000):
             p.update(i + 1, loss=0.5)

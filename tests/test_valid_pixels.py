@@ -1,23 +1,24 @@
 """Pixels that are left out, and scans that the panel cuts off: in the scan, its file, the initial cloud and the fit."""
+
 import warnings
 
 import drjit as dr
 import numpy as np
 import pytest
 import yaml
-from test_fit import SHORT, error_of, geometry, some_points, tiny_scan
 
+from helpers.fits import SHORT, error_of, geometry, some_points, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.fit.view import Target
-from lingo_mi.geometry import circular
+from lingo_mi.geometry.base import circular
 from lingo_mi.lingo.initialise import Settings, initialise
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
-from lingo_mi.recon.fdk import fdk
+from lingo_mi.reconstruction.fdk import fdk
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -32,7 +33,7 @@ def patches(scan, seed=0):
     valid = np.ones(scan.projections.shape, bool)
     for mask in valid:
         row, column = rng.integers(6, 18, 2)
-        mask[row:row + 7, column:column + 6] = False
+        mask[row : row + 7, column : column + 6] = False
     valid[:, :, 20] = False
     valid[2, 16:] = False
     return valid
@@ -44,6 +45,7 @@ def spoilt(scan, valid, value):
 
 # ---- the scan ----------------------------------------------------------------------------------------------
 
+
 def test_what_is_not_valid_is_forgotten(scan):
     valid = patches(scan)
     for value in (np.nan, 1e6, -3):
@@ -54,13 +56,18 @@ def test_what_is_not_valid_is_forgotten(scan):
     binned = masked.binned(2)
     assert binned.valid.shape == binned.projections.shape
     for v, row, column in ((0, 3, 10), (2, 8, 3), (3, 0, 0)):
-        assert binned.valid[v, row, column] == valid[v, 2 * row:2 * row + 2, 2 * column:2 * column + 2].all()
+        assert binned.valid[v, row, column] == valid[v, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2].all()
     assert not binned.valid[:, :, 10].any() and binned.valid[3, 0, 0]
 
 
-@pytest.mark.parametrize('mask, match', [
-    (np.ones((6, 32, 31), bool), 'shape of the projections'), (np.ones((6, 32, 32)), 'true or false'),
-    (np.zeros((6, 32, 32), bool), 'no pixel')])
+@pytest.mark.parametrize(
+    'mask, match',
+    [
+        (np.ones((6, 32, 31), bool), 'shape of the projections'),
+        (np.ones((6, 32, 32)), 'true or false'),
+        (np.zeros((6, 32, 32), bool), 'no pixel'),
+    ],
+)
 def test_bad_masks(scan, mask, match):
     with pytest.raises(InputError, match=match):
         Scan(scan.geometry, scan.projections, mask)
@@ -104,6 +111,7 @@ def test_filtered_backprojection_needs_every_pixel(scan):
 
 # ---- the initial cloud -------------------------------------------------------------------------------------
 
+
 def brute_force(frames, found, points, misses, outside):
     """Low valid set by the definition, one point and view at a time."""
     keep = []
@@ -125,17 +133,17 @@ def brute_force(frames, found, points, misses, outside):
 @pytest.mark.parametrize('misses', [0, 1])
 def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     g, valid = scan.geometry, patches(scan)
-    found = masks(spoilt(scan, valid, 1e9) * g.scale, .1, valid)
-    expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.scale, .1)
+    found = masks(spoilt(scan, valid, 1e9) * g.scale, 0.1, valid)
+    expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.scale, 0.1)
     assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
-    frames, grid = g.normalised_frames(), (12, 12, 12)
+    frames, grid = g.normalised_rays(), (12, 12, 12)
     low, high = valid_voxels(frames, found, grid, g.half, misses, outside)
     np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.half), misses, outside))
     assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.half, misses, outside)[0])
     # Blocks of cells are tested at once on large grids; they must not lose a cell behind an invalid pixel.
     large = (40, 40, 40)
     whole = valid_voxels(frames, found, large, g.half, misses, outside)[0]
-    sample = np.random.default_rng(0).choice(40 ** 3, 300, replace=False)
+    sample = np.random.default_rng(0).choice(40**3, 300, replace=False)
     expected = sample[brute_force(frames, found, voxel_centres(large, g.half, sample), misses, outside)]
     np.testing.assert_array_equal(np.sort(expected), np.intersect1d(whole, sample))
 
@@ -144,16 +152,29 @@ def test_densities_come_from_valid_pixels(scan):
     """Whatever stands in the others, the cloud is the same."""
     g, valid, clouds = scan.geometry, patches(scan), []
     for value in (0, 1e6):
+
         def render(points, density, spacing, views, value=value):
             return spoilt(scan, valid, value)[views] * g.scale
-        clouds.append(initialise(g.normalised_frames(), spoilt(scan, valid, value) * g.scale, g.nVoxel, g.half,
-                                 Settings(n_points=300), np.random.default_rng(0), render, valid=valid))
+
+        clouds.append(
+            initialise(
+                g.normalised_rays(),
+                spoilt(scan, valid, value) * g.scale,
+                g.nVoxel,
+                g.half,
+                Settings(n_points=300),
+                np.random.default_rng(0),
+                render,
+                valid=valid,
+            )
+        )
     np.testing.assert_array_equal(clouds[0].points, clouds[1].points)
     np.testing.assert_array_equal(clouds[0].density, clouds[1].density)
     assert (clouds[0].density > 0).all()
 
 
 # ---- truncation --------------------------------------------------------------------------------------------
+
 
 def cropped(columns=14):
     """The object is wider than the panel: only its middle columns are seen."""
@@ -180,6 +201,7 @@ def test_truncated_scans_keep_what_the_panel_misses():
     def cloud(outside):
         settings = METHODS['fast'].changed(outside=outside, n_points=400)
         return initial_cloud(narrow, settings)
+
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         automatic = cloud('auto')
@@ -190,11 +212,12 @@ def test_truncated_scans_keep_what_the_panel_misses():
     assert automatic.info['outside'] == 'ignore' and whole.info['outside'] == 'invalid'
     np.testing.assert_array_equal(automatic.points, literal.points)
     # Columns of the points in the first view, from the middle of the 14. Points are drawn up to half a cell from those seen.
-    beyond = [np.mean(np.abs(g.normalised_frames().project(c.points, 0)[0] - 7) > 7.5) for c in (strict, automatic)]
-    assert beyond[0] == 0 and beyond[1] > .02
+    beyond = [np.mean(np.abs(g.normalised_rays().project(c.points, 0)[0] - 7) > 7.5) for c in (strict, automatic)]
+    assert beyond[0] == 0 and beyond[1] > 0.02
 
 
 # ---- the fit -----------------------------------------------------------------------------------------------
+
 
 def kernels(scan, settings, start):
     """Hashes of the compiled kernels of a fit, in the order of their launches, traced in every step."""
@@ -219,13 +242,15 @@ def test_without_a_mask_no_kernel_knows_of_masks(scan, monkeypatch):
 def test_held_out_pixels_that_are_not_valid_do_not_count(scan):
     from types import SimpleNamespace
 
-    from lingo_mi.results import quick_measure
+    from lingo_mi.results.measure import quick_measure
+
     valid = patches(scan)
     dataset = Dataset(scan, Scan(scan.geometry, scan.projections, valid))
 
     def measured(value):
         views = spoilt(scan, valid, value) * np.float32(1.01)
         return quick_measure(dataset, 9)(SimpleNamespace(render=lambda state, geometry: views), None)
+
     assert measured(0) == measured(1e6) and np.isfinite(measured(0)['psnr_2d'])
 
 

@@ -1,1 +1,1 @@
-"""Effects of real projections, one a file, each used only where its element is in the scene."""
+"""What a real detector sees besides line integrals; only where a scene calls for it."""

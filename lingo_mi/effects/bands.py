@@ -8,6 +8,7 @@ r_m(E) = mu_m(E) / mu_m(E0), what a detector measures is (Alvarez and Macovski, 
 K terms with positive weights that sum to 1. They start as K intervals of energy, and are then moved, weights and ratios
 together, to where the mean square error of h over a range of p is least.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from scipy.optimize import least_squares
 from scipy.special import logsumexp, softmax
 from scipy.stats import qmc
 
-from ..errors import InputError
+from lingo_mi.errors import InputError
 
 MOST_BANDS = 6
 MOST_STEPS = 1000  # of the search; the error it leaves is stated whatever it is
@@ -35,7 +36,7 @@ class Bands:
 
     weights: np.ndarray
     ratios: np.ndarray
-    error: float = 0.
+    error: float = 0.0
 
     def hardened(self, *integrals) -> np.ndarray:
         """h: what a detector measures of line integrals at the reference energy, M arrays of one shape, float64."""
@@ -106,8 +107,16 @@ def _band(signal, ratios, materials, count, largest):
         w, r = unpacked(x)
         share = softmax(np.log(w) - points @ r, -1)
         return np.concatenate([w - share] + [share * points[:, m, None] * r[m] for m in range(materials)], 1)
-    x = least_squares(error, np.concatenate([np.log(weights), np.log(start).ravel()]), jacobian, xtol=1e-10, ftol=1e-10,
-                      gtol=1e-14, max_nfev=MOST_STEPS).x
+
+    x = least_squares(
+        error,
+        np.concatenate([np.log(weights), np.log(start).ravel()]),
+        jacobian,
+        xtol=1e-10,
+        ftol=1e-10,
+        gtol=1e-14,
+        max_nfev=MOST_STEPS,
+    ).x
     weights, found = unpacked(x)
     fine = _points(materials, largest, 11)
     worst = np.abs(_hardened(fine, weights, found) - _hardened(fine, signal, ratios)).max()
@@ -121,7 +130,7 @@ def _hardened(points, weights, ratios):
 
 def _points(materials, largest, power):
     """Line integrals [n, M] with sums up to `largest`: each material alone, and 2^power mixtures."""
-    n = 2 ** power
+    n = 2**power
     alone = np.concatenate([np.linspace(0, largest, n)[:, None] * axis for axis in np.eye(materials)])
     if materials == 1:
         return alone

@@ -8,21 +8,22 @@ The electrons of a material are bound: xraylib multiplies this by the incoherent
 coherent (Rayleigh) part r_e^2 / 2 (1 + cos^2 theta) F(q)^2, atom by atom (Schoonjans et al., Spectrochim. Acta B 66, 2011).
 The interference of neighbouring molecules, which moves the coherent peak of water to some degrees, is not in its tables.
 """
+
 from __future__ import annotations
 
 from functools import lru_cache
 
 import numpy as np
 
-from ..errors import InputError
-from .spectrum import compound, library
+from lingo_mi.effects.spectrum import compound, library
+from lingo_mi.errors import InputError
 
 ELECTRON = 510.99895  # m c^2, keV
-LEAST_ENERGY, MOST_ENERGY = 1., 800.  # keV
-CELLS = 8192          # of cos theta from -1 to 1 in a table: the free electron's is right to 2e-6; forward, 1.3 degrees wide
-_FINE = 4096          # angles at which xraylib is asked
-_LEAST_Q = 1.1e-3     # 1/Angstrom, below which its tables of S end; it is next to 0 there, and F next to its largest
-_HC = 12.398420       # keV Angstrom
+LEAST_ENERGY, MOST_ENERGY = 1.0, 800.0  # keV
+CELLS = 8192  # of cos theta from -1 to 1 in a table: the free electron's is right to 2e-6; forward, 1.3 degrees wide
+_FINE = 4096  # angles at which xraylib is asked
+_LEAST_Q = 1.1e-3  # 1/Angstrom, below which its tables of S end; it is next to 0 there, and F next to its largest
+_HC = 12.398420  # keV Angstrom
 
 
 def klein_nishina(cosine, energy: float, response: str = 'count') -> np.ndarray:
@@ -34,7 +35,7 @@ def klein_nishina(cosine, energy: float, response: str = 'count') -> np.ndarray:
     """
     cosine = np.asarray(cosine, float)
     kept = 1 / (1 + energy / ELECTRON * (1 - cosine))
-    return .5 * kept ** (3 if response == 'energy' else 2) * (kept + 1 / kept - (1 - cosine ** 2))
+    return 0.5 * kept ** (3 if response == 'energy' else 2) * (kept + 1 / kept - (1 - cosine**2))
 
 
 @lru_cache(maxsize=64)
@@ -56,16 +57,18 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     formula, density = compound(material)
     xraylib = library('xraylib')
     half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), in which a forward peak is broad
-    angles = (2 * np.arcsin(np.maximum(half, min(1., _LEAST_Q * _HC / energy)))).tolist()
-    bound, coherent = (np.array([function(formula, float(energy), a) for a in angles])
-                       for function in (xraylib.DCS_Compt_CP, xraylib.DCS_Rayl_CP))
-    cosine = 1 - 2 * half ** 2
-    kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.
+    angles = (2 * np.arcsin(np.maximum(half, min(1.0, _LEAST_Q * _HC / energy)))).tolist()
+    bound, coherent = (
+        np.array([function(formula, float(energy), a) for a in angles])
+        for function in (xraylib.DCS_Compt_CP, xraylib.DCS_Rayl_CP)
+    )
+    cosine = 1 - 2 * half**2
+    kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.0
     fine = (bound * kept + coherent) * density / 10  # cm2/g to 1/mm
     # Means over cells, so that a forward peak narrower than a cell keeps its integral. Between two fine angles the density is
     # a line, so its integral is a parabola.
-    edges = np.concatenate([[-1.], (np.arange(CELLS) + .5) * (2 / CELLS) - 1, [1.]])
-    below = np.concatenate([[0.], np.cumsum((fine[1:] + fine[:-1]) / 2 * np.diff(cosine))])
+    edges = np.concatenate([[-1.0], (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1, [1.0]])
+    below = np.concatenate([[0.0], np.cumsum((fine[1:] + fine[:-1]) / 2 * np.diff(cosine))])
     i = np.clip(np.searchsorted(cosine, edges, 'right') - 1, 0, _FINE - 1)
     step = edges - cosine[i]
     slope = (fine[i + 1] - fine[i]) / (cosine[i + 1] - cosine[i])

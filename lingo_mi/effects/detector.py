@@ -13,6 +13,7 @@ energy-integrating panel's noise is a little larger than that of as many photons
 Random numbers are those of Philox4x64 (Salmon et al., SC 2011), a counter-based generator, keyed by seed and view: a view
 has the same noise whichever others are rendered, and in any order.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -21,53 +22,72 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import convolve
 
-from ..errors import InputError
-from .focal_spot import checked_order
+from lingo_mi.effects.focal_spot import checked_order
+from lingo_mi.errors import InputError
 
 RESPONSES = 'energy', 'count'
 MOST_PHOTONS = 1e15
 FULL_SCALE = 1.25  # of a converter, where no saturation is given: the open beam with its noise stays below
-DARKEST = 1e-30    # least transmission without noise; float32 holds 1e-38
-_MAPS = 2 ** 63    # added to a seed: the maps of gains and dead pixels share no numbers with the noise
+DARKEST = 1e-30  # least transmission without noise; float32 holds 1e-38
+_MAPS = 2**63  # added to a seed: the maps of gains and dead pixels share no numbers with the noise
 
 
 @dataclass(frozen=True)
 class Detector:
     """See the film `ct_detector`, whose parameters these are."""
 
-    DEFAULTS = dict(photons=0., electronic_noise=0., response='energy', psf=0., aperture=0., aperture_order=3,
-                    saturation=0., bits=0, dead=0., gain=0., seed=0, corrected=True)
+    DEFAULTS = dict(
+        photons=0.0,
+        electronic_noise=0.0,
+        response='energy',
+        psf=0.0,
+        aperture=0.0,
+        aperture_order=3,
+        saturation=0.0,
+        bits=0,
+        dead=0.0,
+        gain=0.0,
+        seed=0,
+        corrected=True,
+    )
 
-    photons: float = 0.
-    electronic_noise: float = 0.
+    photons: float = 0.0
+    electronic_noise: float = 0.0
     response: str = 'energy'
-    psf: float = 0.
-    aperture: float = 0.
+    psf: float = 0.0
+    aperture: float = 0.0
     aperture_order: int = 3
-    saturation: float = 0.
+    saturation: float = 0.0
     bits: int = 0
-    dead: float = 0.
-    gain: float = 0.
+    dead: float = 0.0
+    gain: float = 0.0
     seed: int = 0
     corrected: bool = True
 
     @staticmethod
     def of(**given) -> Detector:
         """Checked parameters. Raises InputError."""
-        ranges = dict(photons=MOST_PHOTONS, electronic_noise=MOST_PHOTONS, psf=1e6, aperture=1., saturation=1e6, dead=1.,
-                      gain=1.)
+        ranges = dict(
+            photons=MOST_PHOTONS,
+            electronic_noise=MOST_PHOTONS,
+            psf=1e6,
+            aperture=1.0,
+            saturation=1e6,
+            dead=1.0,
+            gain=1.0,
+        )
         for name, most in ranges.items():
             value = given[name]
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a number from 0 to {most:g}, not {value!r}')
-        for name, most in dict(bits=24, seed=2 ** 62).items():
+        for name, most in dict(bits=24, seed=2**62).items():
             value = given[name]
             if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a whole number from 0 to {most}, not {value!r}')
         if given['response'] not in RESPONSES:
             raise InputError(f"response must be 'energy' or 'count', not {given['response']!r}")
         if not isinstance(given['corrected'], bool):
-            raise InputError(f"corrected must be true or false, not {given['corrected']!r}")
+            raise InputError(f'corrected must be true or false, not {given["corrected"]!r}')
         if given['electronic_noise'] and not given['photons']:
             raise InputError('electronic_noise, in photons, needs photons')
         checked_order(given['aperture_order'], 'aperture_order')
@@ -81,13 +101,13 @@ class Detector:
     @property
     def expected(self) -> Detector:
         """The same, of which only what happens to the light is left, and its saturation."""
-        gain = self.gain if self.saturation and self.corrected else 0.  # what is divided out moves the saturation
-        return replace(self, photons=0., electronic_noise=0., bits=0, dead=0., gain=gain, corrected=True)
+        gain = self.gain if self.saturation and self.corrected else 0.0  # what is divided out moves the saturation
+        return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 
     @property
     def floor(self) -> float:
         """The least transmission that is told from none."""
-        return max(.5 / self.photons if self.photons else DARKEST, .5 * self._step)
+        return max(0.5 / self.photons if self.photons else DARKEST, 0.5 * self._step)
 
     @property
     def _top(self) -> float:
@@ -95,7 +115,7 @@ class Detector:
 
     @property
     def _step(self) -> float:
-        return self._top / (2 ** self.bits - 1) if self.bits else 0.
+        return self._top / (2**self.bits - 1) if self.bits else 0.0
 
     def signal(self, transmission, view: int, seed: int = 0) -> np.ndarray:
         """The signal of a view, in units of the open beam's, float64 [v, u], gains and dead pixels as they are.
@@ -134,7 +154,7 @@ class Detector:
         """Standard deviation of a line integral -ln(N / I0) by the noise of its counts and the rounding to `bits`, to first
         order, for transmissions of any shape; at least that of the floor."""
         light = np.maximum(transmission, self.floor)
-        variance = self._step ** 2 / 12
+        variance = self._step**2 / 12
         if self.photons:
             variance = variance + light / self.photons + (self.electronic_noise / self.photons) ** 2
         return np.sqrt(variance) / light
@@ -151,6 +171,7 @@ class Detector:
         """
         import drjit as dr
         import mitsuba as mi
+
         image = mi.TensorXf(image, shape=(view.height, view.width))
         for axis, step in ((0, view.v), (1, view.u)):
             # Rounded, because the taps are compiled into the kernel: no two views may differ in their last digit.
@@ -169,14 +190,14 @@ FWHM = 2 * np.sqrt(2 * np.log(2))  # of a Gaussian, in standard deviations
 def taps(sigma: float) -> list[float]:
     """Weights of a Gaussian of `sigma` pixels at whole pixels, out to five sigma; they sum to 1."""
     reach = max(1, int(np.ceil(5 * sigma)))
-    weights = np.exp(-.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return (weights / weights.sum()).tolist()
 
 
 @lru_cache(maxsize=4)
 def _maps(seed, gain, dead, shape):
     rng = np.random.Generator(np.random.Philox(key=[_MAPS + seed, 0]))
-    gains = np.maximum(1 + gain * rng.standard_normal(shape), .01)  # no pixel is quite blind by its gain
+    gains = np.maximum(1 + gain * rng.standard_normal(shape), 0.01)  # no pixel is quite blind by its gain
     return gains, rng.random(shape) < dead
 
 

@@ -8,6 +8,7 @@ For a uniform rectangle the Gauss-Legendre rule of n x n points integrates polyn
 falls exponentially with n wherever intensities are smooth; at an edge the blur is a staircase of n steps. Every pair of
 points is a projection of its own, with the source and the pixels moved: blur varies with depth as it should.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
+from lingo_mi.errors import InputError
 
 MOST_ORDER = 16
 
@@ -25,7 +26,7 @@ MOST_ORDER = 16
 class FocalSpot:
     """size: width and height in mm, along u and v; order: n of n x n points, 1 to 16."""
 
-    size: tuple[float, float] = (0., 0.)
+    size: tuple[float, float] = (0.0, 0.0)
     order: int = 3
 
     @staticmethod
@@ -41,11 +42,13 @@ class FocalSpot:
 
     def views(self, view) -> list:
         """(weight, View) of every point of the focal spot; the view itself for a point."""
-        if self.size == (0., 0.):
-            return [(1., view)]
+        if self.size == (0.0, 0.0):
+            return [(1.0, view)]
         u, v = dr.normalize(view.u), dr.normalize(view.v)
-        return [(weight, replace(view, source=view.source + _opaque(x * self.size[0]) * u + _opaque(y * self.size[1]) * v))
-                for weight, x, y in square(self.order, *(s > 0 for s in self.size))]
+        return [
+            (weight, replace(view, source=view.source + _opaque(x * self.size[0]) * u + _opaque(y * self.size[1]) * v))
+            for weight, x, y in square(self.order, *(s > 0 for s in self.size))
+        ]
 
     def scaled(self, factor: float) -> FocalSpot:
         """The same spot where lengths are multiplied by `factor`."""
@@ -56,8 +59,9 @@ class FocalSpot:
         if max(self.size) > 0 and distance is None:
             raise InputError('focal_spot: a parallel beam has no focal spot')
         if distance is not None and max(self.size) >= distance:
-            raise InputError(f'focal_spot of {max(self.size):g} mm is not smaller than the distance of the source, '
-                             f'{distance:g} mm')
+            raise InputError(
+                f'focal_spot of {max(self.size):g} mm is not smaller than the distance of the source, {distance:g} mm'
+            )
 
     def __str__(self):
         return f'focal_spot = {self.size[0]:g} x {self.size[1]:g} mm, {self.order} x {self.order} points'
@@ -66,15 +70,17 @@ class FocalSpot:
 def aperture_views(view, share: float, order: int) -> list:
     """(weight, View) of n x n points in the middle `share` of every pixel; the view itself for a share of 0."""
     if share == 0:
-        return [(1., view)]
-    return [(weight, replace(view, corner=view.corner + _opaque(x * share) * view.u + _opaque(y * share) * view.v))
-            for weight, x, y in square(order)]
+        return [(1.0, view)]
+    return [
+        (weight, replace(view, corner=view.corner + _opaque(x * share) * view.u + _opaque(y * share) * view.v))
+        for weight, x, y in square(order)
+    ]
 
 
 def square(order: int, wide: bool = True, high: bool = True) -> list:
     """(weight, x, y) of the Gauss-Legendre rule on [-1/2, 1/2]^2, or along one of its axes; the weights sum to 1."""
     x, w = np.polynomial.legendre.leggauss(order)
-    line, point = list(zip(w / 2, x / 2)), [(1., 0.)]
+    line, point = list(zip(w / 2, x / 2)), [(1.0, 0.0)]
     across, down = line if wide else point, line if high else point
     return [(float(wx * wy), float(x), float(y)) for wy, y in down for wx, x in across]
 

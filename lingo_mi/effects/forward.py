@@ -1,4 +1,5 @@
 """The effects that a scene calls for, and what its detector then sees (Dr.Jit)."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -7,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import InputError
-from ..scan import Scan
-from .detector import DARKEST, Detector
-from .focal_spot import FocalSpot, aperture_views
-from .hardening import Tube, by_material, hardened
-from .scatter import Scatter
+from lingo_mi.effects.detector import DARKEST, Detector
+from lingo_mi.effects.focal_spot import FocalSpot, aperture_views
+from lingo_mi.effects.hardening import Tube, by_material, hardened
+from lingo_mi.effects.scatter import Scatter
+from lingo_mi.errors import InputError
+from lingo_mi.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,23 @@ class Effects:
     @property
     def ideal(self) -> bool:
         """Whether the expected signal is exp(-line integral) along the ray through a pixel's centre."""
-        return not (self.tube and self.tube.hardens or self.spot and max(self.spot.size) or self.scatter
-                    or self.detector and (self.detector.aperture or self.detector.psf or self.detector.saturation))
+        return not (
+            self.tube
+            and self.tube.hardens
+            or self.spot
+            and max(self.spot.size)
+            or self.scatter
+            or self.detector
+            and (self.detector.aperture or self.detector.psf or self.detector.saturation)
+        )
 
     def scaled(self, factor: float) -> Effects:
         """The same for views whose lengths are mm times `factor`."""
-        return replace(self, spot=self.spot and self.spot.scaled(factor),
-                       detector=self.detector and replace(self.detector, psf=factor * self.detector.psf))
+        return replace(
+            self,
+            spot=self.spot and self.spot.scaled(factor),
+            detector=self.detector and replace(self.detector, psf=factor * self.detector.psf),
+        )
 
     @property
     def response(self) -> str:
@@ -47,17 +58,19 @@ class Effects:
 
     def views(self, view) -> list:
         """(weight, View) of all bundles of rays whose mean intensity a view's pixels see."""
-        views = self.spot.views(view) if self.spot else [(1., view)]
+        views = self.spot.views(view) if self.spot else [(1.0, view)]
         if self.detector:
             d = self.detector
-            views = [(w * share, v) for w, one in views for share, v in aperture_views(one, d.aperture, d.aperture_order)]
+            views = [
+                (w * share, v) for w, one in views for share, v in aperture_views(one, d.aperture, d.aperture_order)
+            ]
         return views
 
     def line_integrals(self, objects, view, quality):
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
-        objects   of `xray.objects.find_objects`
-        quality   `xray.quality.Quality`; its n x n rays a pixel are averaged as intensities
+        objects   of `projectors.objects.find_objects`
+        quality   `projectors.accuracy.Quality`; its n x n rays a pixel are averaged as intensities
         """
         groups, bands = {'': objects}, None
         if self.tube and self.tube.hardens:
@@ -73,6 +86,7 @@ class Effects:
                     total += quality.line_integrals(thing, rays)
                 integrals.append(total)
             return hardened(integrals, bands) if bands else integrals[0]
+
         scattered = self.scatter and self.scatter.light(objects, self.tube, self.response, view, self.index)
         return self.averaged(seen, view, quality, scattered)
 

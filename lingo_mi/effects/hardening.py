@@ -4,6 +4,7 @@ The density of an object is its attenuation at the tube's reference energy E0. A
 mu_m(E) / mu_m(E0) at another energy, so the line integrals of the densities, one a material, are all that is needed of the
 objects; `bands` turns them into what a detector measures.
 """
+
 from __future__ import annotations
 
 import copy
@@ -12,12 +13,12 @@ from dataclasses import dataclass, field
 import drjit as dr
 import numpy as np
 
-from ..errors import InputError
-from . import bands as energy_bands
-from .spectrum import Spectrum, attenuation, monochromatic, tube_spectrum
+from lingo_mi.effects import bands as energy_bands
+from lingo_mi.effects.spectrum import Spectrum, attenuation, monochromatic, tube_spectrum
+from lingo_mi.errors import InputError
 
-REFERENCE = 60.  # keV; water attenuates .0206 per mm
-LARGEST = 10.    # sum of line integrals up to which bands are fitted: behind it, 5e-5 of the photons are left
+REFERENCE = 60.0  # keV; water attenuates .0206 per mm
+LARGEST = 10.0  # sum of line integrals up to which bands are fitted: behind it, 5e-5 of the photons are left
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,27 @@ class Tube:
         if isinstance(bands, bool) or not isinstance(bands, int) or not 1 <= bands <= energy_bands.MOST_BANDS:
             raise InputError(f'bands must be a whole number from 1 to {energy_bands.MOST_BANDS}, not {bands!r}')
         named = {name: _names(text) for name, text in materials.items()}
-        given = dict(energy=energy, kvp=kvp, angle=angle, filtration=filtration, reference=reference, material=material,
-                     split=split, bands=bands) | {f'material_{name}': text for name, text in materials.items()}
-        tube = Tube(spectrum, float(reference), _names(material) if material else (), named, _split(split), bands, given)
+        given = dict(
+            energy=energy,
+            kvp=kvp,
+            angle=angle,
+            filtration=filtration,
+            reference=reference,
+            material=material,
+            split=split,
+            bands=bands,
+        ) | {f'material_{name}': text for name, text in materials.items()}
+        tube = Tube(
+            spectrum, float(reference), _names(material) if material else (), named, _split(split), bands, given
+        )
         for names in (tube.material, *named.values()):
             for name in names:
                 attenuation(name, [tube.reference])
             if len(names) == 2 and tube.split is None:
-                raise InputError(f'the two materials {" + ".join(names)!r} need a split, the densities in 1/mm that '
-                                 "tell them apart: '0.024, 0.040'")
+                raise InputError(
+                    f'the two materials {" + ".join(names)!r} need a split, the densities in 1/mm that '
+                    "tell them apart: '0.024, 0.040'"
+                )
         return tube
 
     @property
@@ -76,20 +89,26 @@ class Tube:
         """The materials of a shape. Raises InputError where the scene does not say."""
         names = self.materials.get(name, self.material)
         if not names:
-            raise InputError(f'xray_tube: the shape {name!r} has no material, without which a spectrum says nothing: add '
-                             f'<string name="material_{name}" value="water"/>')
+            raise InputError(
+                f'xray_tube: the shape {name!r} has no material, without which a spectrum says nothing: add '
+                f'<string name="material_{name}" value="water"/>'
+            )
         return names
 
     def fitted(self) -> tuple[str, ...]:
         """The materials of all objects, one or two: what a cloud without shapes may be of. Raises InputError."""
         names = tuple(dict.fromkeys([*self.material, *(name for shape in self.materials.values() for name in shape)]))
         if not names:
-            raise InputError('xray_tube: without a material a spectrum says nothing: add <string name="material" '
-                             'value="water"/>, or leave it out with -D effects=ignore')
+            raise InputError(
+                'xray_tube: without a material a spectrum says nothing: add <string name="material" '
+                'value="water"/>, or leave it out with -D effects=ignore'
+            )
         if len(names) > 2 or len(names) == 2 and self.split is None:
-            raise InputError(f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
-                             + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
-                             + ', or leave it out with -D effects=ignore')
+            raise InputError(
+                f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
+                + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
+                + ', or leave it out with -D effects=ignore'
+            )
         return names
 
     def signal(self, names, response: str = 'energy') -> energy_bands.Bands:
@@ -120,7 +139,7 @@ def hardened(integrals, bands: energy_bands.Bands):
 
 
 def by_material(objects, tube: Tube) -> dict:
-    """The objects of a scene (`xray.objects`), or the parts of them, that are made of each material."""
+    """The objects of a scene (`projectors.objects`), or the parts of them, that are made of each material."""
     out = {}
     for thing in objects:
         names = tube.made_of(thing.name)
@@ -145,8 +164,10 @@ def _parts(thing, split):
         first.data, second.data = thing.data * (1 - share), thing.data * share
     elif hasattr(thing, 'density'):
         if thing.second is None:
-            raise InputError(f'the ellipsoids {thing.name!r} are of two materials, but have no attribute "second": give '
-                             "it the second one's share in the density of every Gaussian, 0 to 1")
+            raise InputError(
+                f'the ellipsoids {thing.name!r} are of two materials, but have no attribute "second": give '
+                "it the second one's share in the density of every Gaussian, 0 to 1"
+            )
         first.density, second.density = thing.density * (1 - thing.second), thing.density * thing.second
     else:
         raise InputError(f'the mesh {thing.name!r} is homogeneous and cannot be of two materials')

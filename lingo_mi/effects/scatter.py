@@ -12,6 +12,7 @@ gives the error of a mean. A smoothing spline that leaves residuals of that size
 
 Scattered photons are attenuated at the energy at which they left the tube.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -22,18 +23,18 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import uniform_filter
 
-from ..errors import InputError
-from ..xray.objects import GridInCube
-from ..xray.sampling import bounds, on_grid
-from .compton import scattering
-from .hardening import by_material
-from .spectrum import attenuation
+from lingo_mi.effects.compton import scattering
+from lingo_mi.effects.hardening import by_material
+from lingo_mi.effects.spectrum import attenuation
+from lingo_mi.errors import InputError
+from lingo_mi.projectors.objects import GridInCube
+from lingo_mi.projectors.sampling import bounds, on_grid
 
 BATCHES = 16
-MOST_LANES = 2 ** 22  # paths at a time: a few hundred megabytes
+MOST_LANES = 2**22  # paths at a time: a few hundred megabytes
 LEAST_GRID, MOST_GRID = 4, 256  # a bicubic spline needs four points
-MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2 ** 20, 512, 16, 1000
-_LATTICE = [int(2 ** 32 / 1.2207440846057596 ** k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
+MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2**20, 512, 16, 1000
+_LATTICE = [int(2**32 / 1.2207440846057596**k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,12 @@ class Scatter:
     def of(paths, grid, orders, voxels, energies, seed, box) -> Scatter | None:
         """From plugin parameters, None without paths. Raises InputError."""
         for name, value, least, most in (
-                ('scatter', paths, 0, MOST_PATHS), ('scatter_orders', orders, -1, MOST_ORDERS),
-                ('scatter_voxels', voxels, 1, MOST_VOXELS), ('scatter_energies', energies, 1, MOST_ENERGIES),
-                ('scatter_seed', seed, 0, 2 ** 62)):
+            ('scatter', paths, 0, MOST_PATHS),
+            ('scatter_orders', orders, -1, MOST_ORDERS),
+            ('scatter_voxels', voxels, 1, MOST_VOXELS),
+            ('scatter_energies', energies, 1, MOST_ENERGIES),
+            ('scatter_seed', seed, 0, 2**62),
+        ):
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(f'{name} must be a whole number from {least} to {most}, not {value!r}')
         if orders == 0:
@@ -64,9 +68,13 @@ class Scatter:
         except ValueError:
             numbers = []
         if len(numbers) not in (1, 2) or not all(LEAST_GRID <= x <= MOST_GRID for x in numbers):
-            raise InputError(f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and '
-                             f'columns, not {grid!r}')
-        return Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed, _corners(box)) if paths else None
+            raise InputError(
+                f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and '
+                f'columns, not {grid!r}'
+            )
+        return (
+            Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed, _corners(box)) if paths else None
+        )
 
     def within(self, geometry) -> Scatter:
         """The same, but nothing scatters outside the volume of a `Geometry`."""
@@ -77,13 +85,22 @@ class Scatter:
     def given(self) -> dict:
         """The parameters of `xray_tube` that make it."""
         box = {} if self.box is None else dict(scatter_box=', '.join(repr(x) for corner in self.box for x in corner))
-        return dict(scatter=self.paths, scatter_grid='{}, {}'.format(*self.grid), scatter_orders=self.orders,
-                    scatter_voxels=self.voxels, scatter_energies=self.energies, scatter_seed=self.seed) | box
+        return (
+            dict(
+                scatter=self.paths,
+                scatter_grid='{}, {}'.format(*self.grid),
+                scatter_orders=self.orders,
+                scatter_voxels=self.voxels,
+                scatter_energies=self.energies,
+                scatter_seed=self.seed,
+            )
+            | box
+        )
 
     def light(self, objects, tube, response: str, view, index: int):
         """Scattered signal over the open beam's, Float [height * width], at the pixel centres of a view; not differentiable.
 
-        objects    of `xray.objects.find_objects`
+        objects    of `projectors.objects.find_objects`
         tube       `hardening.Tube`, whose materials the objects are of
         response   'energy' or 'count'
         index      with `seed` the key of the random numbers
@@ -97,8 +114,12 @@ class Scatter:
         """The same on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
             key, made_of = (response, self.voxels, self.energies, self.box), (tube, *objects)
-            if not (_LATEST and key == _LATEST[0] and len(made_of) == len(_LATEST[1])
-                    and all(a is b for a, b in zip(made_of, _LATEST[1]))):
+            if not (
+                _LATEST
+                and key == _LATEST[0]
+                and len(made_of) == len(_LATEST[1])
+                and all(a is b for a, b in zip(made_of, _LATEST[1]))
+            ):
                 _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies, self.box)
             low, high, beam, scenes = _LATEST[2]
             beam.aim(view)
@@ -108,7 +129,7 @@ class Scatter:
             total = np.zeros((*self.grid, BATCHES))
             for weight, scene in scenes:
                 for first in range(0, BATCHES, rays.batches):
-                    total[..., first:first + rays.batches] += weight * rays.means(integrator, scene, rng)
+                    total[..., first : first + rays.batches] += weight * rays.means(integrator, scene, rng)
             return total.mean(-1), total.std(-1, ddof=1) / np.sqrt(BATCHES)
 
 
@@ -135,13 +156,14 @@ def smoothed(means, errors, height: int, width: int) -> np.ndarray:
                     squares (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
     """
     rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
-    spline = RectBivariateSpline(rows, columns, means, s=float((errors ** 2).sum()))
-    return np.maximum(spline(np.arange(height) + .5, np.arange(width) + .5), 0)
+    spline = RectBivariateSpline(rows, columns, means, s=float((errors**2).sum()))
+    return np.maximum(spline(np.arange(height) + 0.5, np.arange(width) + 0.5), 0)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 #  The scene
 # ----------------------------------------------------------------------------------------------------------------------
+
 
 def _scenes(objects, tube, response, voxels, energies, box):
     """The box of the objects, the beam, and (weight, scene) of every energy; none where nothing attenuates."""
@@ -152,15 +174,31 @@ def _scenes(objects, tube, response, voxels, energies, box):
         step = (high - low).max() / voxels
         shape = tuple(np.maximum(1, np.ceil((high - low) / step - 1e-6)).astype(int).tolist())
     step = (high - low) / shape
-    densities = {name: np.maximum(sum(on_grid(thing, low, step, shape) for thing in things), 0)
-                 for name, things in by_material(objects, tube).items()}
+    densities = {
+        name: np.maximum(sum(on_grid(thing, low, step, shape) for thing in things), 0)
+        for name, things in by_material(objects, tube).items()
+    }
     beam = mi.load_dict(dict(type='ct_beam'))
     if not any(d.any() for d in densities.values()):
         return low, high, beam, []
-    return low, high, beam, [
-        (weight, mi.load_dict(dict(type='scene', beam=beam, box=_box(
-            low, high, _medium(densities, tube.reference, energy, response, low, high)))))
-        for weight, energy in _energies(tube.spectrum.energies, tube.spectrum.detected(response), energies)]
+    return (
+        low,
+        high,
+        beam,
+        [
+            (
+                weight,
+                mi.load_dict(
+                    dict(
+                        type='scene',
+                        beam=beam,
+                        box=_box(low, high, _medium(densities, tube.reference, energy, response, low, high)),
+                    )
+                ),
+            )
+            for weight, energy in _energies(tube.spectrum.energies, tube.spectrum.detected(response), energies)
+        ],
+    )
 
 
 def _energies(energies, shares, count):
@@ -173,7 +211,7 @@ def _energies(energies, shares, count):
 
 def _medium(densities, reference, energy, response, low, high):
     """The medium of materials whose densities, float32 [x, y, z], are attenuation at the reference energy."""
-    attenuating, scattered = 0., []
+    attenuating, scattered = 0.0, []
     for name, density in densities.items():
         amount = density / attenuation(name, [reference])[0]
         attenuating = attenuating + amount * attenuation(name, [energy])[0]
@@ -182,11 +220,22 @@ def _medium(densities, reference, energy, response, low, high):
     phase, so_far = _phase(names[0], energy, response), scattered[0]
     for name, more in zip(names[1:], scattered[1:]):
         so_far = so_far + more
-        phase = dict(type='blendphase', weight=_volume(_ratio(more, so_far), low, high), phase_0=phase,
-                     phase_1=_phase(name, energy, response))
-    albedo = _volume(_ratio(so_far, attenuating), low, high) if len(names) > 1 else float(so_far.sum() / attenuating.sum())
-    return dict(type='heterogeneous', sigma_t=_volume(attenuating, low, high), albedo=albedo, phase=phase,
-                has_spectral_extinction=False)
+        phase = dict(
+            type='blendphase',
+            weight=_volume(_ratio(more, so_far), low, high),
+            phase_0=phase,
+            phase_1=_phase(name, energy, response),
+        )
+    albedo = (
+        _volume(_ratio(so_far, attenuating), low, high) if len(names) > 1 else float(so_far.sum() / attenuating.sum())
+    )
+    return dict(
+        type='heterogeneous',
+        sigma_t=_volume(attenuating, low, high),
+        albedo=albedo,
+        phase=phase,
+        has_spectral_extinction=False,
+    )
 
 
 def _phase(name, energy, response):
@@ -215,6 +264,7 @@ def _box(low, high, medium):
 #  The rays
 # ----------------------------------------------------------------------------------------------------------------------
 
+
 class _Rays:
     """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as memory bears."""
 
@@ -240,18 +290,21 @@ class _Rays:
         for h in height[1:]:
             nearest = dr.minimum(nearest, h)
         if dr.any(nearest <= 0):
-            raise InputError('scatter: the box of the objects reaches the panel; move the panel, or give a smaller scatter_box')
+            raise InputError(
+                'scatter: the box of the objects reaches the panel; move the panel, or give a smaller scatter_box'
+            )
         dr.eval(self.shifted, self.origin, self.normal, self.open)
 
     def means(self, integrator, scene, rng) -> np.ndarray:
         """Scattered signal over the open beam's, float64 [rows, columns, batches]."""
         shape = *self.grid, self.batches
         sampler = mi.load_dict(dict(type='independent'))
-        sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2 ** 32))), dr.width(self.shifted))
+        sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2**32))), dr.width(self.shifted))
         j = dr.arange(mi.UInt32, dr.width(self.shifted)) - self.shifted * dr.opaque(mi.UInt32, self.count)
-        shift = [mi.UInt32(s) for s in rng.integers(2 ** 32, size=(3, np.prod(shape)), dtype=np.uint32)]
-        xi = mi.Vector3f(*(mi.Float((j * a + dr.gather(mi.UInt32, s, self.shifted)) >> 8) * 2 ** -24
-                           for a, s in zip(_LATTICE, shift)))
+        shift = [mi.UInt32(s) for s in rng.integers(2**32, size=(3, np.prod(shape)), dtype=np.uint32)]
+        xi = mi.Vector3f(
+            *(mi.Float((j * a + dr.gather(mi.UInt32, s, self.shifted)) >> 8) * 2**-24 for a, s in zip(_LATTICE, shift))
+        )
         direction = dr.normalize(self.low + xi * self.extent - self.origin)
         # A uniform point of the box lies in a direction with the density of the cone's volume: (far^3 - near^3) / 3 of all.
         a, b = (self.low - self.origin) / direction, (self.low + self.extent - self.origin) / direction

@@ -3,6 +3,7 @@
 Both libraries come with `pip install lingo_mi[physics]`. A spectrum takes spekpy seconds, so every one is kept in the
 user's cache folder.
 """
+
 from __future__ import annotations
 
 import importlib
@@ -15,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
+from lingo_mi.errors import InputError
 
-STEP = .5  # keV, width of a spectrum's bins
-LEAST_KVP, MOST_KVP = 20., 300.
+STEP = 0.5  # keV, width of a spectrum's bins
+LEAST_KVP, MOST_KVP = 20.0, 300.0
 
 # Short names of materials in the NIST database of compounds, as xraylib spells it.
 NAMES = {
@@ -47,7 +48,7 @@ class Spectrum:
 
     def detected(self, response: str) -> np.ndarray:
         """Shares [E] of a detector's signal: `energy` integrates the photons' energy, `count` counts them."""
-        signal = self.photons * (self.energies if response == 'energy' else 1.)
+        signal = self.photons * (self.energies if response == 'energy' else 1.0)
         return signal / signal.sum()
 
 
@@ -58,7 +59,7 @@ def monochromatic(energy: float) -> Spectrum:
     return Spectrum(np.array([float(energy)]), np.ones(1))
 
 
-def tube_spectrum(kvp: float, angle: float = 12., filtration: str = 'Al 2.5') -> Spectrum:
+def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -> Spectrum:
     """The spectrum of a tube with a tungsten anode, as spekpy tabulates it (Poludniowski et al., Med. Phys. 48, 2021).
 
     kvp          peak voltage, kV, 20 to 300
@@ -117,10 +118,12 @@ def compound(material: str) -> tuple[str, float]:
             density = xraylib.GetCompoundDataNISTByName(formula)['density']
         else:
             density = xraylib.ElementDensity(xraylib.SymbolToAtomicNumber(formula))
-        xraylib.CS_Total_CP(formula, 60.)
+        xraylib.CS_Total_CP(formula, 60.0)
     except ValueError:
-        raise InputError(f'the material {material!r} is unknown: use {", ".join(NAMES)}, a compound of the NIST '
-                         "database, an element's symbol, or a formula with its density in g/cm3: 'CsI @ 4.51'") from None
+        raise InputError(
+            f'the material {material!r} is unknown: use {", ".join(NAMES)}, a compound of the NIST '
+            "database, an element's symbol, or a formula with its density in g/cm3: 'CsI @ 4.51'"
+        ) from None
     if not (np.isfinite(density) and density > 0):
         raise InputError(f'the material {material!r} must have a positive density, in g/cm3')
     return formula, density

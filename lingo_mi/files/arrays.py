@@ -1,10 +1,11 @@
 """Arrays in .npy and .npz files, never unpickled."""
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from .paths import one_line, reading, replacing
+from lingo_mi.errors import InputError
+from lingo_mi.files.paths import one_line, reading, replacing
 
 
 def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> np.ndarray:
@@ -13,12 +14,13 @@ def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> 
     if array.dtype.kind not in 'buif':
         raise InputError(f'{where}: holds {array.dtype} values; real numbers are needed')
     if ndim not in (None, array.ndim) or array.size == 0:
-        raise InputError(f'{where}: has the shape {array.shape}, but a filled array of '
-                         f'{"" if ndim is None else f"{ndim} "}dimensions is needed')
+        raise InputError(
+            f'{where}: has the shape {array.shape}, but a filled array of '
+            f'{"" if ndim is None else f"{ndim} "}dimensions is needed'
+        )
     if finite and array.dtype.kind == 'f' and not np.isfinite(array).all():
         first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise InputError(f'{where}: holds NaN or infinity (first at {first}); mask or repair those values '
-                         'first')
+        raise InputError(f'{where}: holds NaN or infinity (first at {first}); mask or repair those values first')
     return array
 
 
@@ -44,8 +46,9 @@ def _numpy_load(path, kind):
     except InputError:
         raise
     except Exception as error:  # a damaged header or archive may fail in any way at all
-        raise InputError(f'{path}: is damaged or not a NumPy file ({one_line(error)}); write it again '
-                         'with numpy.save') from None
+        raise InputError(
+            f'{path}: is damaged or not a NumPy file ({one_line(error)}); write it again with numpy.save'
+        ) from None
     if not isinstance(loaded, kind):
         raise InputError(f'{path}: its content does not match its suffix; .npy holds one array, .npz several')
     return loaded

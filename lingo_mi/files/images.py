@@ -1,12 +1,13 @@
 """Single-channel float32 images in OpenEXR files."""
+
 from __future__ import annotations
 
 import numpy as np
 import OpenEXR
 
-from ..errors import InputError
-from .arrays import numeric
-from .paths import one_line, reading, replacing
+from lingo_mi.errors import InputError
+from lingo_mi.files.arrays import numeric
+from lingo_mi.files.paths import one_line, reading, replacing
 
 
 def write_exr(path, image) -> None:
@@ -32,10 +33,8 @@ def read_exr(path) -> np.ndarray:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             pixels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError) as error:
-        raise InputError(f'{path}: is damaged or not an OpenEXR file ({one_line(error)}); '
-                         'write it again') from None
+        raise InputError(f'{path}: is damaged or not an OpenEXR file ({one_line(error)}); write it again') from None
     if 'Y' not in pixels and len(pixels) != 1:
-        raise InputError(f'{path}: has the channels {sorted(pixels)}; a single-channel (luminance) image is '
-                         'needed')
+        raise InputError(f'{path}: has the channels {sorted(pixels)}; a single-channel (luminance) image is needed')
     image = pixels['Y'] if 'Y' in pixels else next(iter(pixels.values()))
     return numeric(np.array(image, np.float32), path, 2)

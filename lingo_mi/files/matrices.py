@@ -3,24 +3,25 @@
 Lengths in mm; a matrix may have any scale and sign. A parallel beam's last row is (0, 0, 0, 1). Hartley and Zisserman,
 "Multiple View Geometry in Computer Vision" (2004), section 6.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from ..frames import Frames
-from ..lingo.camera import camera_matrices
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays
 
 # From continuous pixel positions, centres at (i + 1/2), to indices.
-_TO_INDEX = np.array([[1, 0, -.5], [0, 1, -.5], [0, 0, 1]])
+_TO_INDEX = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 
 
-def to_matrices(frames: Frames) -> np.ndarray:
+def to_matrices(frames: Rays) -> np.ndarray:
     """The views' matrices, float64 [n, 3, 4]; w is 1 on the panel, 0 at the source (everywhere 1 for a parallel beam)."""
     return _TO_INDEX @ camera_matrices(frames)
 
 
-def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0., 0., 0.)) -> Frames:
+def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0.0, 0.0, 0.0)) -> Rays:
     """The views whose rays the matrices [n, 3, 4] describe.
 
     nDetector   (v, u) pixels
@@ -38,7 +39,7 @@ def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0., 0
         raise InputError('a projection matrix holds NaN or infinity')
     P = np.linalg.inv(_TO_INDEX) @ matrices
     rows = _parallel(P, towards) if parallel else _cone(P, towards, dDetector[1])
-    return Frames(*(np.array(column) for column in zip(*rows)), parallel).checked()
+    return Rays(*(np.array(column) for column in zip(*rows)), parallel).checked()
 
 
 def _cone(P, towards, step):
@@ -61,8 +62,9 @@ def _cone(P, towards, step):
 def _parallel(P, towards):
     for view, p in enumerate(P):
         if np.abs(p[2, :3]).max() > 1e-9 * np.abs(p[:2, :3]).max() or p[2, 3] == 0:
-            raise InputError(f'the projection matrix of view {view} is that of no parallel beam: its last row must be '
-                             '0, 0, 0, 1')
+            raise InputError(
+                f'the projection matrix of view {view} is that of no parallel beam: its last row must be 0, 0, 0, 1'
+            )
         p = p / p[2, 3]
         a, b = p[:2, :3]
         beam = np.cross(a, b)
@@ -70,6 +72,6 @@ def _parallel(P, towards):
         if not length > 1e-9 * np.linalg.norm(a) * np.linalg.norm(b):
             raise InputError(f'the projection matrix of view {view} has columns and rows along one direction')
         # The steps are dual to the rows in the plane across the beam.
-        u, v = np.cross(b, beam) / length ** 2, np.cross(beam, a) / length ** 2
+        u, v = np.cross(b, beam) / length**2, np.cross(beam, a) / length**2
         x, y = p[:2] @ np.append(towards, 1)
         yield beam / length, towards - x * u - y * v, u, v

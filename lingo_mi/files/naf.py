@@ -15,6 +15,7 @@ A pickle is a program. Here it may only build dictionaries, lists, tuples, strin
 arrays: each of the few NumPy names it may mention stands for code of this module, so that not even NumPy's
 own functions run.
 """
+
 from __future__ import annotations
 
 import math
@@ -22,11 +23,11 @@ import pickle
 
 import numpy as np
 
-from ..errors import InputError
-from ..scan import Dataset
-from .arrays import numeric
-from .paths import one_line, reading, replacing
-from .tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.errors import InputError
+from lingo_mi.files.arrays import numeric
+from lingo_mi.files.paths import one_line, reading, replacing
+from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.scan import Dataset
 
 
 class _Refused(Exception):
@@ -47,16 +48,24 @@ class _DType:
             raise _Refused(f'the array type {name!r}')
 
     def __setstate__(self, state):
-        if not (isinstance(state, tuple) and len(state) >= 5 and state[1] in ('<', '>', '|', '=')
-                and all(x is None for x in state[2:5])):
+        if not (
+            isinstance(state, tuple)
+            and len(state) >= 5
+            and state[1] in ('<', '>', '|', '=')
+            and all(x is None for x in state[2:5])
+        ):
             raise _Refused('an array type with fields')
         if self.value.itemsize > 1:
             self.value = self.value.newbyteorder(state[1])
 
 
 def _array(shape, dtype, data, order='C') -> np.ndarray:
-    if not (isinstance(dtype, _DType) and isinstance(data, (bytes, bytearray)) and isinstance(shape, tuple)
-            and all(isinstance(n, int) and n >= 0 for n in shape)):
+    if not (
+        isinstance(dtype, _DType)
+        and isinstance(data, (bytes, bytearray))
+        and isinstance(shape, tuple)
+        and all(isinstance(n, int) and n >= 0 for n in shape)
+    ):
         raise _Refused('an array that does not hold plain numbers')
     if math.prod(shape) * dtype.value.itemsize != len(data):
         raise _Refused('an array whose size does not match its shape')
@@ -130,11 +139,7 @@ class _EncodeName(_Name):
         return text.encode('latin1')
 
 
-_NAMES = {
-    ('numpy', 'ndarray'): _NdarrayName(),
-    ('numpy', 'dtype'): _DTypeName(),
-    ('_codecs', 'encode'): _EncodeName(),
-}
+_NAMES = {('numpy', 'ndarray'): _NdarrayName(), ('numpy', 'dtype'): _DTypeName(), ('_codecs', 'encode'): _EncodeName()}
 for _core in ('numpy.core', 'numpy._core'):  # NumPy 1, NumPy 2
     _NAMES[f'{_core}.multiarray', '_reconstruct'] = _ReconstructName()
     _NAMES[f'{_core}.multiarray', 'scalar'] = _ScalarName()
@@ -180,21 +185,23 @@ def load_pickle(path):
         try:
             return _resolve(_Unpickler(stream).load())
         except _Refused as refused:
-            raise InputError(f'{path}: the pickle asks for {one_line(refused)}, which plain scan data does '
-                             'not need; do not trust this file, or export it again as arrays and '
-                             'numbers') from None
+            raise InputError(
+                f'{path}: the pickle asks for {one_line(refused)}, which plain scan data does '
+                'not need; do not trust this file, or export it again as arrays and '
+                'numbers'
+            ) from None
         except OSError:
             raise
         except Exception as error:  # a damaged pickle may fail in any way at all
-            raise InputError(f'{path}: is truncated, damaged or not a pickle ({one_line(error)}); '
-                             'fetch it again') from None
+            raise InputError(
+                f'{path}: is truncated, damaged or not a pickle ({one_line(error)}); fetch it again'
+            ) from None
 
 
 def _split(data, name, where):
     split = data[name]
     if not isinstance(split, dict) or not {'projections', 'angles'} <= split.keys():
-        raise InputError(f"{where}: '{name}' must be a dictionary with 'projections' [n, v, u] and 'angles' "
-                         "[n]")
+        raise InputError(f"{where}: '{name}' must be a dictionary with 'projections' [n, v, u] and 'angles' [n]")
     arrays = []
     for key, ndim in (('projections', 3), ('angles', 1)):
         label = f"{where}: {name}['{key}']"
@@ -208,8 +215,10 @@ def _split(data, name, where):
     projections, angles = arrays
     count = data.get('numTrain' if name == 'train' else 'numVal')
     if len(angles) != len(projections) or count not in (None, len(angles)):
-        raise InputError(f"{where}: '{name}' has {len(projections)} projections and {len(angles)} angles, "
-                         f"and the file announces {'none' if count is None else count}; these must agree")
+        raise InputError(
+            f"{where}: '{name}' has {len(projections)} projections and {len(angles)} angles, "
+            f'and the file announces {"none" if count is None else count}; these must agree'
+        )
     return projections, angles
 
 
@@ -258,9 +267,18 @@ def write(path, dataset: Dataset) -> None:
     start, total = angle_range(dataset.train.geometry.angles)
     data = {
         **from_geometry(dataset.train.geometry, offset_order='uv'),
-        'numTrain': len(dataset.train), 'numVal': 0 if dataset.test is None else len(dataset.test),
-        'accuracy': 0.5, 'filter': None, 'totalAngle': total, 'startAngle': start, 'randomAngle': False,
-        'convert': False, 'rescale_slope': 1.0, 'rescale_intercept': 0.0, 'normalize': True, 'noise': 0,
+        'numTrain': len(dataset.train),
+        'numVal': 0 if dataset.test is None else len(dataset.test),
+        'accuracy': 0.5,
+        'filter': None,
+        'totalAngle': total,
+        'startAngle': start,
+        'randomAngle': False,
+        'convert': False,
+        'rescale_slope': 1.0,
+        'rescale_intercept': 0.0,
+        'normalize': True,
+        'noise': 0,
     }
     for name, scan in (('train', dataset.train), ('val', dataset.test)):
         if scan is not None:

@@ -1,4 +1,5 @@
 """Opening and replacing files: one clear line for whatever the file system refuses, and never half a file."""
+
 from __future__ import annotations
 
 import os
@@ -6,7 +7,7 @@ import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..errors import InputError
+from lingo_mi.errors import InputError
 
 
 def one_line(error: BaseException) -> str:
@@ -24,7 +25,9 @@ def reading(path):
     except OSError as error:
         if error.errno is None:  # not the system's, but a format's
             raise InputError(f'{path}: is damaged ({one_line(error)}); fetch it or write it again') from None
-        raise InputError(f'{error.filename or path}: cannot be read ({error.strerror}); check the path and its permissions') from None
+        raise InputError(
+            f'{error.filename or path}: cannot be read ({error.strerror}); check the path and its permissions'
+        ) from None
 
 
 @contextmanager
@@ -36,8 +39,10 @@ def _temporary(path, remove):
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(f'{path}: cannot be written ({error.strerror or one_line(error)}); '
-                         'check that the folder exists and may be written to') from None
+        raise InputError(
+            f'{path}: cannot be written ({error.strerror or one_line(error)}); '
+            'check that the folder exists and may be written to'
+        ) from None
     finally:
         remove(temporary)
 
@@ -76,6 +81,7 @@ def new_folder(path):
 def optional(module: str):
     """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
     import importlib
+
     try:
         return importlib.import_module(module)
     except ImportError:

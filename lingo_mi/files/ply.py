@@ -12,41 +12,61 @@ pi) s) with s the geometric mean of the scales. `read_ply` ignores them.
 
 Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes exactly the columns of 3DGS.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from .paths import reading, replacing
+from lingo_mi.errors import InputError
+from lingo_mi.files.paths import reading, replacing
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'
 _ROT = 'rot_0', 'rot_1', 'rot_2', 'rot_3'
 _REST = 15  # coefficients of the harmonics of degrees 1 to 3, of each of three colours
 _PROPERTIES = (*_CENTRE, 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'density', *_SCALE, *_ROT)
-_TYPES = {'char': 'i1', 'int8': 'i1', 'uchar': 'u1', 'uint8': 'u1', 'short': '<i2', 'int16': '<i2',
-          'ushort': '<u2', 'uint16': '<u2', 'int': '<i4', 'int32': '<i4', 'uint': '<u4', 'uint32': '<u4',
-          'float': '<f4', 'float32': '<f4', 'double': '<f8', 'float64': '<f8'}
+_TYPES = {
+    'char': 'i1',
+    'int8': 'i1',
+    'uchar': 'u1',
+    'uint8': 'u1',
+    'short': '<i2',
+    'int16': '<i2',
+    'ushort': '<u2',
+    'uint16': '<u2',
+    'int': '<i4',
+    'int32': '<i4',
+    'uint': '<u4',
+    'uint32': '<u4',
+    'float': '<f4',
+    'float32': '<f4',
+    'double': '<f8',
+    'float64': '<f8',
+}
 
 
 def _check(where, centres, scales, quaternions, density, name='density'):
     n = len(density)
     if n == 0:
         raise InputError(f'{where}: the cloud is empty; at least one Gaussian is needed')
-    for what, array, shape in (('centres', centres, (n, 3)), ('scales', scales, (n, 3)),
-                               ('quaternions', quaternions, (n, 4)), (name, density, (n,))):
+    for what, array, shape in (
+        ('centres', centres, (n, 3)),
+        ('scales', scales, (n, 3)),
+        ('quaternions', quaternions, (n, 4)),
+        (name, density, (n,)),
+    ):
         if array.shape != shape:
             raise InputError(f'{where}: {what} must have the shape {shape}, not {array.shape}')
         if not np.isfinite(array).all():
             bad = int(np.argwhere(~np.isfinite(array))[0, 0])
             raise InputError(f'{where}: {what} of Gaussian {bad} is not finite; remove that Gaussian')
     if not (scales > 0).all():
-        raise InputError(f'{where}: the scale of Gaussian {int(np.argwhere(scales <= 0)[0, 0])} is not '
-                         'positive')
+        raise InputError(f'{where}: the scale of Gaussian {int(np.argwhere(scales <= 0)[0, 0])} is not positive')
     norm = np.linalg.norm(quaternions, axis=1)
     if not (norm > 0).all():
-        raise InputError(f'{where}: the quaternion of Gaussian {int(np.argmin(norm))} is zero; it must have '
-                         'a direction')
+        raise InputError(
+            f'{where}: the quaternion of Gaussian {int(np.argmin(norm))} is zero; it must have a direction'
+        )
 
 
 def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
@@ -58,8 +78,7 @@ def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
     not finite, scales that are not positive, zero quaternions, an empty cloud, or a file that cannot be
     written.
     """
-    centres, scales, quaternions, density = (np.asarray(a, float)
-                                             for a in (centres, scales, quaternions, density))
+    centres, scales, quaternions, density = (np.asarray(a, float) for a in (centres, scales, quaternions, density))
     density = density.reshape(-1) if density.shape[1:] == (1,) else density
     if density.ndim != 1:
         raise InputError(f'{path}: density must have one dimension, not the shape {density.shape}')
@@ -70,8 +89,9 @@ def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
     opacity = np.log(np.expm1(np.clip(depth, 1e-4, 10)))
     zeros = np.zeros((len(density), 6))
     more = [] if second is None else [np.asarray(second, float)[:, None]]
-    table = np.concatenate([centres, zeros, opacity[:, None], *more, density[:, None], np.log(scales),
-                            quaternions[:, [3, 0, 1, 2]]], 1)
+    table = np.concatenate(
+        [centres, zeros, opacity[:, None], *more, density[:, None], np.log(scales), quaternions[:, [3, 0, 1, 2]]], 1
+    )
     names = [p for name in _PROPERTIES for p in (['second'] if more and name == 'density' else []) + [name]]
     _write(path, names, table)
 
@@ -88,23 +108,52 @@ def write_radiance_ply(path, centres, scales, quaternions, opacity, radiance, ha
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     opacity = np.clip(opacity, 1e-12, 1 - 1e-12)  # the ends have no logit
     rest = np.zeros((len(opacity), _REST))
-    rest[:, :np.shape(harmonics)[1]] = harmonics
-    names = [*_CENTRE, 'nx', 'ny', 'nz', *(f'f_dc_{i}' for i in range(3)), *(f'f_rest_{i}' for i in range(3 * _REST)),
-             'opacity', *_SCALE, *_ROT]
-    _write(path, names, np.concatenate([
-        centres, np.zeros((len(opacity), 3)), np.repeat(np.reshape(radiance, (-1, 1)), 3, 1), np.tile(rest, 3),
-        (np.log(opacity) - np.log1p(-opacity))[:, None], np.log(scales), quaternions[:, [3, 0, 1, 2]]], 1))
+    rest[:, : np.shape(harmonics)[1]] = harmonics
+    names = [
+        *_CENTRE,
+        'nx',
+        'ny',
+        'nz',
+        *(f'f_dc_{i}' for i in range(3)),
+        *(f'f_rest_{i}' for i in range(3 * _REST)),
+        'opacity',
+        *_SCALE,
+        *_ROT,
+    ]
+    _write(
+        path,
+        names,
+        np.concatenate(
+            [
+                centres,
+                np.zeros((len(opacity), 3)),
+                np.repeat(np.reshape(radiance, (-1, 1)), 3, 1),
+                np.tile(rest, 3),
+                (np.log(opacity) - np.log1p(-opacity))[:, None],
+                np.log(scales),
+                quaternions[:, [3, 0, 1, 2]],
+            ],
+            1,
+        ),
+    )
 
 
 def _write(path, names, table):
-    header = ''.join(['ply\nformat binary_little_endian 1.0\n', f'element vertex {len(table)}\n',
-                      *(f'property float {name}\n' for name in names), 'end_header\n'])
+    header = ''.join(
+        [
+            'ply\nformat binary_little_endian 1.0\n',
+            f'element vertex {len(table)}\n',
+            *(f'property float {name}\n' for name in names),
+            'end_header\n',
+        ]
+    )
     with replacing(path) as temporary, open(temporary, 'wb') as stream:
         stream.write(header.encode('ascii') + np.ascontiguousarray(table, '<f4').tobytes())
 
 
 def _header(stream, where):
     """(number of vertices, dtype of one vertex); leaves the stream at the first vertex."""
+
     def fail(what):
         raise InputError(f'{where}: {what}; a binary little-endian PLY file of Gaussians is needed')
 
@@ -141,8 +190,10 @@ def read_ply(path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             raise InputError(f'{path}: has no property {missing[0]}; write the cloud with lingo_mi')
         body = stream.read()
     if len(body) != n * dtype.itemsize:
-        raise InputError(f'{path}: has {len(body)} bytes of data, but {n} Gaussians need '
-                         f'{n * dtype.itemsize}; it is truncated or damaged, write it again')
+        raise InputError(
+            f'{path}: has {len(body)} bytes of data, but {n} Gaussians need '
+            f'{n * dtype.itemsize}; it is truncated or damaged, write it again'
+        )
     rows = np.frombuffer(body, dtype)
 
     def take(names):

@@ -1,22 +1,23 @@
 """Files of poses, one for every view, whatever their convention: `read_poses` finds the reader.
 
-    .xml            RTK's geometry (`rtk_geometry`): needs dDetector; the panel is centred but for the file's own offsets
-    .npy, .txt, .csv   12 numbers a view, ASTRA's vectors (`astra`): [n, 12]; or projection matrices (`matrices`):
-                    [n, 3, 4], which need dDetector, the pixel size that a matrix leaves open
+.xml            RTK's geometry (`rtk_geometry`): needs dDetector; the panel is centred but for the file's own offsets
+.npy, .txt, .csv   12 numbers a view, ASTRA's vectors (`astra`): [n, 12]; or projection matrices (`matrices`):
+                [n, 3, 4], which need dDetector, the pixel size that a matrix leaves open
 """
+
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
-from ..frames import Frames
-from . import arrays, astra, matrices, rtk_geometry
-from .paths import one_line, reading
+from lingo_mi.errors import InputError
+from lingo_mi.files import arrays, astra, matrices, rtk_geometry
+from lingo_mi.files.paths import one_line, reading
+from lingo_mi.geometry.rays import Rays
 
 
-def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=(0., 0., 0.)) -> Frames:
+def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=(0.0, 0.0, 0.0)) -> Rays:
     """The views of a file of poses, in mm.
 
     nDetector   (v, u) pixels
@@ -35,8 +36,9 @@ def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=
     elif suffix in ('.txt', '.csv'):
         values = _table(path)
     else:
-        raise InputError(f'{path}: is no known file of poses; give RTK\'s .xml, or a .npy, .txt or .csv '
-                         'of 12 numbers a view')
+        raise InputError(
+            f"{path}: is no known file of poses; give RTK's .xml, or a .npy, .txt or .csv of 12 numbers a view"
+        )
     try:
         if values.ndim == 3 and values.shape[1:] == (3, 4):
             return matrices.from_matrices(values, nDetector, _needed(dDetector, path), parallel, towards)

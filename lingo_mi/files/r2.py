@@ -7,6 +7,7 @@ Lengths have any one unit (its synthetic scans have DSD 7, DSO 5, sVoxel 2), and
 integrals; here the numbers are taken as mm. nDetector and sDetector are (v, u), rows along -z; nVoxel, sVoxel
 and offOrigin (x, y, z); angles are radians. offDetector is (u, v) and reaches TIGRE as (v, u).
 """
+
 from __future__ import annotations
 
 import json
@@ -14,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
-from ..scan import Dataset
-from . import arrays
-from .paths import new_folder, one_line, reading
-from .tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.errors import InputError
+from lingo_mi.files import arrays
+from lingo_mi.files.paths import new_folder, one_line, reading
+from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.scan import Dataset
 
 META = 'meta_data.json'
 
@@ -28,19 +29,21 @@ def _views(meta, split, folder, where):
     if not frames:
         return None
     if not isinstance(frames, list):
-        raise InputError(f"{where}: proj_{split} must be a list of views")
+        raise InputError(f'{where}: proj_{split} must be a list of views')
     projections, angles = [], []
     for i, frame in enumerate(frames):
         try:
             file, angle = folder / frame['file_path'], float(frame['angle'])
         except (TypeError, KeyError, ValueError):
-            raise InputError(f"{where}: entry {i} of proj_{split} must have a 'file_path' and an 'angle' in "
-                             "radians") \
-                from None
+            raise InputError(
+                f"{where}: entry {i} of proj_{split} must have a 'file_path' and an 'angle' in radians"
+            ) from None
         image = arrays.load(file, 2)
         if projections and image.shape != projections[0].shape:
-            raise InputError(f'{file}: has the shape {image.shape}, but the first view has '
-                             f'{projections[0].shape}; all views need one panel')
+            raise InputError(
+                f'{file}: has the shape {image.shape}, but the first view has '
+                f'{projections[0].shape}; all views need one panel'
+            )
         projections.append(image)
         angles.append(angle)
     geometry = to_geometry(meta['scanner'], angles, where, offset_order='uv')
@@ -61,8 +64,7 @@ def read(path) -> Dataset:
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f'{where}: is not valid JSON ({one_line(error)}); correct or regenerate '
-                         'it') from None
+        raise InputError(f'{where}: is not valid JSON ({one_line(error)}); correct or regenerate it') from None
     if not isinstance(meta, dict) or not isinstance(meta.get('scanner'), dict):
         raise InputError(f"{where}: has no 'scanner'; add the dictionary of the scan geometry")
     train = _views(meta, 'train', folder, where)
@@ -83,9 +85,16 @@ def write(path, dataset: Dataset) -> None:
     check_one_scanner(dataset, path)
     geometry = dataset.train.geometry
     start, total = angle_range(geometry.angles)
-    scanner = {**from_geometry(geometry, offset_order='uv'), 'sDetector': list(geometry.sDetector),
-               'sVoxel': list(geometry.sVoxel), 'filter': None, 'accuracy': 0.5, 'totalAngle': total,
-               'startAngle': start, 'noise': False}
+    scanner = {
+        **from_geometry(geometry, offset_order='uv'),
+        'sDetector': list(geometry.sDetector),
+        'sVoxel': list(geometry.sVoxel),
+        'filter': None,
+        'accuracy': 0.5,
+        'totalAngle': total,
+        'startAngle': start,
+        'noise': False,
+    }
     centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
     meta = {'scanner': scanner, 'bbox': [(centre - half).tolist(), (centre + half).tolist()]}
     with new_folder(path) as folder:

@@ -14,6 +14,7 @@ package's down: the rows of RTK's stacks must be reversed, `stack[:, ::-1]`, to 
 
 Rit et al., "The Reconstruction Toolkit (RTK)", J. Phys.: Conf. Ser. 489 (2014), and RTK's documentation, "Geometry".
 """
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -22,19 +23,28 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
-from ..frames import Frames, rotation
-from ..lingo.camera import camera_matrices
-from .paths import one_line, reading, replacing
+from lingo_mi.errors import InputError
+from lingo_mi.files.paths import one_line, reading, replacing
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays, rotation
 
 ROOT = 'RTKThreeDCircularGeometry'
-_NUMBERS = ('SourceToIsocenterDistance', 'SourceToDetectorDistance', 'GantryAngle', 'OutOfPlaneAngle', 'InPlaneAngle',
-            'ProjectionOffsetX', 'ProjectionOffsetY', 'SourceOffsetX', 'SourceOffsetY')
+_NUMBERS = (
+    'SourceToIsocenterDistance',
+    'SourceToDetectorDistance',
+    'GantryAngle',
+    'OutOfPlaneAngle',
+    'InPlaneAngle',
+    'ProjectionOffsetX',
+    'ProjectionOffsetY',
+    'SourceOffsetX',
+    'SourceOffsetY',
+)
 _IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', 'CollimationVSup')
 _AXES = [2, 0, 1]  # our x, y, z in RTK's
 
 
-def read(path, nDetector, dDetector) -> Frames:
+def read(path, nDetector, dDetector) -> Rays:
     """The views of a file, in mm, rows down. nDetector, dDetector: (v, u), pixels and mm.
 
     Raises InputError where the file is missing, damaged or another one, for cylindrical detectors, and for elements that
@@ -46,20 +56,21 @@ def read(path, nDetector, dDetector) -> Frames:
     sid, sdd, gantry, out, turn, px, py, sx, sy = np.array(views).T
     parallel = not sdd.any()
     if not parallel and not (sdd > 0).all():
-        raise InputError(f'{path}: mixes parallel and cone beams (SourceToDetectorDistance of 0 and not), or has a negative '
-                         'distance')
+        raise InputError(
+            f'{path}: mixes parallel and cone beams (SourceToDetectorDistance of 0 and not), or has a negative distance'
+        )
     axes = rotation('y', np.radians(gantry)) @ rotation('x', np.radians(out)) @ rotation('z', np.radians(turn))
     e1, e2, e3 = (axes[:, _AXES, i] for i in range(3))
     (nv, nu), (dv, du) = nDetector, dDetector
     x, y, z = (a[:, None] for a in (px - nu / 2 * du, py + nv / 2 * dv, sid - sdd if not parallel else 0 * sid))
     source = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
     try:
-        return Frames(source, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
+        return Rays(source, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
 
 
-def write(path, frames: Frames, nDetector) -> None:
+def write(path, frames: Rays, nDetector) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
 
     Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between
@@ -77,7 +88,7 @@ def write(path, frames: Frames, nDetector) -> None:
     if frames.parallel:
         if np.abs(np.cross(frames.source, e3)).max() > 1e-6:
             raise InputError(f'{path}: RTK has no panels askew to a parallel beam')
-        sid, sdd, sx, sy = np.full(len(frames), 1000.), zero, zero, zero
+        sid, sdd, sx, sy = np.full(len(frames), 1000.0), zero, zero, zero
     else:
         sx, sy, sid = (np.sum(frames.source * e, 1) for e in (e1, e2, e3))
         sdd = sid - np.sum(centre * e3, 1)
@@ -92,8 +103,9 @@ def write(path, frames: Frames, nDetector) -> None:
         node = ElementTree.SubElement(root, 'Projection')
         for name, values in columns.items():
             ElementTree.SubElement(node, name).text = repr(float(values[view]))
-        ElementTree.SubElement(node, 'Matrix').text = '\n' + '\n'.join(' '.join(repr(float(x)) for x in row)
-                                                                       for row in matrix) + '\n'
+        ElementTree.SubElement(node, 'Matrix').text = (
+            '\n' + '\n'.join(' '.join(repr(float(x)) for x in row) for row in matrix) + '\n'
+        )
     ElementTree.indent(root)
     text = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
     with replacing(path) as temporary:
@@ -111,7 +123,7 @@ def _views(path):
         raise InputError(f'{path}: is no XML ({one_line(error)})') from None
     if root.tag != ROOT or root.get('version') not in ('2', '3'):
         raise InputError(f'{path}: is no {ROOT} of version 2 or 3')
-    shared = dict.fromkeys(_NUMBERS, 0.)
+    shared = dict.fromkeys(_NUMBERS, 0.0)
     for node in root:
         if node.tag != 'Projection':
             shared.update(_number(node, path))

@@ -17,7 +17,7 @@ degrees:
                                    +z
     rotDetector, COR, tilt, pitch, z   optional: a panel turned by (roll, pitch, yaw), an axis off centre, a source
                            lifted out of the plane of rotation, a helix by mm a turn (at z = 0 for the angle 0) or by
-                           the height of every view (`lingo_mi.frames.scanner_frames` defines them; angles in degrees)
+                           the height of every view (`lingo_mi.geometry.rays.scanner_rays` defines them; angles in degrees)
     poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
@@ -36,6 +36,7 @@ A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_pos
 The Helsinki Tomography Challenge 2022 as .npz: `sinogram_<name>` [angles, pixels] of a fan beam, which is a
 cone beam with one row.
 """
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -43,23 +44,53 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from ..errors import InputError
-from ..geometry import circular
-from ..scan import Dataset, Scan
-from . import arrays, astra, naf, r2
-from .images import read_exr, write_exr
-from .paths import new_folder, one_line, reading, replacing
-from .poses import read_poses
-from .tigre import MOTION, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry, to_posed
-from .volumes import first_voxel, read_volume, write_volume
+from lingo_mi.errors import InputError
+from lingo_mi.files import arrays, astra, naf, r2
+from lingo_mi.files.images import read_exr, write_exr
+from lingo_mi.files.paths import new_folder, one_line, reading, replacing
+from lingo_mi.files.poses import read_poses
+from lingo_mi.files.tigre import (
+    MOTION,
+    check_one_scanner,
+    from_geometry,
+    make_dataset,
+    make_scan,
+    to_geometry,
+    to_posed,
+)
+from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
+from lingo_mi.geometry.base import circular
+from lingo_mi.scan import Dataset, Scan
 
-_KEYS = {'DSO', 'DSD', 'nDetector', 'dDetector', 'sDetector', 'nVoxel', 'dVoxel', 'sVoxel', 'mode',
-         'offOrigin',
-         'offDetector', 'angles', 'totalAngle', 'startAngle', 'input', 'I0', 'test_angles', 'accuracy',
-         'filter', 'poses', 'test_poses', 'valid', *MOTION}
+_KEYS = {
+    'DSO',
+    'DSD',
+    'nDetector',
+    'dDetector',
+    'sDetector',
+    'nVoxel',
+    'dVoxel',
+    'sVoxel',
+    'mode',
+    'offOrigin',
+    'offDetector',
+    'angles',
+    'totalAngle',
+    'startAngle',
+    'input',
+    'I0',
+    'test_angles',
+    'accuracy',
+    'filter',
+    'poses',
+    'test_poses',
+    'valid',
+    *MOTION,
+}
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
+
 
 def _load_yaml(path) -> dict:
     try:
@@ -73,8 +104,10 @@ def _load_yaml(path) -> dict:
         raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
     unknown = sorted(str(key) for key in values.keys() - _KEYS)
     if unknown:
-        raise InputError(f'{path}: {one_line(unknown[0])} is not a name of the scan geometry or not '
-                         f'supported; the names are {", ".join(sorted(_KEYS))}')
+        raise InputError(
+            f'{path}: {one_line(unknown[0])} is not a name of the scan geometry or not '
+            f'supported; the names are {", ".join(sorted(_KEYS))}'
+        )
     return values
 
 
@@ -100,21 +133,23 @@ def _geometry(values, n, where, test=False):
         if len(found) != n:
             raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
         return found
+
     return to_posed(values, frames, where)
 
 
 def _angles(values, key, n, where):
     """n angles in radians, or [n, 3] Euler angles."""
     if values.get(key) is None:
-        return circular(n, _number(values, 'totalAngle', 360., where),
-                        _number(values, 'startAngle', 0., where))
+        return circular(n, _number(values, 'totalAngle', 360.0, where), _number(values, 'startAngle', 0.0, where))
     try:
         angles = np.radians(np.asarray(values[key], float))
     except (TypeError, ValueError):
         raise InputError(f'{where}: {key} must be a list of numbers, in degrees') from None
     if angles.shape not in ((n,), (n, 3)):
-        raise InputError(f'{where}: {key} lists {len(angles) if angles.ndim else 1} angles, but there are {n} '
-                         'projections; these must agree')
+        raise InputError(
+            f'{where}: {key} lists {len(angles) if angles.ndim else 1} angles, but there are {n} '
+            'projections; these must agree'
+        )
     return angles
 
 
@@ -128,15 +163,16 @@ def _valid(values, shape, where):
     path = Path(where).parent / name
     mask = arrays.load(path, None)
     if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
-        raise InputError(f'{path}: must be bool of the shape {shape} or {shape[1:]}, not {mask.dtype} of the shape '
-                         f'{mask.shape}')
+        raise InputError(
+            f'{path}: must be bool of the shape {shape} or {shape[1:]}, not {mask.dtype} of the shape {mask.shape}'
+        )
     return np.broadcast_to(mask, shape)
 
 
 def _line_integrals(projections, values, where, projections_path):
     kind = values.get('input', 'line_integral')
     if kind not in ('line_integral', 'intensity'):
-        raise InputError(f"{where}: input must be line_integral or intensity, not {kind!r}")
+        raise InputError(f'{where}: input must be line_integral or intensity, not {kind!r}')
     if kind == 'line_integral':
         return projections
     if values.get('I0') is None:
@@ -146,8 +182,10 @@ def _line_integrals(projections, values, where, projections_path):
         raise InputError(f'{where}: I0 must be positive, not {i0:g}')
     if not projections.min() > 0:
         bad = tuple(int(i) for i in np.argwhere(projections <= 0)[0])
-        raise InputError(f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
-                         'so it has no logarithm; mask or repair dead pixels first')
+        raise InputError(
+            f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
+            'so it has no logarithm; mask or repair dead pixels first'
+        )
     return np.log(i0 / projections.astype(float))
 
 
@@ -155,9 +193,9 @@ def _dump_yaml(path, geometry, test=None, **more):
     if any(g is not None and g.poses is not None for g in (geometry, test)):
         values = {'mode': geometry.mode}
         values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
-        values['poses'] = astra.to_vectors(geometry.frames(), geometry.nDetector).tolist()
+        values['poses'] = astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
         if test is not None:
-            values['test_poses'] = astra.to_vectors(test.frames(), test.nDetector).tolist()
+            values['test_poses'] = astra.to_vectors(test.rays(), test.nDetector).tolist()
     else:
         values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
         if test is not None:
@@ -171,8 +209,7 @@ def _read_npy(path, geometry):
         beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
         geometry = next((p for p in beside if p.exists()), None)
         if geometry is None:
-            raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name '
-                             'the file')
+            raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
     values = _load_yaml(geometry)
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
@@ -187,11 +224,14 @@ def _read_npy(path, geometry):
 def _write_npy(path, dataset):
     path = Path(path)
     if path.suffix != '.npy':
-        raise InputError(f'{path}: projections are written as .npy with a .yml beside it; give a name that '
-                         'ends in .npy')
+        raise InputError(
+            f'{path}: projections are written as .npy with a .yml beside it; give a name that ends in .npy'
+        )
     if dataset.test is not None or dataset.volume is not None:
-        raise InputError(f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
-                         'instead, or drop the test views and the volume')
+        raise InputError(
+            f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
+            'instead, or drop the test views and the volume'
+        )
     more = {'input': 'line_integral'}
     if dataset.train.valid is not None:
         more['valid'] = path.stem + '.valid.npy'
@@ -204,6 +244,7 @@ def _write_npy(path, dataset):
 
 # ---- EXR folders -------------------------------------------------------------------------------------------
 
+
 def _read_stack(folder):
     files = sorted(folder.glob('*.exr'))
     if not files:
@@ -211,8 +252,10 @@ def _read_stack(folder):
     images = [read_exr(file) for file in files]
     for file, image in zip(files, images):
         if image.shape != images[0].shape:
-            raise InputError(f'{file}: has the shape {image.shape}, but the first view has '
-                             f'{images[0].shape}; all views need one panel')
+            raise InputError(
+                f'{file}: has the shape {image.shape}, but the first view has '
+                f'{images[0].shape}; all views need one panel'
+            )
     return np.stack(images)
 
 
@@ -227,14 +270,16 @@ def _read_exr_folder(folder):
         if split == 'test' and not (folder / split).is_dir() and not given:
             continue
         if split == 'test' and not given:
-            raise InputError(f'{where}: test_angles is missing, but there is a folder of test views; add it, '
-                             'in degrees')
+            raise InputError(
+                f'{where}: test_angles is missing, but there is a folder of test views; add it, in degrees'
+            )
         projections = _read_stack(folder / split)
         geometry = _geometry(values, len(projections), where, split == 'test')
         scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
     volume = folder / 'volume.nii.gz'
-    return make_dataset(scans['train'], scans.get('test'),
-                        read_volume(volume).data if volume.exists() else None, volume)
+    return make_dataset(
+        scans['train'], scans.get('test'), read_volume(volume).data if volume.exists() else None, volume
+    )
 
 
 def _write_exr_folder(path, dataset):
@@ -253,20 +298,24 @@ def _write_exr_folder(path, dataset):
 
 # ---- Helsinki Tomography Challenge 2022 --------------------------------------------------------------------
 
+
 def _read_htc(path, name):
     data = arrays.load_many(path)
-    names = sorted(key[len('sinogram_'):] for key in data if key.startswith('sinogram_'))
+    names = sorted(key[len('sinogram_') :] for key in data if key.startswith('sinogram_'))
     if not names or not {'DSO', 'DSD', 'dDetector', 'angles_deg'} <= data.keys():
-        raise InputError(f'{path}: is no scan of the Helsinki Tomography Challenge (sinogram_<name>, DSO, '
-                         'DSD, dDetector, '
-                         'angles_deg), the only .npz scan that can be read; give .npy with a .yml beside it')
+        raise InputError(
+            f'{path}: is no scan of the Helsinki Tomography Challenge (sinogram_<name>, DSO, '
+            'DSD, dDetector, '
+            'angles_deg), the only .npz scan that can be read; give .npy with a .yml beside it'
+        )
     if name not in names:
         raise InputError(f'{path}: has no sinogram {name!r}; it has {", ".join(names)}')
     sinogram = arrays.numeric(data[f'sinogram_{name}'], f'{path}: sinogram_{name}', 2)
     degrees = arrays.numeric(data['angles_deg'], f'{path}: angles_deg', 1)
     if len(degrees) != len(sinogram):
-        raise InputError(f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these '
-                         'must agree')
+        raise InputError(
+            f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these must agree'
+        )
     if len(degrees) > 1 and np.isclose(degrees[-1] - degrees[0], 360):
         degrees, sinogram = degrees[:-1], sinogram[:-1]
     pixel = data['dDetector']
@@ -274,12 +323,22 @@ def _read_htc(path, name):
     # degrees. The row is as high as a pixel is wide; the slice is one voxel of the challenge's reference
     # reconstructions.
     geometry = to_geometry(
-        {'DSO': data['DSO'], 'DSD': data['DSD'], 'nDetector': (1, sinogram.shape[1]), 'dDetector': pixel,
-         'nVoxel': (512, 512, 1), 'dVoxel': 0.1483}, np.radians(degrees - 90), path)
+        {
+            'DSO': data['DSO'],
+            'DSD': data['DSD'],
+            'nDetector': (1, sinogram.shape[1]),
+            'dDetector': pixel,
+            'nVoxel': (512, 512, 1),
+            'dVoxel': 0.1483,
+        },
+        np.radians(degrees - 90),
+        path,
+    )
     return Dataset(make_scan(geometry, sinogram[:, None, :], path))
 
 
 # ---- any format --------------------------------------------------------------------------------------------
+
 
 def read_scan(path, geometry=None, name: str = 'ta') -> Dataset:
     """Reads a scan; the format follows from the path.
@@ -303,8 +362,9 @@ def read_scan(path, geometry=None, name: str = 'ta') -> Dataset:
             return r2.read(path)
         if (path / 'geometry.yml').exists():
             return _read_exr_folder(path)
-        raise InputError(f'{path}: has neither {r2.META} (R2-Gaussian) nor geometry.yml (EXR views); give a '
-                         'folder of a scan')
+        raise InputError(
+            f'{path}: has neither {r2.META} (R2-Gaussian) nor geometry.yml (EXR views); give a folder of a scan'
+        )
     with reading(path):
         open(path, 'rb').close()
     if suffix in ('.pickle', '.pkl'):

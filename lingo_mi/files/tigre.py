@@ -1,12 +1,13 @@
 """Scan geometry as a dictionary under TIGRE's names: the common ground of the pickle, the R2 folder and the
 YAML file."""
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import Geometry, helix
-from ..scan import Dataset, Scan
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry, helix
+from lingo_mi.scan import Dataset, Scan
 
 # Names that move the scanner off its circle.
 MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
@@ -48,12 +49,11 @@ def _steps(values, kind, counts, where):
         return from_side
     d = _numbers(values, 'd' + kind, where, len(counts))
     if side and not np.allclose(d, from_side, rtol=1e-3, atol=0):
-        raise InputError(f'{where}: d{kind} and s{kind} disagree (s{kind} = n{kind} * d{kind}); remove one '
-                         'of them')
+        raise InputError(f'{where}: d{kind} and s{kind} disagree (s{kind} = n{kind} * d{kind}); remove one of them')
     return d
 
 
-def _per_view(values, name, where, n, length, default=0.):
+def _per_view(values, name, where, n, length, default=0.0):
     """A value given once or for every view: float64 [length] or [n, length] (a length of 1: one number or [n])."""
     if values.get(name) is None:
         return np.full(length, default) if length > 1 else np.float64(default)
@@ -65,16 +65,20 @@ def _per_view(values, name, where, n, length, default=0.):
     if array.shape == shape and np.isfinite(array).all():
         return array
     if array.size not in (1, length) or array.ndim > 1 or not np.isfinite(array).all():
-        raise InputError(f'{where}: {name} must be {length} number{"s" * (length > 1)}, or that for each of {n} views, not '
-                         f'{str(values[name])[:80]}')
+        raise InputError(
+            f'{where}: {name} must be {length} number{"s" * (length > 1)}, or that for each of {n} views, not '
+            f'{str(values[name])[:80]}'
+        )
     return np.broadcast_to(array.ravel(), length) if length > 1 else np.float64(array.ravel()[0])
 
 
 def moves(values: dict, n: int) -> bool:
     """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
     lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
-    several = any(np.ndim(values.get(k)) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
-                  for k, length in lengths.items())
+    several = any(
+        np.ndim(values.get(k)) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
+        for k, length in lengths.items()
+    )
     return several or any(values.get(k) is not None for k in MOTION)
 
 
@@ -84,6 +88,7 @@ def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mod
 
     def each(name, length=1):
         return _per_view(values, name, where, n, length)
+
     if values.get('pitch') is not None and values.get('z') is not None:
         raise InputError(f'{where}: pitch and z both say the height of the views; remove one of them')
     height = each('z')
@@ -92,9 +97,21 @@ def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mod
             raise InputError(f'{where}: pitch needs one angle a view, not three; give z instead')
         height = helix(angles, float(_numbers(values, 'pitch', where, 1)[0]))
     return Geometry.per_view(
-        DSO=each('DSO'), DSD=each('DSD'), nDetector=n_detector, dDetector=d_detector, nVoxel=n_voxel, dVoxel=d_voxel,
-        angles=angles, mode=mode, offOrigin=each('offOrigin', 3), offDetector=each('offDetector', 2),
-        rotDetector=np.radians(each('rotDetector', 3)), COR=each('COR'), tilt=np.radians(each('tilt')), height=height)
+        DSO=each('DSO'),
+        DSD=each('DSD'),
+        nDetector=n_detector,
+        dDetector=d_detector,
+        nVoxel=n_voxel,
+        dVoxel=d_voxel,
+        angles=angles,
+        mode=mode,
+        offOrigin=each('offOrigin', 3),
+        offDetector=each('offDetector', 2),
+        rotDetector=np.radians(each('rotDetector', 3)),
+        COR=each('COR'),
+        tilt=np.radians(each('tilt')),
+        height=height,
+    )
 
 
 def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_order: str = 'vu') -> Geometry:
@@ -118,9 +135,11 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
     d_detector = _steps(values, 'Detector', n_detector, where)
     if detector_shape is not None and tuple(n_detector) != tuple(detector_shape):
         if tuple(n_detector[::-1]) != tuple(detector_shape):
-            raise InputError(f'{where}: nDetector = {[int(n) for n in n_detector]} does not match the '
-                             f'projections, which have {detector_shape[0]} rows and {detector_shape[1]} '
-                             'columns; correct nDetector')
+            raise InputError(
+                f'{where}: nDetector = {[int(n) for n in n_detector]} does not match the '
+                f'projections, which have {detector_shape[0]} rows and {detector_shape[1]} '
+                'columns; correct nDetector'
+            )
         n_detector, d_detector = n_detector[::-1], d_detector[::-1]
     n_voxel = _counts(values, 'nVoxel', where, 3)
     mode = values.get('mode') or 'cone'
@@ -128,21 +147,30 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
         if values.get(name) is None:
             if mode != 'parallel':
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
-            values[name] = 0.  # places the panel on the axis, where a parallel beam does not care
+            values[name] = 0.0  # places the panel on the axis, where a parallel beam does not care
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
     try:
         if offset_order == 'vu' and (np.ndim(angles) == 2 or moves(values, len(angles))):
             return _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mode)
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
-    origin, offset = (np.zeros(length) if values.get(name) is None else _numbers(values, name, where, length)
-                      for name, length in (('offOrigin', 3), ('offDetector', 2)))
+    origin, offset = (
+        np.zeros(length) if values.get(name) is None else _numbers(values, name, where, length)
+        for name, length in (('offOrigin', 3), ('offDetector', 2))
+    )
     try:
         return Geometry(
-            DSO=float(_numbers(values, 'DSO', where, 1)[0]), DSD=float(_numbers(values, 'DSD', where, 1)[0]),
-            nDetector=n_detector, dDetector=d_detector,
-            nVoxel=n_voxel, dVoxel=d_voxel, angles=angles, mode=mode,
-            offOrigin=origin, offDetector=offset[::-1] if offset_order == 'uv' else offset)
+            DSO=float(_numbers(values, 'DSO', where, 1)[0]),
+            DSD=float(_numbers(values, 'DSD', where, 1)[0]),
+            nDetector=n_detector,
+            dDetector=d_detector,
+            nVoxel=n_voxel,
+            dVoxel=d_voxel,
+            angles=angles,
+            mode=mode,
+            offOrigin=origin,
+            offDetector=offset[::-1] if offset_order == 'uv' else offset,
+        )
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
@@ -154,8 +182,11 @@ def to_posed(values: dict, frames, where) -> Geometry:
 
     Raises InputError where a value is missing or out of range, or one is given that the poses say already.
     """
-    known = [k for k in ('DSO', 'DSD', 'offDetector', 'angles', 'totalAngle', 'startAngle', *MOTION)
-             if values.get(k) is not None]
+    known = [
+        k
+        for k in ('DSO', 'DSD', 'offDetector', 'angles', 'totalAngle', 'startAngle', *MOTION)
+        if values.get(k) is not None
+    ]
     if known:
         raise InputError(f'{where}: {known[0]} and poses both say where source and panel are; remove one of them')
     n_detector, n_voxel = _counts(values, 'nDetector', where, 2), _counts(values, 'nVoxel', where, 3)
@@ -168,7 +199,9 @@ def to_posed(values: dict, frames, where) -> Geometry:
     try:
         if mode not in ('cone', 'parallel'):
             raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
-        return Geometry.posed(frames(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin)
+        return Geometry.posed(
+            frames(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin
+        )
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
@@ -177,10 +210,15 @@ def from_geometry(geometry: Geometry, offset_order: str = 'vu') -> dict:
     """The inverse of `to_geometry` for a circular scan, without the angles: plain floats, ints and lists, mm."""
     offset = geometry.offDetector[::-1] if offset_order == 'uv' else geometry.offDetector
     return {
-        'mode': geometry.mode, 'DSD': geometry.DSD, 'DSO': geometry.DSO,
-        'nDetector': list(geometry.nDetector), 'dDetector': list(geometry.dDetector),
-        'nVoxel': list(geometry.nVoxel), 'dVoxel': list(geometry.dVoxel),
-        'offOrigin': list(geometry.offOrigin), 'offDetector': list(offset),
+        'mode': geometry.mode,
+        'DSD': geometry.DSD,
+        'DSO': geometry.DSO,
+        'nDetector': list(geometry.nDetector),
+        'dDetector': list(geometry.dDetector),
+        'nVoxel': list(geometry.nVoxel),
+        'dVoxel': list(geometry.dVoxel),
+        'offOrigin': list(geometry.offOrigin),
+        'offDetector': list(offset),
     }
 
 
@@ -188,7 +226,7 @@ def angle_range(angles: np.ndarray) -> tuple[float, float]:
     """(startAngle, totalAngle) in degrees, as if `angles` (radians) were evenly spaced; formats that list the
     angles carry these two for information only."""
     low, high, n = np.degrees(angles.min()), np.degrees(angles.max()), len(angles)
-    return float(low), float((high - low) * n / (n - 1)) if n > 1 else 360.
+    return float(low), float((high - low) * n / (n - 1)) if n > 1 else 360.0
 
 
 def make_scan(geometry: Geometry, projections, where, valid=None) -> Scan:
@@ -203,8 +241,10 @@ def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
     """A Dataset with a float32 volume, after a check that the volume [x, y, z] has nVoxel voxels."""
     if volume is not None:
         if volume.shape != train.geometry.nVoxel:
-            raise InputError(f'{where}: the volume has the shape {volume.shape}, but nVoxel is '
-                             f'{train.geometry.nVoxel}; volumes are stored [x, y, z]')
+            raise InputError(
+                f'{where}: the volume has the shape {volume.shape}, but nVoxel is '
+                f'{train.geometry.nVoxel}; volumes are stored [x, y, z]'
+            )
         volume = np.asarray(volume, np.float32)
     return Dataset(train, test, volume)
 
@@ -216,11 +256,15 @@ def check_one_scanner(dataset: Dataset, where, poses: bool = False) -> None:
     names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
     if any(g.poses is not None for g in geometries):
         if not poses:
-            raise InputError(f"{where}: this format holds circular scans only, and this one has other poses; write it as "
-                             "'npy' or 'exr'")
+            raise InputError(
+                f'{where}: this format holds circular scans only, and this one has other poses; write it as '
+                "'npy' or 'exr'"
+            )
         known = [{name: getattr(g, name) for name in names} for g in geometries]
     else:
         known = [from_geometry(g) for g in geometries]
     if known[0] != known[-1]:
-        raise InputError(f'{where}: this format holds one scanner, but the training and test views have '
-                         'different geometries; write them as two files')
+        raise InputError(
+            f'{where}: this format holds one scanner, but the training and test views have '
+            'different geometries; write them as two files'
+        )

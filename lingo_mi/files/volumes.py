@@ -13,6 +13,7 @@ Values become density by these rules, the first that applies:
    fractions down to -10 % of the maximum are the noise of a reconstruction and become 0; other negative
    values are refused as ambiguous, unless `hu=False` says that they are to become 0 too.
 """
+
 from __future__ import annotations
 
 import gzip
@@ -23,15 +24,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import Geometry
-from . import arrays
-from .arrays import numeric
-from .paths import one_line, optional, reading, replacing
+from lingo_mi.errors import InputError
+from lingo_mi.files import arrays
+from lingo_mi.files.arrays import numeric
+from lingo_mi.files.paths import one_line, optional, reading, replacing
+from lingo_mi.geometry.base import Geometry
 
 _OURS = 'lingo_mi: '
-_TO_MM = {'meter': 1000., 'mm': 1., 'micron': 1e-3, 'unknown': 1.}
-_LPS_TO_RAS = np.diag([-1., -1., 1., 1.])
+_TO_MM = {'meter': 1000.0, 'mm': 1.0, 'micron': 1e-3, 'unknown': 1.0}
+_LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Raw files known by their content: SHA-1 of the git blob -> shape [x, y, z], type. The first is the
 # rotational C-arm scan `foot` of the volvis.org collection.
 _KNOWN_RAW = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uint8')}
@@ -57,7 +58,7 @@ class Volume:
 def centred_affine(shape, spacing) -> np.ndarray:
     """The affine [4, 4] of a volume of `shape` voxels of `spacing` mm whose middle is the world's origin."""
     spacing = np.asarray(spacing, float)
-    affine = np.diag([*spacing, 1.])
+    affine = np.diag([*spacing, 1.0])
     affine[:3, 3] = spacing / 2 - np.asarray(shape) * spacing / 2
     return affine
 
@@ -69,6 +70,7 @@ def first_voxel(geometry: Geometry) -> np.ndarray:
 
 # ---- values ------------------------------------------------------------------------------------------------
 
+
 def _density(data, path, hu, mu_water):
     """(float32 density, unit) by rules 2 and 3 of the module."""
     low, high = float(data.min()), float(data.max())
@@ -77,9 +79,11 @@ def _density(data, path, hu, mu_water):
         # Whole numbers are looked for in the values: a header's slope makes floats of integers.
         if not hu and low < 0 and (low < -0.1 * high or not (data != np.round(data)).any()):
             if mu_water is None:
-                raise InputError(f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
-                                 'or not; if they are, give --mu-water (in scenes and Python mu_water), else set '
-                                 'them to 0; in Python, hu=True or hu=False says which')
+                raise InputError(
+                    f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
+                    'or not; if they are, give --mu-water (in scenes and Python mu_water), else set '
+                    'them to 0; in Python, hu=True or hu=False says which'
+                )
             hu = True
     if hu:
         data = data.astype(np.float32)
@@ -87,8 +91,10 @@ def _density(data, path, hu, mu_water):
             return np.maximum((data + 1000) * np.float32(mu_water / 1000), 0), '1/mm'
         return (np.clip(data, -1000, 2000) + 1000) / 3000, 'normalised'
     if mu_water is not None:
-        raise InputError(f'{path}: --mu-water (mu_water) was given, but the values ({low:g} to {high:g}) do not '
-                         'look like Hounsfield units; leave it out, or in Python say hu=True')
+        raise InputError(
+            f'{path}: --mu-water (mu_water) was given, but the values ({low:g} to {high:g}) do not '
+            'look like Hounsfield units; leave it out, or in Python say hu=True'
+        )
     if not high > 0:
         raise InputError(f'{path}: the volume is empty: no value is above 0')
     keep = data.dtype.kind == 'f' and high <= 1
@@ -98,9 +104,11 @@ def _density(data, path, hu, mu_water):
 
 # ---- formats: each returns (numeric array [x, y, z], affine or None) ---------------------------------------
 
+
 def _nifti(path):
     import nibabel
-    description, to_mm = '', 1.
+
+    description, to_mm = '', 1.0
     try:
         with reading(path):
             image = nibabel.load(path)
@@ -109,15 +117,14 @@ def _nifti(path):
                 _check_sum(path)
             if isinstance(image, nibabel.Nifti1Image):
                 description = bytes(image.header['descrip'].item()).decode('utf-8', 'replace')
-                to_mm = _TO_MM.get(image.header.get_xyzt_units()[0], 1.)
+                to_mm = _TO_MM.get(image.header.get_xyzt_units()[0], 1.0)
     except InputError:
         raise
     except Exception as error:  # a damaged header fails inside nibabel in many ways
-        raise InputError(f'{path}: is damaged or not a NIfTI file ({one_line(error)}); '
-                         'fetch it again') from None
+        raise InputError(f'{path}: is damaged or not a NIfTI file ({one_line(error)}); fetch it again') from None
     while data.ndim > 3 and data.shape[-1] == 1:
         data = data[..., 0]
-    return data, np.diag([to_mm, to_mm, to_mm, 1.]) @ image.affine, description
+    return data, np.diag([to_mm, to_mm, to_mm, 1.0]) @ image.affine, description
 
 
 def _check_sum(path):
@@ -134,12 +141,16 @@ def _itk(path):
     try:
         image = sitk.ReadImage(str(path))
     except RuntimeError as error:
-        raise InputError(f'{path}: cannot be read by SimpleITK ({one_line(error).split("ERROR: ")[-1]}); '
-                         'check the header, and for .mhd the raw file that it names') from None
+        raise InputError(
+            f'{path}: cannot be read by SimpleITK ({one_line(error).split("ERROR: ")[-1]}); '
+            'check the header, and for .mhd the raw file that it names'
+        ) from None
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
-        raise InputError(f'{path}: has {image.GetDimension()} dimensions and '
-                         f'{image.GetNumberOfComponentsPerPixel()} values a voxel; a 3D volume of single '
-                         'values is needed')
+        raise InputError(
+            f'{path}: has {image.GetDimension()} dimensions and '
+            f'{image.GetNumberOfComponentsPerPixel()} values a voxel; a 3D volume of single '
+            'values is needed'
+        )
     affine = np.eye(4)
     affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
@@ -169,14 +180,16 @@ def _raw(path, shape, dtype):
     try:
         dtype, shape = np.dtype(dtype), tuple(int(n) for n in shape)
     except (TypeError, ValueError):
-        raise InputError(f'{path}: shape {shape!r} or dtype {dtype!r} is not understood; '
-                         'give for example (256, 256, 256) and uint8') from None
+        raise InputError(
+            f'{path}: shape {shape!r} or dtype {dtype!r} is not understood; give for example (256, 256, 256) and uint8'
+        ) from None
     if len(shape) != 3 or min(shape) < 1:
         raise InputError(f'{path}: the shape must be 3 positive numbers (x, y, z), not {shape}')
     expected = int(np.prod(shape)) * dtype.itemsize
     if len(content) != expected:
-        raise InputError(f'{path}: has {len(content)} bytes, but {shape} of {dtype} needs {expected}; '
-                         'correct the shape or the dtype')
+        raise InputError(
+            f'{path}: has {len(content)} bytes, but {shape} of {dtype} needs {expected}; correct the shape or the dtype'
+        )
     return np.frombuffer(content, dtype).reshape(shape[::-1]).transpose(2, 1, 0)
 
 
@@ -192,8 +205,7 @@ def _tiff_file(tifffile, path):
     except InputError:
         raise
     except Exception as error:  # damaged files fail inside tifffile and its codecs in many ways
-        raise InputError(f'{path}: is damaged or not a TIFF file ({one_line(error)}); '
-                         'write it again') from None
+        raise InputError(f'{path}: is damaged or not a TIFF file ({one_line(error)}); write it again') from None
 
 
 def _tiff(files, path):
@@ -203,8 +215,10 @@ def _tiff(files, path):
         return (slices[0][None] if slices[0].ndim == 2 else slices[0]).transpose()
     for file, image in zip(files, slices):
         if image.ndim != 2 or image.shape != slices[0].shape:
-            raise InputError(f'{file}: has the shape {image.shape}, but the slices of a folder must be 2D '
-                             f'and of one size (the first is {slices[0].shape})')
+            raise InputError(
+                f'{file}: has the shape {image.shape}, but the slices of a folder must be 2D '
+                f'and of one size (the first is {slices[0].shape})'
+            )
     return np.stack(slices).transpose()
 
 
@@ -220,8 +234,7 @@ def _dicom(folder):
         if 'PixelData' in data:
             slices.append((file, data))
     if not slices:
-        raise InputError(f'{folder}: holds neither DICOM nor TIFF slices; give the folder that directly '
-                         'holds them')
+        raise InputError(f'{folder}: holds neither DICOM nor TIFF slices; give the folder that directly holds them')
     series = {str(s.get('SeriesInstanceUID')) for _, s in slices}
     if len(series) > 1:
         raise InputError(f'{folder}: holds {len(series)} DICOM series; put one series in a folder of its own')
@@ -230,8 +243,10 @@ def _dicom(folder):
     except (AttributeError, KeyError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f'{folder}: a DICOM slice lacks geometry or has unreadable pixels '
-                         f'({one_line(error)}); export the series again, uncompressed') from None
+        raise InputError(
+            f'{folder}: a DICOM slice lacks geometry or has unreadable pixels '
+            f'({one_line(error)}); export the series again, uncompressed'
+        ) from None
 
 
 def _stack_dicom(folder, slices):
@@ -240,14 +255,16 @@ def _stack_dicom(folder, slices):
     normal = np.cross(x_axis, y_axis)
     row_step, column_step = (float(d) for d in first.PixelSpacing)  # between rows (y), between columns (x)
     for file, s in slices:
-        if ((s.Rows, s.Columns) != (first.Rows, first.Columns) or int(s.get('NumberOfFrames', 1)) != 1
-                or not np.allclose(np.asarray(s.PixelSpacing, float), [row_step, column_step], rtol=1e-4)
-                or not np.allclose(np.asarray(s.ImageOrientationPatient, float), [*x_axis, *y_axis],
-                                   atol=1e-3)):
-            raise InputError(f'{file}: differs from the other slices in size, pixel spacing or orientation; '
-                             'remove it')
-    slices = sorted(((np.asarray(s.ImagePositionPatient, float) @ normal, file, s) for file, s in slices),
-                    key=lambda item: item[0])
+        if (
+            (s.Rows, s.Columns) != (first.Rows, first.Columns)
+            or int(s.get('NumberOfFrames', 1)) != 1
+            or not np.allclose(np.asarray(s.PixelSpacing, float), [row_step, column_step], rtol=1e-4)
+            or not np.allclose(np.asarray(s.ImageOrientationPatient, float), [*x_axis, *y_axis], atol=1e-3)
+        ):
+            raise InputError(f'{file}: differs from the other slices in size, pixel spacing or orientation; remove it')
+    slices = sorted(
+        ((np.asarray(s.ImagePositionPatient, float) @ normal, file, s) for file, s in slices), key=lambda item: item[0]
+    )
     depth = np.array([d for d, _, _ in slices])
     steps = np.diff(depth)
     if len(steps) == 0:
@@ -257,11 +274,17 @@ def _stack_dicom(folder, slices):
         uneven = np.abs(steps - step) > max(0.01 * step, 1e-3)
         if step <= 0 or uneven.any():
             i = int(np.argmax(uneven))
-            raise InputError(f'{folder}: the slices are not evenly spaced: {steps[i]:g} mm from '
-                             f'{slices[i][1].name} to {slices[i + 1][1].name}, {step:g} mm elsewhere; '
-                             'add the missing or remove the extra slices')
-    data = np.stack([np.float32(s.get('RescaleSlope', 1)) * s.pixel_array
-                     + np.float32(s.get('RescaleIntercept', 0)) for _, _, s in slices])
+            raise InputError(
+                f'{folder}: the slices are not evenly spaced: {steps[i]:g} mm from '
+                f'{slices[i][1].name} to {slices[i + 1][1].name}, {step:g} mm elsewhere; '
+                'add the missing or remove the extra slices'
+            )
+    data = np.stack(
+        [
+            np.float32(s.get('RescaleSlope', 1)) * s.pixel_array + np.float32(s.get('RescaleIntercept', 0))
+            for _, _, s in slices
+        ]
+    )
     affine = np.eye(4)
     affine[:3, :3] = np.stack([x_axis * column_step, y_axis * row_step, normal * step], 1)
     affine[:3, 3] = np.asarray(slices[0][2].ImagePositionPatient, float)
@@ -270,8 +293,10 @@ def _stack_dicom(folder, slices):
 
 # ---- in and out --------------------------------------------------------------------------------------------
 
-def read_volume(path, mu_water: float | None = None, shape=None, dtype=None, spacing=None,
-                hu: bool | None = None) -> Volume:
+
+def read_volume(
+    path, mu_water: float | None = None, shape=None, dtype=None, spacing=None, hu: bool | None = None
+) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
     path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd (SimpleITK); .npy, .npz with one 3D array,
@@ -319,11 +344,13 @@ def read_volume(path, mu_water: float | None = None, shape=None, dtype=None, spa
     else:
         with reading(path):
             open(path, 'rb').close()
-        raise InputError(f'{path}: is no known volume format; give .nii.gz, .nrrd, .mhd, .npy, .tif, a '
-                         'folder of slices, or shape and dtype of raw bytes')
+        raise InputError(
+            f'{path}: is no known volume format; give .nii.gz, .nrrd, .mhd, .npy, .tif, a '
+            'folder of slices, or shape and dtype of raw bytes'
+        )
     data = numeric(data, path, 3)
     if affine is None:
-        steps = np.atleast_1d(np.asarray(1. if spacing is None else spacing, float))
+        steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))
         if steps.shape not in ((1,), (3,)) or not (np.isfinite(steps).all() and steps.min() > 0):
             raise InputError(f'spacing must be one or three positive numbers, in mm, not {spacing!r}')
         affine = centred_affine(data.shape, np.broadcast_to(steps, 3))
@@ -333,7 +360,7 @@ def read_volume(path, mu_water: float | None = None, shape=None, dtype=None, spa
     if not np.isfinite(affine).all() or not sides.min() > 0:
         raise InputError(f'{path}: the header has no valid voxel size; correct its affine')
     if description.startswith(_OURS) and data.dtype.kind == 'f':
-        density, unit = data.astype(np.float32), description[len(_OURS):]
+        density, unit = data.astype(np.float32), description[len(_OURS) :]
     else:
         density, unit = _density(data, path, hu, mu_water)
     return Volume(np.ascontiguousarray(density, np.float32), tuple(float(s) for s in sides), affine, unit)
@@ -353,6 +380,7 @@ def write_volume(path, data, spacing, origin=None, description: str = 'normalise
     written.
     """
     import nibabel
+
     path = Path(path)
     if not path.name.endswith(('.nii', '.nii.gz')):
         raise InputError(f'{path}: volumes are written as NIfTI; give a name that ends in .nii or .nii.gz')
@@ -365,8 +393,7 @@ def write_volume(path, data, spacing, origin=None, description: str = 'normalise
         affine[:3, 3] = origin
     text = (_OURS + description).encode('utf-8')
     if len(text) > 79:
-        raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room '
-                         'for 79')
+        raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room for 79')
     image = nibabel.Nifti1Image(np.asarray(data, np.float32), affine)
     image.header.set_xyzt_units('mm')
     image.header['descrip'] = text

@@ -1,0 +1,1 @@
+"""Fitting a cloud of Gaussians: settings, loss, Adam, densification, checkpoints, the loop."""

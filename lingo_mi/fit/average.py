@@ -1,4 +1,5 @@
 """A running mean of a fit's parameters: steps on single views jitter about what they converge to, and their mean does not."""
+
 from __future__ import annotations
 
 import copy
@@ -6,7 +7,7 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
-from .device import DeviceState, download, upload
+from lingo_mi.fit.device import DeviceState, download, upload
 
 PREFIX = 'average.'  # of the names in a checkpoint
 

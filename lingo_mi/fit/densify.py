@@ -12,15 +12,16 @@ mean and covariance stay, so that images hardly change, and both halves keep the
 For alpha compositing the rules are those of 3DGS: clones and halves keep the opacity, the faint vanish and later the large,
 Gaussians outside the volume stay, and from time to time all opacities are lowered (`reset_opacity`).
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from .settings import Settings
-from .state import State, activate, inverse_scale, inverse_sigmoid, inverse_softplus
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.state import State, activate, inverse_scale, inverse_sigmoid, inverse_softplus
 
-RESET = .01   # 3DGS: opacity that `reset_opacity` leaves at most
-APART = .7    # distance of a half's centre from its parent's, in the parent's standard deviations
+RESET = 0.01  # 3DGS: opacity that `reset_opacity` leaves at most
+APART = 0.7  # distance of a half's centre from its parent's, in the parent's standard deviations
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
@@ -39,14 +40,19 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     if settings.birth == 'halve':
         return prune(halve(state, strong, settings, flat), settings, half, largest)
     large = activate(state, settings)[1].max(1) > settings.split_size
-    state = split(clone(state, strong & ~large), np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
-                  settings, rng, flat)
+    state = split(
+        clone(state, strong & ~large),
+        np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
+        settings,
+        rng,
+        flat,
+    )
     return prune(state, settings, half, largest)
 
 
 def clone(state: State, chosen) -> State:
     """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
-    halved = _with_density(state, chosen, .5)
+    halved = _with_density(state, chosen, 0.5)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
@@ -55,13 +61,13 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.scale_min, settings.scale_max
     centre, scale, rotation, _ = activate(state, settings)
-    shrink = np.array([SHRINK, SHRINK, 1. if flat else SHRINK])
-    children = _fresh(_with_density(state, chosen, .5), parents)
+    shrink = np.array([SHRINK, SHRINK, 1.0 if flat else SHRINK])
+    children = _fresh(_with_density(state, chosen, 0.5), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
     if flat:
         offset[:, 2] = 0
     children.values['centre'] = (centre[parents] + _rotate(rotation[parents], offset)).astype(np.float32)
-    smaller = np.clip(scale[parents] / shrink, low * 1.01, high * .99)
+    smaller = np.clip(scale[parents] / shrink, low * 1.01, high * 0.99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32)
     return _append(_take(state, ~chosen), children)
 
@@ -71,12 +77,12 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
     parents = np.flatnonzero(chosen)
     low, high = settings.scale_min, settings.scale_max
     centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
-    axis = np.eye(3)[scale[:, :2 if flat else 3].argmax(1)]
-    shrink = np.where(axis > 0, np.sqrt(1 - APART ** 2), 1)
-    children = _take(_with_density(state, chosen, .5 / np.sqrt(1 - APART ** 2)), parents.repeat(2))
+    axis = np.eye(3)[scale[:, : 2 if flat else 3].argmax(1)]
+    shrink = np.where(axis > 0, np.sqrt(1 - APART**2), 1)
+    children = _take(_with_density(state, chosen, 0.5 / np.sqrt(1 - APART**2)), parents.repeat(2))
     offset = _rotate(rotation, APART * axis * scale)
     children.values['centre'] = np.stack([centre + offset, centre - offset], 1).reshape(-1, 3).astype(np.float32)
-    smaller = np.clip(scale * shrink, low * 1.01, high * .99)
+    smaller = np.clip(scale * shrink, low * 1.01, high * 0.99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32).repeat(2, 0)
     children.born[:] = True
     return _append(_take(state, ~chosen), children)
@@ -97,13 +103,20 @@ def prune(state: State, settings: Settings, half, largest: float = np.inf) -> St
 
 def reset_opacity(state: State) -> State:
     """Lower all opacities to 0.01 and forget their moments, so that only those that images need come back (3DGS)."""
+
     def with_opacity(columns, opacity):
         return columns | {'opacity': opacity}
+
     opacity = state.values['opacity']
     zeros = np.zeros_like(opacity)
-    return State(with_opacity(state.values, np.minimum(opacity, np.float32(inverse_sigmoid(RESET)))),
-                 with_opacity(state.first, zeros), with_opacity(state.second, zeros.copy()), state.gradient, state.seen,
-                 state.born)
+    return State(
+        with_opacity(state.values, np.minimum(opacity, np.float32(inverse_sigmoid(RESET)))),
+        with_opacity(state.first, zeros),
+        with_opacity(state.second, zeros.copy()),
+        state.gradient,
+        state.seen,
+        state.born,
+    )
 
 
 def _with_density(state, chosen, factor):
@@ -112,7 +125,7 @@ def _with_density(state, chosen, factor):
         return state
     values = dict(state.values)
     raw = values['density'].astype(float)
-    raw[chosen] = inverse_softplus(np.logaddexp(0., raw[chosen]) * factor)
+    raw[chosen] = inverse_softplus(np.logaddexp(0.0, raw[chosen]) * factor)
     values['density'] = raw.astype(np.float32)
     return State(values, state.first, state.second, state.gradient, state.seen, state.born)
 
@@ -120,8 +133,15 @@ def _with_density(state, chosen, factor):
 def _take(state, index):
     def pick(columns):
         return {k: v[index] for k, v in columns.items()}
-    return State(pick(state.values), pick(state.first), pick(state.second), state.gradient[index], state.seen[index],
-                 state.born[index])
+
+    return State(
+        pick(state.values),
+        pick(state.first),
+        pick(state.second),
+        state.gradient[index],
+        state.seen[index],
+        state.born[index],
+    )
 
 
 def _fresh(state, index):
@@ -129,16 +149,28 @@ def _fresh(state, index):
     taken = _take(state, index)
     n = len(taken)
     zeros = {k: np.zeros_like(v) for k, v in taken.values.items()}
-    return State(taken.values, zeros, {k: v.copy() for k, v in zeros.items()}, np.zeros(n, np.float32),
-                 np.zeros(n, np.float32), np.ones(n, bool))
+    return State(
+        taken.values,
+        zeros,
+        {k: v.copy() for k, v in zeros.items()},
+        np.zeros(n, np.float32),
+        np.zeros(n, np.float32),
+        np.ones(n, bool),
+    )
 
 
 def _append(state, more):
     def join(a, b):
         return {k: np.concatenate([v, b[k]]) for k, v in a.items()}
-    return State(join(state.values, more.values), join(state.first, more.first), join(state.second, more.second),
-                 np.concatenate([state.gradient, more.gradient]), np.concatenate([state.seen, more.seen]),
-                 np.concatenate([state.born, more.born]))
+
+    return State(
+        join(state.values, more.values),
+        join(state.first, more.first),
+        join(state.second, more.second),
+        np.concatenate([state.gradient, more.gradient]),
+        np.concatenate([state.seen, more.seen]),
+        np.concatenate([state.born, more.born]),
+    )
 
 
 def _rotate(q, v):

@@ -1,17 +1,25 @@
 """A fit's state on the device: activation, Adam and the way to the host and back."""
+
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .settings import Settings
-from .state import State
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.state import State
 
 
 def _types():
-    return dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float, opacity=mi.Float,
-                radiance=mi.Float, harmonics=mi.ArrayXf)
+    return dict(
+        centre=mi.Point3f,
+        scale=mi.Vector3f,
+        rotation=mi.Vector4f,
+        density=mi.Float,
+        opacity=mi.Float,
+        radiance=mi.Float,
+        harmonics=mi.ArrayXf,
+    )
 
 
 class DeviceState:
@@ -27,16 +35,25 @@ class DeviceState:
 
     def host(self) -> State:
         """The state as NumPy arrays."""
-        return State(download(self.values), download(self.first), download(self.second), self.gradient.numpy(),
-                     self.seen.numpy(), self.born)
+        return State(
+            download(self.values),
+            download(self.first),
+            download(self.second),
+            self.gradient.numpy(),
+            self.seen.numpy(),
+            self.born,
+        )
 
     def gaussians(self, settings: Settings):
         """Centres, standard deviations, quaternions (not normalised) and densities; differentiable.
 
-        For alpha compositing opacities in place of densities, followed by what `xray.radiance.seen` takes.
+        For alpha compositing opacities in place of densities, followed by what `projectors.radiance.seen` takes.
         """
         v = self.values
-        low, high = dr.opaque(mi.Float, settings.scale_min), dr.opaque(mi.Float, settings.scale_max - settings.scale_min)
+        low, high = (
+            dr.opaque(mi.Float, settings.scale_min),
+            dr.opaque(mi.Float, settings.scale_max - settings.scale_min),
+        )
         scale = low + high / (1 + dr.exp(-v['scale']))
         if settings.render == 'alpha':
             radiance = [v[k] for k in ('radiance', 'harmonics') if k in v]
@@ -51,7 +68,7 @@ class DeviceState:
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
         b1, b2, step = settings.beta1, settings.beta2, iteration + 1
         # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
-        c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1 ** step)), dr.opaque(mi.Float, 1 / (1 - b2 ** step))
+        c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
         for name, g in gradients.items():
             m = b1 * self.first[name] + (1 - b1) * g
             v = b2 * self.second[name] + (1 - b2) * g * g
@@ -78,7 +95,7 @@ def _softplus(x):
     above = x > 0  # not by maximum and abs, whose derivatives at 0 add up to 0
     small = dr.exp(dr.select(above, -x, x))
     series = small * (1 - small * (1 / 2 - small * (1 / 3 - small / 4)))  # 1 + small would round small away
-    return dr.select(above, x, 0) + dr.select(small < .01, series, dr.log(1 + small))
+    return dr.select(above, x, 0) + dr.select(small < 0.01, series, dr.log(1 + small))
 
 
 def uploaded(values):
@@ -89,7 +106,7 @@ def uploaded(values):
     """
     room = np.empty(len(values) + 16, np.float32)
     start = -room.ctypes.data % 64 // 4
-    out = room[start:start + len(values)]
+    out = room[start : start + len(values)]
     out[:] = values
     out = mi.Float(out)
     dr.make_opaque(out)  # one value alone would otherwise be a literal, and be compiled in

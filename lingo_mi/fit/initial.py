@@ -1,4 +1,5 @@
 """The initial cloud of a fit, by the method that its settings name."""
+
 from __future__ import annotations
 
 import time
@@ -6,19 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..lingo import initialise as lingo
-from ..lingo.initialise import InitialCloud
-from ..recon.fdk import fdk
-from ..recon.upright import is_circular
-from ..scan import Scan
-from .device import DeviceState
-from .loop import bounded
-from .model import linearised
-from .points import cuboid, random_points
-from .r2_init import r2_initialise
-from .settings import Settings
-from .state import start
-from .step import Stepper, density_unit
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.loop import bounded
+from lingo_mi.fit.model import linearised
+from lingo_mi.fit.point_starts import cuboid, random_points
+from lingo_mi.fit.r2_start import r2_initialise
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.state import start
+from lingo_mi.fit.step import Stepper, density_unit
+from lingo_mi.lingo import initialise as lingo
+from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.rectify import is_circular
+from lingo_mi.scan import Scan
 
 
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
@@ -41,15 +42,18 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
         cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, settings.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)
     else:
+
         def render(points, density, spacing, views):
             state = start(points, spacing, density / unit, settings)
             stepper = Stepper(scan.subset(views[:1]), settings.changed(weights='equal'), unit)
             return stepper.render(DeviceState(state), g.subset(views)) * g.scale
+
         chosen = settings.of_start()
         if chosen.density == 'fdk' and not is_circular(scan):
             chosen = replace(chosen, density='lsq')
         volume = fdk(scan) if chosen.density == 'fdk' else None
-        cloud = lingo.initialise(g.normalised_frames(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume,
-                                 scan.valid)
+        cloud = lingo.initialise(
+            g.normalised_rays(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume, scan.valid
+        )
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

@@ -1,4 +1,5 @@
 """The loop of a fit: views in turn, densification, measurements on the way, checkpoints."""
+
 from __future__ import annotations
 
 import json
@@ -10,16 +11,17 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from ..errors import InputError
-from ..lingo.initialise import InitialCloud
-from ..scan import Scan
-from . import checkpoint
-from .average import Average
-from .densify import densify, reset_opacity
-from .device import DeviceState
-from .settings import Settings
-from .state import State, parameters, start
-from .step import Stepper
+from lingo_mi.errors import InputError
+from lingo_mi.fit import checkpoint
+from lingo_mi.fit.average import Average
+from lingo_mi.fit.densify import densify, reset_opacity
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.state import State, parameters, start
+from lingo_mi.fit.step import Stepper
+from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.scan import Scan
+from lingo_mi.scene.description import describe
 
 
 @dataclass
@@ -40,12 +42,20 @@ class Fitted:
     settings: Settings
     initial: np.ndarray
     history: list = field(default_factory=list)
-    seconds: float = 0.
+    seconds: float = 0.0
     info: dict = field(default_factory=dict)
 
 
-def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int = 0, measure=None, progress=None,
-        path: Path | None = None, resume: bool = False) -> Fitted:
+def run(
+    scan: Scan,
+    settings: Settings,
+    initial: InitialCloud | None,
+    seed: int = 0,
+    measure=None,
+    progress=None,
+    path: Path | None = None,
+    resume: bool = False,
+) -> Fitted:
     """Fit a cloud to a scan.
 
     scan       the views to fit
@@ -58,7 +68,6 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     resume     go on from `path`: the same steps as without the interruption. More iterations than the checkpoint was made
                with are right where `decay_steps` sets the rates and `coarse_share` is 0
     """
-    from ..plugins.ct_scanner import describe
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
@@ -75,7 +84,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
         average.restore(arrays)
     else:
         points, order = initial.points.astype(np.float32), []
-        iteration, seconds, history, info = 0, 0., [], dict(initial.info)
+        iteration, seconds, history, info = 0, 0.0, [], dict(initial.info)
         density = None if settings.render == 'alpha' else initial.density / stepper.unit
         state = DeviceState(start(points, initial.spacing, density, settings))
     marks = set(measure_at(settings.iterations))
@@ -84,11 +93,22 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
     def store():
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            checkpoint.save(path, state.host(), dict(
-                seed=seed, rng=rng.bit_generator.state, iteration=iteration,
-                seconds=seconds + time.perf_counter() - clock, history=history, info=info,
-                settings=asdict(settings), unit=stepper.unit, **scanned),
-                dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays())
+            checkpoint.save(
+                path,
+                state.host(),
+                dict(
+                    seed=seed,
+                    rng=rng.bit_generator.state,
+                    iteration=iteration,
+                    seconds=seconds + time.perf_counter() - clock,
+                    history=history,
+                    info=info,
+                    settings=asdict(settings),
+                    unit=stepper.unit,
+                    **scanned,
+                ),
+                dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays(),
+            )
 
     while iteration < settings.iterations:
         # Not after the last step, which nothing would mend; a longer fit that goes on from there does it first.
@@ -97,7 +117,7 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
             average.restart()
         while len(order) < settings.batch:  # every view once before any a second time
             order += rng.permutation(len(scan)).tolist()
-        views, rest = order[:settings.batch], order[settings.batch:]
+        views, rest = order[: settings.batch], order[settings.batch :]
         loss = stepper.step(state, views, iteration, rng)
         order, iteration = rest, iteration + 1
         average.add(state)
@@ -105,8 +125,9 @@ def run(scan: Scan, settings: Settings, initial: InitialCloud | None, seed: int 
             dr.sync_thread()
             value = float(loss[0])
             if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not would silently leave the image
-                raise InputError(f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the '
-                                 'projections')
+                raise InputError(
+                    f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the projections'
+                )
             seconds += time.perf_counter() - clock
             entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
             history.append(entry | (measure(stepper, average.of(state)) if measure else {}))
@@ -145,29 +166,33 @@ def _renewed(state, stepper, settings, iteration, rng):
 
 def measure_at(iterations: int) -> list[int]:
     """Iterations to measure at: twelve, denser at the beginning, the last one among them."""
-    return sorted({max(1, round(iterations * share ** 1.5)) for share in np.linspace(0, 1, 13)[1:]})
+    return sorted({max(1, round(iterations * share**1.5)) for share in np.linspace(0, 1, 13)[1:]})
 
 
 def bounded(settings: Settings, scan: Scan) -> Settings:
     """The settings with the bounds that a scan sets.
 
     The largest scale becomes so small that no Gaussian in the volume can reach the source: beyond it the integral of a
-    cone beam's Gaussian is no footprint (see `xray.footprint`). `values_per_gaussian` bounds the number of Gaussians.
+    cone beam's Gaussian is no footprint (see `projectors.footprint`). `values_per_gaussian` bounds the number of Gaussians.
     What is in units of the scene's radius becomes a length. Raises InputError where the source is in the volume.
     """
     g = scan.geometry
     if settings.render == 'alpha':
         radius = scene_radius(g)
-        settings = replace(settings, rate_centre=tuple(radius * r for r in settings.rate_centre),
-                           split_size=radius * settings.split_size, prune_size=radius * settings.prune_size)
+        settings = replace(
+            settings,
+            rate_centre=tuple(radius * r for r in settings.rate_centre),
+            split_size=radius * settings.split_size,
+            prune_size=radius * settings.prune_size,
+        )
     if settings.values_per_gaussian > 0:
         most = min(max(int(scan.projections.size / settings.values_per_gaussian), 1), settings.max_gaussians)
         settings = replace(settings, max_gaussians=most, n_points=min(settings.n_points, most))
     if g.mode == 'parallel':
         return settings
-    frames = g.normalised_frames()
+    frames = g.normalised_rays()
     room = np.linalg.norm(frames.source, axis=1).min() - np.linalg.norm(g.half)
-    largest = .9 * room / settings.extent
+    largest = 0.9 * room / settings.extent
     if largest <= settings.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
     return replace(settings, scale_max=min(settings.scale_max, largest))
@@ -183,16 +208,19 @@ def scene_radius(geometry) -> float:
 
     1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
     """
-    frames = geometry.normalised_frames()
+    frames = geometry.normalised_rays()
     if frames.parallel:
-        return 1.
-    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.
+        return 1.0
+    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.0
 
 
 def _same_fit(host, extra, settings, scanned, seed, path):
     """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
     damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
-    if not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views', 'scanner', 'signal'} <= extra.keys():
+    if (
+        not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views', 'scanner', 'signal'}
+        <= extra.keys()
+    ):
         raise damaged
     now = asdict(settings)
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
@@ -206,13 +234,21 @@ def _same_fit(host, extra, settings, scanned, seed, path):
         changed.append('views')
     elif extra['scanner'] != json.loads(json.dumps(scanned['scanner'], default=np.generic.item)):
         changed.append('the geometry')
-    elif not math.isclose(extra['signal'], scanned['signal'], rel_tol=1e-4):  # simulated anew, their last digits may differ
+    elif not math.isclose(
+        extra['signal'], scanned['signal'], rel_tol=1e-4
+    ):  # simulated anew, their last digits may differ
         changed.append('the projections')
     if changed:
-        raise InputError(f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
-                         'settings, or remove it and start again')
+        raise InputError(
+            f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
+            'settings, or remove it and start again'
+        )
     shapes = {k: (len(host), size) for k, size in parameters(settings).items()}
-    if not (len(host.gradient) == len(host.seen) == len(host)
-            and all({k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
-                    for group in (host.values, host.first, host.second))):
+    if not (
+        len(host.gradient) == len(host.seen) == len(host)
+        and all(
+            {k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
+            for group in (host.values, host.first, host.second)
+        )
+    ):
         raise damaged

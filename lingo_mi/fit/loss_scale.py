@@ -1,4 +1,5 @@
 """The paper's loss scale T_g + 1 / (4 T_g) from Otsu's threshold of a rendered image, without leaving the device."""
+
 from __future__ import annotations
 
 import drjit as dr
@@ -8,14 +9,14 @@ BINS = 256
 LANES = 32  # histograms for each thread of the CPU
 
 
-def loss_scale(image, floor: float = .01):
+def loss_scale(image, floor: float = 0.01):
     """T_g + 1 / (4 T_g) with T_g = max(floor, `otsu`(image)): Float of width 1, detached.
 
     image : Float [N], line integrals
     floor : > 0; keeps the scale of an empty image finite
     """
     threshold = dr.maximum(otsu(image), floor)
-    return threshold + .25 / threshold
+    return threshold + 0.25 / threshold
 
 
 def otsu(image):
@@ -34,7 +35,7 @@ def otsu(image):
     dr.make_opaque(image, low, high)
     histogram = _histogram(image, low, high)
     dr.eval(histogram)
-    threshold = low + (mi.Float(_best_bin(histogram)) + .5) * ((high - low) / BINS)
+    threshold = low + (mi.Float(_best_bin(histogram)) + 0.5) * ((high - low) / BINS)
     threshold = dr.select(high > low, threshold, low)
     dr.eval(threshold)  # now, with one lane: not in each lane of whatever uses it
     return threshold

@@ -14,6 +14,7 @@ nothing is measured from zero:
     the adjoint    filters linear functions of the two images, e + g (y - y0) - h (x - x0), with the same origins; a
                    function is carried over to the next tile by adding the step between the origins
 """
+
 from __future__ import annotations
 
 import math
@@ -21,8 +22,8 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import InputError
-from ..metrics import C1, C2, WINDOW
+from lingo_mi.errors import InputError
+from lingo_mi.metrics import C1, C2, WINDOW
 
 TILE = 8
 REACH = len(WINDOW) // 2
@@ -42,15 +43,15 @@ def ssim(image, truth, height: int, width: int):
     zeros around the images, C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode;
     the truth is a constant. InputError where the two do not have that many pixels.
     """
-    return 1 - _photometric(image, truth, height, width, 0., 1.)
+    return 1 - _photometric(image, truth, height, width, 0.0, 1.0)
 
 
-def combined(image, truth, height: int, width: int, lambda_ssim: float = .25):
+def combined(image, truth, height: int, width: int, lambda_ssim: float = 0.25):
     """L1 + lambda_ssim (1 - SSIM) in one operation, with the arguments of `ssim`.
 
     Differentiable in the image, in reverse mode; InputError as for `ssim`.
     """
-    return _photometric(image, truth, height, width, 1., lambda_ssim)
+    return _photometric(image, truth, height, width, 1.0, lambda_ssim)
 
 
 def tv(volume, shape: tuple[int, int, int]):
@@ -69,8 +70,9 @@ def tv(volume, shape: tuple[int, int, int]):
 def _photometric(image, truth, height, width, weight_l1, weight_ssim):
     _check_size('image', image, height, width)
     _check_size('truth', truth, height, width)
-    return dr.custom(_Photometric, image, dr.detach(truth), height, width, weight_l1, weight_ssim,
-                     dr.grad_enabled(image))
+    return dr.custom(
+        _Photometric, image, dr.detach(truth), height, width, weight_l1, weight_ssim, dr.grad_enabled(image)
+    )
 
 
 def _check_size(what, array, *shape):
@@ -152,8 +154,12 @@ class _Tiles:
             dissimilarity, slopes = _compare(mx + x0, my + y0, ox, oy, variance, covariance)
             loss += dr.select(inside, dissimilarity, 0)
             if derivative:
-                dr.scatter(target, dr.select(inside, slopes, 0), (tile * TILE + k) * self.height + row,
-                           mode=dr.ReduceMode.Permute)
+                dr.scatter(
+                    target,
+                    dr.select(inside, slopes, 0),
+                    (tile * TILE + k) * self.height + row,
+                    mode=dr.ReduceMode.Permute,
+                )
         return loss, target
 
     def rows_adjoint(self, slopes):
@@ -161,8 +167,9 @@ class _Tiles:
         tile, row, taps, origins = self._row(slopes, self.height)
         target = dr.empty(mi.Float, 4 * self.padded_width * self.height)
         for k, s in enumerate(_blur([self._carry(origins, k, s) for k, s in zip(TAPS, taps)])):
-            dr.scatter(target, mi.Vector4f(*s, 0), row * self.padded_width + tile * TILE + k,
-                       mode=dr.ReduceMode.Permute)
+            dr.scatter(
+                target, mi.Vector4f(*s, 0), row * self.padded_width + tile * TILE + k, mode=dr.ReduceMode.Permute
+            )
         return target
 
     def columns_adjoint(self, slopes, factor_l1, factor_ssim):
@@ -170,26 +177,35 @@ class _Tiles:
         lane = dr.arange(mi.Int32, self.down * self.width)
         tile, column = lane // self.width, lane % self.width
         index = tile * (TILE * self.padded_width) + column
-        taps = [dr.gather(mi.Vector4f, slopes, index + k * self.padded_width, self._inside(tile, k, self.height))
-                for k in TAPS]
-        origins = [self._origin(tile + s, column // TILE, self._inside(tile, s * TILE, self.height))
-                   for s in (-1, 0, 1)]
+        taps = [
+            dr.gather(mi.Vector4f, slopes, index + k * self.padded_width, self._inside(tile, k, self.height))
+            for k in TAPS
+        ]
+        origins = [
+            self._origin(tile + s, column // TILE, self._inside(tile, s * TILE, self.height)) for s in (-1, 0, 1)
+        ]
         ox, oy = origins[1]
         x, y = self._pixels(tile, column, range(TILE))
         target = dr.empty(mi.Float, self.height * self.width)
         for k, (e, g, h) in enumerate(_blur([self._carry(origins, k, s) for k, s in zip(TAPS, taps)])):
             slope = e + g * (y[k] - oy) - h * (x[k] - ox)
-            dr.scatter(target, factor_l1 * _sign(x[k] - y[k]) - factor_ssim * slope,
-                       (tile * TILE + k) * self.width + column, self._inside(tile, k, self.height),
-                       mode=dr.ReduceMode.Permute)
+            dr.scatter(
+                target,
+                factor_l1 * _sign(x[k] - y[k]) - factor_ssim * slope,
+                (tile * TILE + k) * self.width + column,
+                self._inside(tile, k, self.height),
+                mode=dr.ReduceMode.Permute,
+            )
         return target
 
     def _pixels(self, tile, column, taps):
         """Both images at taps of the column of a tile, zero outside."""
         index = tile * (TILE * self.width) + column
         active = [self._inside(tile, k, self.height) & (column < self.width) for k in taps]
-        return tuple([dr.gather(mi.Float, x, index + k * self.width, a) for k, a in zip(taps, active)]
-                     for x in (self.image, self.truth))
+        return tuple(
+            [dr.gather(mi.Float, x, index + k * self.width, a) for k, a in zip(taps, active)]
+            for x in (self.image, self.truth)
+        )
 
     def _row(self, packed, stride):
         """A tile's row, its taps in packets stored column by column, and the origins of it and its neighbours."""

@@ -1,4 +1,5 @@
 """What a scan's detector sees of a cloud: the effects of a scan inside the fit's forward model."""
+
 from __future__ import annotations
 
 import drjit as dr
@@ -6,15 +7,15 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..effects.forward import Effects
-from ..effects.hardening import hardened, second_share
-from ..errors import InputError
-from ..geometry import Geometry
-from ..recon import corrections
-from ..scan import Scan
-from ..xray.quality import Quality
-from .device import uploaded
-from .scattered import Scattered
+from lingo_mi.effects.forward import Effects
+from lingo_mi.effects.hardening import hardened, second_share
+from lingo_mi.errors import InputError
+from lingo_mi.fit.device import uploaded
+from lingo_mi.fit.scatter import Scattered
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.reconstruction import effects_correction as corrections
+from lingo_mi.scan import Scan
 
 RENEWED = 50  # steps after which the shares of two materials are looked at again
 
@@ -50,9 +51,11 @@ class Model:
         integrals   gives line integrals along the rays of a View, one Float a material
         scattered   light over the open beam's, Float [height * width], a constant to the derivatives; None: none
         """
+
         def seen(rays):
             parts = [self.factor * q for q in integrals(rays)]
             return hardened(parts, self.bands) if self.bands else parts[0]
+
         return self.effects.saturated(self.effects.averaged(seen, view, Quality(), scattered), view) / self.factor
 
     def shares(self, volume, centres, half):
@@ -63,7 +66,7 @@ class Model:
         """
         if self.split is None:
             return None
-        place = (np.asarray(centres, float) / half + 1) / 2 * volume.shape - .5
+        place = (np.asarray(centres, float) / half + 1) / 2 * volume.shape - 0.5
         density = ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
         return uploaded(second_share(density.astype(float), self.split))
 
@@ -96,8 +99,10 @@ def weights_of(scan: Scan, settings) -> np.ndarray | None:
         raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
     p = scan.projections
     valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
-    light, share = (ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
-    weights = 1 / detector.deviation(light / np.maximum(share, .1))
+    light, share = (
+        ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid)
+    )
+    weights = 1 / detector.deviation(light / np.maximum(share, 0.1))
     return (weights * (p.max() / (weights * p).max())).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ A view's correction turns source and panel about the volume's centre and shifts 
 A motion of all views together is one of the object, which no projection tells: after every step the mean turn and the mean
 shift of the views are taken off.
 """
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -18,9 +19,9 @@ import drjit as dr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..frames import Frames
-from ..geometry import Geometry
-from ..xray.frame import vector64
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.projectors.view import vector64
 
 _NAMES = ('source', 'corner', 'u', 'v')
 
@@ -48,7 +49,7 @@ class Poses:
         for name in self.arrays():
             setattr(self, name.removeprefix('poses.'), np.array(arrays[name]))
 
-    def correct(self, frames: Frames, view: int | None = None) -> Frames:
+    def correct(self, frames: Rays, view: int | None = None) -> Rays:
         """The views, in the normalised frame, as corrected; only one of them where `view` is given, frames then being its
         own [1]."""
         chosen = slice(None) if view is None else [view]
@@ -57,7 +58,7 @@ class Poses:
     def corrected(self, geometry: Geometry) -> Geometry:
         """A scan's geometry, in mm, with its views as corrected."""
         g, centre = geometry, np.array(geometry.offOrigin)
-        f = self.correct(g.normalised_frames())
+        f = self.correct(g.normalised_rays())
         source = f.source if f.parallel else f.source / g.scale + centre
         frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
         return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
@@ -68,7 +69,7 @@ class Poses:
         back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
         return back
 
-    def step(self, view: int, frames: Frames, gradient: dict, rate: float, settings):
+    def step(self, view: int, frames: Rays, gradient: dict, rate: float, settings):
         """Move a view by one Adam step, then take off the mean motion of all.
 
         frames     the view as corrected so far, [1]
@@ -93,7 +94,7 @@ class Poses:
         self.shift -= self.shift.mean(0)
 
 
-def place(view, frames: Frames):
+def place(view, frames: Rays):
     """Put a `View` where its `frames` [1] are, ready to gather derivatives."""
     for name in _NAMES:
         vector = vector64(getattr(frames, name)[0])

@@ -1,14 +1,15 @@
 """The state of a fit: everything that a step changes, and how raw parameters become Gaussians."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .settings import Settings
+from lingo_mi.fit.settings import Settings
 
 PARAMETERS = {'centre': 3, 'scale': 3, 'rotation': 4, 'density': 1}
-OPACITY = .1  # of all Gaussians at the start of a fit by alpha compositing (3DGS)
+OPACITY = 0.1  # of all Gaussians at the start of a fit by alpha compositing (3DGS)
 
 
 def parameters(settings: Settings) -> dict[str, int]:
@@ -53,8 +54,11 @@ def start(points, spacing, density, settings: Settings) -> State:
     scale_min, scale_max = settings.scale_min, settings.scale_max
     n = len(points)
     scale = np.clip(spacing, scale_min + 1e-5, scale_max - 1e-5)[:, None].repeat(3, 1)
-    values = dict(centre=np.asarray(points), scale=inverse_scale(scale, scale_min, scale_max),
-                  rotation=np.tile([0., 0., 0., 1.], (n, 1)))
+    values = dict(
+        centre=np.asarray(points),
+        scale=inverse_scale(scale, scale_min, scale_max),
+        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+    )
     if settings.render == 'integral':
         values['density'] = inverse_softplus(np.asarray(density))[:, None]
     else:
@@ -62,8 +66,14 @@ def start(points, spacing, density, settings: Settings) -> State:
         values |= {k: np.zeros((n, size)) for k, size in parameters(settings).items() if k not in values}
     values = {k: np.ascontiguousarray(v, np.float32) for k, v in values.items()}
     zeros = {k: np.zeros_like(v) for k, v in values.items()}
-    return State(values, zeros, {k: v.copy() for k, v in zeros.items()}, np.zeros(n, np.float32),
-                 np.zeros(n, np.float32), np.zeros(n, bool))
+    return State(
+        values,
+        zeros,
+        {k: v.copy() for k, v in zeros.items()},
+        np.zeros(n, np.float32),
+        np.zeros(n, np.float32),
+        np.zeros(n, bool),
+    )
 
 
 def activate(state: State, settings: Settings):
@@ -82,17 +92,17 @@ def activate(state: State, settings: Settings):
 def harmonics(state: State):
     """Coefficients of the radiance's spherical harmonics: of degree 0 [N], to whose harmonic 1/2 is added, and higher [N, M].
 
-    Radiance that is the same in all directions is a sigmoid of its raw value (see `xray.radiance`).
+    Radiance that is the same in all directions is a sigmoid of its raw value (see `projectors.radiance`).
     """
     raw = state.values['radiance'][:, 0].astype(float)
     if 'harmonics' in state.values:
         return raw, state.values['harmonics']
-    return np.sqrt(4 * np.pi) * (1 / (1 + np.exp(-raw)) - .5), np.zeros((len(raw), 0))
+    return np.sqrt(4 * np.pi) * (1 / (1 + np.exp(-raw)) - 0.5), np.zeros((len(raw), 0))
 
 
 def softplus(x):
     """ln(1 + e^x), without overflow."""
-    return np.logaddexp(0., x)
+    return np.logaddexp(0.0, x)
 
 
 def inverse_softplus(y):

@@ -1,4 +1,5 @@
 """One step of the fit: render, compare, differentiate, and move the Gaussians."""
+
 from __future__ import annotations
 
 import math
@@ -7,20 +8,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry import Geometry
-from ..recon.circle import require_signal
-from ..scan import Scan
-from ..xray.chain import leaves, pass_on
-from ..xray.frame import View, vector64
-from ..xray.objects import Ellipsoids
-from ..xray.voxelize import Grid, voxelize
-from . import losses
-from .device import DeviceState, uploaded
-from .model import RENEWED, model_of, trusted, weights_of
-from .poses import Poses, gathered, place
-from .scattered import RENEWED as SCATTER_RENEWED, light
-from .settings import Settings
-from .view import Target, differentiate, differentiate_replayed, evaluate, footprints_of, integrals
+from lingo_mi.fit import losses
+from lingo_mi.fit.device import DeviceState, uploaded
+from lingo_mi.fit.model import RENEWED, model_of, trusted, weights_of
+from lingo_mi.fit.poses import Poses, gathered, place
+from lingo_mi.fit.scatter import RENEWED as SCATTER_RENEWED
+from lingo_mi.fit.scatter import light
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.view import Target, differentiate, differentiate_replayed, evaluate, footprints_of, integrals
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.objects import Ellipsoids
+from lingo_mi.projectors.view import View, vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.reconstruction.views import require_signal
+from lingo_mi.scan import Scan
 
 
 def _targets(scan, unit, settings):
@@ -55,7 +57,11 @@ class Stepper:
         s = self.settings
         if self.share is None or iteration % RENEWED == 0 or dr.width(self.share) != len(state):
             self.share = self.shares(state)
-        if self.model is not None and self.model.scattered and iteration in {round(x * s.iterations) for x in SCATTER_RENEWED}:
+        if (
+            self.model is not None
+            and self.model.scattered
+            and iteration in {round(x * s.iterations) for x in SCATTER_RENEWED}
+        ):
             self.scatter(state)
         for value in state.values.values():
             dr.enable_grad(value)
@@ -96,7 +102,7 @@ class Stepper:
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
         """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
         the expected signal where the fit models effects. Grey images of alpha compositing are taken for line integrals."""
-        frames, (height, width) = geometry.normalised_frames(), geometry.nDetector
+        frames, (height, width) = geometry.normalised_rays(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
         scattered = [None] * len(geometry)
@@ -106,6 +112,7 @@ class Stepper:
 
         def along(rays):
             return integrals(footprints_of(gaussians, rays, self.settings), rays, self.settings, share)
+
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
             view = View.of(frames, i, height, width, panel=False)
@@ -132,14 +139,22 @@ class Stepper:
         """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""
         if self.model is None or self.model.split is None:
             return None
-        return self.model.shares(self.volume(state), np.stack([c.numpy() for c in state.values['centre']], 1), self.half)
+        return self.model.shares(
+            self.volume(state), np.stack([c.numpy() for c in state.values['centre']], 1), self.half
+        )
 
     def cloud(self, state: DeviceState) -> Ellipsoids:
         """The Gaussians in the world frame, mm, densities 1/mm."""
         centre, scale, rotation, density = (dr.detach(x) for x in state.gaussians(self.settings))
         size, middle = dr.opaque(mi.Float, self.geometry.scale), dr.opaque(mi.Point3f, self.geometry.offOrigin)
-        return Ellipsoids.of(centre / size + middle, scale / size, rotation, density * dr.opaque(mi.Float, self.unit),
-                             self.shares(state), 'cloud')
+        return Ellipsoids.of(
+            centre / size + middle,
+            scale / size,
+            rotation,
+            density * dr.opaque(mi.Float, self.unit),
+            self.shares(state),
+            'cloud',
+        )
 
     def arrays(self) -> dict:
         """What steps keep beside the state, by name, for a checkpoint."""
@@ -182,7 +197,7 @@ class Stepper:
         voxel, between = 2 * self.half / self.geometry.nVoxel, np.array(self.geometry.nVoxel) - 1
         shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
         room = between - (np.array(shape) - 1) * s.tv_stride
-        corner = -self.half + (.5 - .5 * s.tv_stride + rng.random(3) * room) * voxel
+        corner = -self.half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
         voxel = voxel * s.tv_stride
         low, high = vector64(corner), vector64(corner + shape * voxel)
         with dr.suspend_grad():
@@ -203,4 +218,4 @@ class Stepper:
 def density_unit(scan: Scan, settings: Settings) -> float:
     """The density that a fit counts as 1: see `Settings.normalise`. Raises InputError for an empty scan."""
     require_signal(scan, 'fit')
-    return float(scan.projections.max()) * scan.geometry.scale if settings.normalise else 1.
+    return float(scan.projections.max()) * scan.geometry.scale if settings.normalise else 1.0

@@ -1,4 +1,5 @@
 """One measured view in a step of the fit: the cloud's image, the loss and its derivatives."""
+
 from __future__ import annotations
 
 import functools
@@ -9,18 +10,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..scan import Scan
-from ..xray.alpha import composite, flatten
-from ..xray.chain import leaves, pass_on
-from ..xray.footprint import project
-from ..xray.frame import View
-from ..xray.radiance import seen
-from ..xray.replay import Replay
-from ..xray.splat import splat
-from . import losses
-from .device import uploaded
-from .loss_scale import loss_scale
-from .settings import Settings
+from lingo_mi.fit import losses
+from lingo_mi.fit.device import uploaded
+from lingo_mi.fit.loss_scale import loss_scale
+from lingo_mi.fit.settings import Settings
+from lingo_mi.projectors.alpha import composite, flatten
+from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.frozen import Replay
+from lingo_mi.projectors.radiance import seen
+from lingo_mi.projectors.splat import splat
+from lingo_mi.projectors.view import View
+from lingo_mi.scan import Scan
 
 
 @dataclass
@@ -31,7 +32,7 @@ class Target:
     pixels     Float [height * width], normalised line integrals over the fit's unit of density
     weights    Float, what they were multiplied by and images are before they are compared; None: nothing
     valid      Bool, which of them are valid; None: all
-    frames     the geometry's `Frames` of the view alone
+    frames     the geometry's `Rays` of the view alone
     scattered  Float, the scattered light that is expected in them; None: none
     """
 
@@ -46,7 +47,7 @@ class Target:
     def of(scan: Scan, index: int, unit: float, weights=None) -> Target:
         """View `index` of a scan; weights float32 [view, v, u] or None."""
         height, width = scan.geometry.nDetector
-        frames = scan.geometry.normalised_frames()[[index]]
+        frames = scan.geometry.normalised_rays()[[index]]
         pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
         valid = None
         if weights is not None:
@@ -84,8 +85,10 @@ def integrals(footprints, rays, settings: Settings, share=None) -> list:
         return [composite(footprints, rays.height, rays.width)]
     amplitude, *others = footprints.values
     parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
-    return [splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.extent)
-            * rays.lengths() for part in parts]
+    return [
+        splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.extent) * rays.lengths()
+        for part in parts
+    ]
 
 
 def differentiate(gaussians, target: Target, settings: Settings, batch: int, model=None, share=None):
@@ -105,6 +108,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, mod
         leaf = leaves(footprints.values)  # their derivatives are wanted themselves, for the statistic
         bundles.append((footprints, leaf))
         return integrals(replace(footprints, values=leaf), rays, s, share)
+
     image = image_along(view)[0] if model is None else model.image(image_along, view, target.scattered)
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
@@ -129,15 +133,45 @@ def differentiate_replayed(gaussians, target: Target, settings: Settings, batch:
     """`differentiate` line integrals that are fitted as they are, replayed; the view's pose is a constant."""
     view = target.view
     *found, gradients = _REPLAY(
-        *gaussians, view.source, view.corner, view.u, view.v, target.pixels, target.weights, target.valid,
-        height=view.height, width=view.width, parallel=view.parallel, panel=view.panel, settings=settings, batch=batch)
+        *gaussians,
+        view.source,
+        view.corner,
+        view.u,
+        view.v,
+        target.pixels,
+        target.weights,
+        target.valid,
+        height=view.height,
+        width=view.width,
+        parallel=view.parallel,
+        panel=view.panel,
+        settings=settings,
+        batch=batch,
+    )
     for x, gradient in zip(gaussians, gradients):
         dr.accum_grad(x, gradient)
     return found
 
 
-def _differentiated(centre, scale, rotation, density, source, corner, u, v, pixels, weights, valid, height, width, parallel,
-                    panel, settings, batch):
+def _differentiated(
+    centre,
+    scale,
+    rotation,
+    density,
+    source,
+    corner,
+    u,
+    v,
+    pixels,
+    weights,
+    valid,
+    height,
+    width,
+    parallel,
+    panel,
+    settings,
+    batch,
+):
     gaussians = centre, scale, rotation, density
     dr.enable_grad(gaussians)
     target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)

@@ -9,21 +9,22 @@ factor is the one thing chosen here:
     'lsq'     the one factor that explains the projections best, see `least_squares_factor`
     'fdk'     not the mean pixel, but an FDK volume at the point, times the factor of 'lsq' (own: a sharper guess)
 """
+
 from __future__ import annotations
 
 import numpy as np
 from scipy import ndimage
 
-from ..geometry import Frames
-from .camera import camera_matrices
-from .voxel_filter import pixels
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.lingo.voxel_filter import pixels
 
-FACTORS = {'paper': 0.15, 'raw': 1.}
+FACTORS = {'paper': 0.15, 'raw': 1.0}
 MODES = (*FACTORS, 'lsq', 'fdk')
-FAINTEST = .02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
+FAINTEST = 0.02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
 
 
-def mean_pixel(frames: Frames, projections, points, valid=None) -> np.ndarray:
+def mean_pixel(frames: Rays, projections, points, valid=None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
     frames       n views in the normalised frame
@@ -51,7 +52,7 @@ def sampled(volume, points, half) -> np.ndarray:
     volume  [x, y, z], densities
     points  [N, 3] and half, [3], half the volume's sides: both in the normalised frame
     """
-    place = (np.asarray(points, float) / half + 1) / 2 * volume.shape - .5
+    place = (np.asarray(points, float) / half + 1) / 2 * volume.shape - 0.5
     value = ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
     return np.maximum(value, FAINTEST * volume.max())
 
@@ -64,5 +65,5 @@ def least_squares_factor(measured, rendered) -> float:
     """
     rendered = np.asarray(rendered, np.float64).ravel()
     power = rendered @ rendered
-    alpha = np.asarray(measured, np.float64).ravel() @ rendered / power if power > 0 else 1.
-    return float(alpha) if np.isfinite(alpha) and alpha > 0 else 1.
+    alpha = np.asarray(measured, np.float64).ravel() @ rendered / power if power > 0 else 1.0
+    return float(alpha) if np.isfinite(alpha) and alpha > 0 else 1.0

@@ -1,4 +1,5 @@
 """LINGO's initial cloud (paper, section III-A and III-B), from projections alone. NumPy and SciPy."""
+
 from __future__ import annotations
 
 import time
@@ -7,13 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import Frames
-from .density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
-from .ipsd import neighbour_distance
-from .masks import masks, truncated
-from .scaling import occupancy, scale_factor, scaled_grid
-from .voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.lingo.density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
+from lingo_mi.lingo.ipsd import neighbour_distance
+from lingo_mi.lingo.masks import masks, truncated
+from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
+from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Settings:
     high_fraction: float = 0.25
     low_factor: float = 0.1
     resolution: int = 16
-    V_S: float = 20.
+    V_S: float = 20.0
     density: str = 'lsq'
     lsq_views: int = 8
     misses: int = 0
@@ -91,16 +92,28 @@ def _outside(wanted: str, found) -> str:
     if not cut.any():
         return 'invalid' if wanted == 'auto' else wanted
     if wanted == 'invalid':
-        warnings.warn(f'the object reaches the edge of the panel in {np.count_nonzero(cut)} of {len(cut)} views, and what a '
-                      "view does not see is taken for empty: for a truncated scan set outside=ignore", stacklevel=3)
+        warnings.warn(
+            f'the object reaches the edge of the panel in {np.count_nonzero(cut)} of {len(cut)} views, and what a '
+            'view does not see is taken for empty: for a truncated scan set outside=ignore',
+            stacklevel=3,
+        )
     return 'ignore' if wanted == 'auto' else wanted
 
 
-def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = Settings(), rng=None,
-               render=None, fdk=None, valid=None) -> InitialCloud:
+def initialise(
+    frames: Rays,
+    projections,
+    nVoxel,
+    half,
+    settings: Settings = Settings(),
+    rng=None,
+    render=None,
+    fdk=None,
+    valid=None,
+) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
-    frames       n views in the normalised frame (`Geometry.normalised_frames`)
+    frames       n views in the normalised frame (`Geometry.normalised_rays`)
     projections  [n, v, u] normalised line integrals (`Scan.normalised`)
     nVoxel       V_d, the volume's voxels (x, y, z); a single slice (fan beam) is fine
     half         half the volume's sides in the normalised frame, [3] (`Geometry.half`)
@@ -132,8 +145,10 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
     grid = scaled_grid(nVoxel, S)
     low, high = valid_voxels(frames, found, grid, half, settings.misses, outside)
     if len(low) == 0:
-        raise InputError('no voxel lies in the low-density mask of every view: check the geometry and '
-                         "the volume's size, or, for a truncated scan, set outside='ignore' or misses > 0")
+        raise InputError(
+            'no voxel lies in the low-density mask of every view: check the geometry and '
+            "the volume's size, or, for a truncated scan, set outside='ignore' or misses > 0"
+        )
 
     n_high = round(settings.n_points * settings.high_fraction) if len(high) else 0
     n_low = settings.n_points - n_high
@@ -162,9 +177,24 @@ def initialise(frames: Frames, projections, nVoxel, half, settings: Settings = S
         factor = least_squares_factor(projections[views][trusted], rendered[trusted])
     else:
         factor = FACTORS[settings.density]
-    return InitialCloud(points, density * factor, spacing, {
-        'method': 'lingo', 'P': P, 'S': S, 'grid': grid,
-        'density': settings.density, 'density_factor': factor,
-        'cells_low': len(low), 'cells_high': len(high), 'points_low': n_low, 'points_high': n_high,
-        'repeats': int(repeats), 'outside': outside,
-        'T_high': float(found.t_high.mean()), 'seconds': time.perf_counter() - begun})
+    return InitialCloud(
+        points,
+        density * factor,
+        spacing,
+        {
+            'method': 'lingo',
+            'P': P,
+            'S': S,
+            'grid': grid,
+            'density': settings.density,
+            'density_factor': factor,
+            'cells_low': len(low),
+            'cells_high': len(high),
+            'points_low': n_low,
+            'points_high': n_high,
+            'repeats': int(repeats),
+            'outside': outside,
+            'T_high': float(found.t_high.mean()),
+            'seconds': time.perf_counter() - begun,
+        },
+    )

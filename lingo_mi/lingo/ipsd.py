@@ -1,4 +1,5 @@
 """Initialization Point Cloud Structural Deviation (paper, section III-D). NumPy and SciPy."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -38,4 +39,4 @@ def neighbour_distance(points, fallback: float) -> np.ndarray:
     if k < 2:
         return np.full(len(points), float(fallback))
     distance = cKDTree(points).query(points, k, workers=-1)[0][:, 1:]
-    return np.sqrt(np.mean(distance ** 2, 1))
+    return np.sqrt(np.mean(distance**2, 1))

@@ -1,11 +1,12 @@
 """High and low masks of every projection (paper, section III-A). Pure NumPy."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from .otsu import otsu
+from lingo_mi.lingo.otsu import otsu
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def masks(projections, low_factor: float = 0.1, valid=None) -> Masks:
     """
     projections = np.asarray(projections)
     known = [...] * len(projections) if valid is None else valid
-    t_high = np.array([otsu(image[v]) if v is ... or v.any() else 0. for image, v in zip(projections, known)])
+    t_high = np.array([otsu(image[v]) if v is ... or v.any() else 0.0 for image, v in zip(projections, known)])
     t_low = t_high * low_factor
     at = (slice(None), None, None)
     low, high = projections > t_low[at], projections > t_high[at]
@@ -41,7 +42,7 @@ def masks(projections, low_factor: float = 0.1, valid=None) -> Masks:
     return Masks(low, high, t_low, t_high, valid)
 
 
-def truncated(found: Masks, share: float = .05) -> np.ndarray:
+def truncated(found: Masks, share: float = 0.05) -> np.ndarray:
     """Views, bool [n], in which the object reaches the edge of the panel: the low mask holds more than `share` of the
     outermost pixels of a side.
 

@@ -1,4 +1,5 @@
 """Otsu's threshold (paper, section II-A). Pure NumPy and scikit-image."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,15 +1,17 @@
 """Voxel scaling for spatial occupancy (paper, section III-B). Pure NumPy."""
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..geometry import Frames
-from .masks import Masks
-from .voxel_filter import valid_voxels
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.lingo.masks import Masks
+from lingo_mi.lingo.voxel_filter import valid_voxels
 
 
-def occupancy(frames: Frames, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0,
-              outside: str = 'invalid') -> float:
+def occupancy(
+    frames: Rays, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0, outside: str = 'invalid'
+) -> float:
     """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
 
     An axis with fewer than V voxels keeps them (a single slice stays one cell thick), and the count is
@@ -20,9 +22,9 @@ def occupancy(frames: Frames, masks: Masks, half, nVoxel, resolution: int = 16, 
     return len(low) / float(np.prod(coarse))
 
 
-def scale_factor(P: float, V_S: float = 20.) -> float:
+def scale_factor(P: float, V_S: float = 20.0) -> float:
     """S = max(P V_S, 1)."""
-    return max(P * V_S, 1.)
+    return max(P * V_S, 1.0)
 
 
 def scaled_grid(nVoxel, S: float, smallest: int = 8) -> tuple[int, int, int]:

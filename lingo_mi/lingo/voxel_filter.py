@@ -3,14 +3,15 @@
 Points that project outside an image are removed, as the paper's text says, not moved to its border (as `clip`
 would). Pure NumPy.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import Frames
-from .camera import camera_matrices
-from .masks import Masks
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.lingo.masks import Masks
 
 CHUNK = 1 << 15  # points projected at a time: they stay in the cache
 BLOCK = 8  # cells along the side of a block that is tested at once
@@ -56,7 +57,7 @@ def _candidates(matrices, low_images, grid, half, misses, outside):
     """
     shape = low_images[0].shape
     ends = [np.minimum(np.arange(0, n + BLOCK, BLOCK), n) for n in grid]
-    ends = [e[:np.argmax(e) + 1] for e in ends]
+    ends = [e[: np.argmax(e) + 1] for e in ends]
     blocks = tuple(len(e) - 1 for e in ends)
     axes = [e * (2 * h / n) - h for e, h, n in zip(ends, half, grid)]
     lattice = np.stack(np.meshgrid(*axes, indexing='ij'))
@@ -69,8 +70,9 @@ def _candidates(matrices, low_images, grid, half, misses, outside):
         # One pixel more on each side guards against rounding.
         first = [_over_corners(np.minimum, q) - 1 for q in position]
         last = [_over_corners(np.maximum, q) + 2 for q in position]
-        x0, x1, y0, y1 = (np.clip(q, 0, shape[1 - axis]).astype(np.int32)
-                          for axis in (0, 1) for q in (first[axis], last[axis]))
+        x0, x1, y0, y1 = (
+            np.clip(q, 0, shape[1 - axis]).astype(np.int32) for axis in (0, 1) for q in (first[axis], last[axis])
+        )
         table = np.zeros((shape[0] + 1, shape[1] + 1), np.int32)  # pixels of the mask above and left
         np.cumsum(np.cumsum(image, 0, dtype=np.int32), 1, out=table[1:, 1:])
         empty = in_front & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] == 0)
@@ -91,7 +93,7 @@ def _over_corners(function, values):
     return values
 
 
-def valid_voxels(frames: Frames, masks: Masks, grid, half, misses: int = 0, outside: str = 'invalid'):
+def valid_voxels(frames: Rays, masks: Masks, grid, half, misses: int = 0, outside: str = 'invalid'):
     """The all-view intersections: flat cell indices (z fastest) of the low and the high valid set, sorted.
 
     frames   n views in the normalised frame
@@ -121,7 +123,7 @@ def valid_voxels(frames: Frames, masks: Masks, grid, half, misses: int = 0, outs
         possible = masks.low if valid is None else masks.low | ~masks.valid
         cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):
-        alive = cells[start:start + CHUNK]
+        alive = cells[start : start + CHUNK]
         points = np.ascontiguousarray(voxel_centres(grid, half, alive).T)
         missed_low, missed_high, seen = (np.zeros(len(alive), np.int32) for _ in range(3))
         for view, (matrix, low_image, high_image) in enumerate(zip(matrices, low_images, high_images)):
@@ -137,7 +139,8 @@ def valid_voxels(frames: Frames, masks: Masks, grid, half, misses: int = 0, outs
             keep = (missed_low <= misses) | (missed_high <= misses)
             if np.count_nonzero(keep) < 0.9 * len(keep):  # a cell out of both sets never comes back
                 alive, points, missed_low, missed_high, seen = (
-                    a[..., keep] for a in (alive, points, missed_low, missed_high, seen))
+                    a[..., keep] for a in (alive, points, missed_low, missed_high, seen)
+                )
         low.append(alive[(missed_low <= misses) & (seen > 0)])
         high.append(alive[(missed_high <= misses) & (seen > 0)])
     none = np.zeros(0, np.int64)

@@ -8,6 +8,7 @@
 Every phantom is a cube centred on the origin of the world frame. A seed decides textures, vessels and random
 clouds.
 """
+
 from __future__ import annotations
 
 import importlib
@@ -17,8 +18,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry import Geometry
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
 
 _NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
 
@@ -32,7 +33,7 @@ class Analytic(Protocol):
 
 @dataclass(frozen=True)
 class Phantom:
-    """A voxelised test object.
+    """A voxelized test object.
 
     data      float32 [x, y, z] in [0, 1], voxel averages or centre values as the phantom's module says
     spacing   voxel size, mm, (x, y, z)
@@ -64,7 +65,7 @@ def make(name: str, size: int, seed: int = 0) -> Phantom:
     Raises InputError for an unknown name, a size outside 8..512 or a negative seed.
     """
     if name not in _NAMES:
-        raise InputError(f"there is no phantom {name!r}: choose one of {', '.join(_NAMES)}")
+        raise InputError(f'there is no phantom {name!r}: choose one of {", ".join(_NAMES)}')
     try:
         size, seed = operator.index(size), operator.index(seed)
     except TypeError:

@@ -7,6 +7,7 @@ closed form along whole lines, in float64:
 
     integral along o + t D  =  rho sqrt(2 pi) |D| / |d| exp(-1/2 |w x d|^2 / |d|^2),   w = W (o - p),  d = W D
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -14,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
-from ..geometry import Geometry
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
 
-SIDE = 256.     # mm
-CUT = 6.        # sigma, of the voxels
-_WINDOW = 8.    # sigma, of the projections
+SIDE = 256.0  # mm
+CUT = 6.0  # sigma, of the voxels
+_WINDOW = 8.0  # sigma, of the projections
 
 
 @dataclass(frozen=True)
@@ -48,21 +49,21 @@ class Cloud:
     @property
     def mass(self) -> float:
         """Integral of the density, mm^3."""
-        return float((self.density * (2 * np.pi)**1.5 * self.scales.prod(1)).sum())
+        return float((self.density * (2 * np.pi) ** 1.5 * self.scales.prod(1)).sum())
 
     def voxels(self, size: int, side: float = SIDE) -> np.ndarray:
         """Values at the voxel centres of a centred cube, float32 [size]^3."""
         h = side / size
-        axis = (np.arange(size) + .5) * h - side / 2
+        axis = (np.arange(size) + 0.5) * h - side / 2
         data = np.zeros((size,) * 3)
-        reach = CUT * np.sqrt((np.linalg.inv(self.whiten)**2).sum(2))    # half sides of the 6 sigma boxes
+        reach = CUT * np.sqrt((np.linalg.inv(self.whiten) ** 2).sum(2))  # half sides of the 6 sigma boxes
         for p, r, w, rho in zip(self.centres, reach, self.whiten, self.density):
             where = tuple(slice(*np.searchsorted(axis, (a - b, a + b))) for a, b in zip(p, r))
             x, y, z = (axis[s] - c for s, c in zip(where, p))
             (a, d, e), (_, b, f), (_, _, c) = w.T @ w
             q = (a * x * x)[:, None, None] + (b * y * y)[:, None] + c * z * z
             q += 2 * (d * x[:, None, None] * y[:, None] + e * x[:, None, None] * z + f * y[:, None] * z)
-            data[where] += rho * np.where(q <= CUT * CUT, np.exp(-.5 * q), 0)
+            data[where] += rho * np.where(q <= CUT * CUT, np.exp(-0.5 * q), 0)
         return data.astype(np.float32)
 
     def project(self, geometry: Geometry) -> np.ndarray:
@@ -72,7 +73,7 @@ class Cloud:
         peak. Raises InputError if the source lies in or beside a Gaussian, where it has no outline on the
         panel.
         """
-        frames, whiten = geometry.frames(), self.whiten
+        frames, whiten = geometry.rays(), self.whiten
         spread = np.linalg.inv(np.swapaxes(whiten, 1, 2) @ whiten)
         panel = geometry.nDetector[::-1]
         out = np.zeros((len(geometry), *geometry.nDetector))
@@ -82,7 +83,7 @@ class Cloud:
             high = np.clip(np.ceil(high), 0, panel).astype(int)
             for i in np.flatnonzero((low < high).all(1)):
                 (x0, y0), (x1, y1) = low[i], high[i]
-                x, y = np.arange(x0, x1) + .5 - centre[i, 0], np.arange(y0, y1) + .5 - centre[i, 1]
+                x, y = np.arange(x0, x1) + 0.5 - centre[i, 0], np.arange(y0, y1) + 0.5 - centre[i, 1]
                 shape = _footprint(x, y, frames, view, centre[i], self.centres[i], whiten[i])
                 out[view, y0:y1, x0:x1] += self.density[i] * shape
         return out.astype(np.float32)
@@ -110,7 +111,7 @@ def _outlines(centres, spread, frames, view):
 
 def _footprint(x, y, frames, view, pixel, centre, whiten):
     """Line integrals [y, x] of a Gaussian of density 1 at pixel offsets x, y from its projected centre."""
-    origin, ray = frames.rays(view, *pixel)
+    origin, ray = frames.through(view, *pixel)
     a, b = whiten @ frames.u[view], whiten @ frames.v[view]
     d = whiten @ ray
     # w x d vanishes at the projected centre, and is linear in x and y.
@@ -122,13 +123,18 @@ def _footprint(x, y, frames, view, pixel, centre, whiten):
         na, nb = np.cross(w, a), np.cross(w, b)
         ray2 = _square(x, y, frames.u[view], frames.v[view], ray)
         d2 = _square(x, y, a, b, d)
-    return np.sqrt(2 * np.pi * ray2 / d2) * np.exp(-.5 * _square(x, y, na, nb, np.zeros(3)) / d2)
+    return np.sqrt(2 * np.pi * ray2 / d2) * np.exp(-0.5 * _square(x, y, na, nb, np.zeros(3)) / d2)
 
 
 def _square(x, y, a, b, c):
     """|x a + y b + c|^2 on the grid [y, x]."""
-    return (x * x * (a @ a) + 2 * x * (a @ c) + (c @ c) + (2 * y * (b @ c) + y * y * (b @ b))[:, None]
-            + (2 * (a @ b) * y)[:, None] * x)
+    return (
+        x * x * (a @ a)
+        + 2 * x * (a @ c)
+        + (c @ c)
+        + (2 * y * (b @ c) + y * y * (b @ b))[:, None]
+        + (2 * (a @ b) * y)[:, None] * x
+    )
 
 
 def cloud(n: int = 2000, seed: int = 0) -> Cloud:
@@ -141,11 +147,11 @@ def cloud(n: int = 2000, seed: int = 0) -> Cloud:
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(n, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    centres = direction * 80 * rng.random((n, 1))**(1 / 2.4)
+    centres = direction * 80 * rng.random((n, 1)) ** (1 / 2.4)
     scales = 1.2 * np.exp(rng.uniform(0, np.log(7.5), (n, 3)))
     quaternions = rng.normal(size=(n, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    density = rng.uniform(.2, 1, n) * .12 * min(1., (2000 / n)**.8)
+    density = rng.uniform(0.2, 1, n) * 0.12 * min(1.0, (2000 / n) ** 0.8)
     return Cloud(centres, scales, quaternions, density)
 
 

@@ -8,6 +8,7 @@ Mitsuba's `ply` and `obj` shapes:
     flange().export('flange.ply')
     bolts().export('bolts.ply')       # eight that fit its holes; not part of the phantom
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,18 +16,19 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from ..errors import InputError
-from ..geometry import Geometry
-from .solids import rotation
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.triangles import add_lengths, voxelize
+from lingo_mi.phantoms.solids import rotation
 
-SIDE = 256.                                         # mm
-BORE, NECK, ROOT, RIM = 32., 40., 54., 96.          # radii, mm
-BOTTOM, PLATE, TOP = -38., -14., 44.                # heights of the faces, mm
-BOLTS, BOLT_CIRCLE, BOLT, DOWEL = 9, 76., 10., 3.5  # count, radius of their circle, radii of the holes
-SHANK, HEAD, LENGTH = 9.5, 15., 10.                 # a bolt's radii and the height of its head
-GAP = .25                                           # between head and plate: parts that touch would share a face
-_ARC = 12                                           # mesh steps along a bolt's sector
-_FAN = 36                                           # vertices around a hole
+SIDE = 256.0  # mm
+BORE, NECK, ROOT, RIM = 32.0, 40.0, 54.0, 96.0  # radii, mm
+BOTTOM, PLATE, TOP = -38.0, -14.0, 44.0  # heights of the faces, mm
+BOLTS, BOLT_CIRCLE, BOLT, DOWEL = 9, 76.0, 10.0, 3.5  # count, radius of their circle, radii of the holes
+SHANK, HEAD, LENGTH = 9.5, 15.0, 10.0  # a bolt's radii and the height of its head
+GAP = 0.25  # between head and plate: parts that touch would share a face
+_ARC = 12  # mesh steps along a bolt's sector
+_FAN = 36  # vertices around a hole
 
 
 def _outline():
@@ -66,9 +68,11 @@ def flange() -> trimesh.Trimesh:
         spoke = outline - [BOLT_CIRCLE, 0]
         rim = spoke / np.linalg.norm(spoke, axis=1, keepdims=True) * hole + [BOLT_CIRCLE, 0]
         outer, inner = outline @ matrix, rim @ matrix
-        triangles += [_strip(lift(outer, PLATE), lift(inner, PLATE)),
-                      _strip(lift(inner, BOTTOM), lift(outer, BOTTOM)),
-                      _strip(lift(inner, PLATE), lift(inner, BOTTOM))]
+        triangles += [
+            _strip(lift(outer, PLATE), lift(inner, PLATE)),
+            _strip(lift(inner, BOTTOM), lift(outer, BOTTOM)),
+            _strip(lift(inner, PLATE), lift(inner, BOTTOM)),
+        ]
     # The profile from the rim's lower edge over the rim, and from the neck over the bore to the bottom.
     rim = [(RIM, BOTTOM), (RIM, PLATE)]
     neck = [(ROOT, PLATE), (NECK, TOP), (BORE, TOP), (BORE, BOTTOM), (ROOT, BOTTOM)]
@@ -81,8 +85,14 @@ def bolts() -> trimesh.Trimesh:
     """Hexagon bolts through the eight bolt holes in the world frame, mm: one mesh of closed parts, outward normals."""
     bottom, top = BOTTOM - 4, PLATE + GAP
     # Radius, height and whether the ring is a hexagon, from the axis at the lower end to the axis at the upper one.
-    profile = [(0., bottom, False), (SHANK, bottom, False), (SHANK, top, False), (HEAD, top, True),
-               (HEAD, top + LENGTH, True), (0., top + LENGTH, True)]
+    profile = [
+        (0.0, bottom, False),
+        (SHANK, bottom, False),
+        (SHANK, top, False),
+        (HEAD, top, True),
+        (HEAD, top + LENGTH, True),
+        (0.0, top + LENGTH, True),
+    ]
     angle = 2 * np.pi * np.arange(_FAN) / _FAN
     hexagon = np.cos(np.pi / 6) / np.cos(angle % (np.pi / 3) - np.pi / 6)
     triangles = []
@@ -93,6 +103,7 @@ def bolts() -> trimesh.Trimesh:
         def ring(radius, z, hexagonal):
             r = radius * (hexagon if hexagonal else np.ones(_FAN))
             return axis + np.stack([r * np.cos(angle), r * np.sin(angle), np.full(_FAN, z)], 1)
+
         triangles += [_strip(ring(*p), ring(*q)) for p, q in zip(profile[:-1], profile[1:])]
     return _tilted(np.concatenate(triangles))
 
@@ -120,78 +131,15 @@ class Mesh:
         the panel once. The whole object must lie between source and panel.
         Raises InputError if part of it is behind the source.
         """
-        frames, faces = geometry.frames(), self.mesh.faces
+        frames, faces = geometry.rays(), self.mesh.faces
         nv, nu = geometry.nDetector
         out = np.zeros((len(geometry), nv, nu))
         for view in range(len(geometry)):
             corners = np.stack(frames.project(self.mesh.vertices, view), -1)[faces]
             if not np.isfinite(corners).all():
                 raise InputError(f'part of the mesh lies behind the source of view {view}: enlarge DSO')
-            _draw(out[view], corners, self.mesh.triangles, lambda x, y, view=view: frames.rays(view, x, y))
+            add_lengths(out[view], corners, self.mesh.triangles, lambda x, y, view=view: frames.through(view, x, y))
         return out.astype(np.float32)
-
-
-def _draw(image, corners, faces, rays):
-    """Adds to image [nv, nu] the signed distances along rays to triangles.
-
-    corners  [n, 3, 2], pixel positions; faces [n, 3, 3], world; rays(x, y) -> origins, directions
-    A pixel centre on an edge belongs to one of the two triangles only: half-open crossing tests in the panel.
-    """
-    nv, nu = image.shape
-    low = np.maximum(np.ceil(corners.min(1) - .5), 0).astype(int)
-    high = np.minimum(np.floor(corners.max(1) - .5), (nu - 1, nv - 1)).astype(int) + 1
-    for c, f, (x0, y0), (x1, y1) in zip(corners, faces, low, high):
-        if x0 >= x1 or y0 >= y1:
-            continue
-        x, y = np.meshgrid(np.arange(x0, x1) + .5, np.arange(y0, y1) + .5)
-        inside = np.zeros(x.shape, bool)
-        for (ax, ay), (bx, by) in zip(c, np.roll(c, -1, 0)):
-            # Sorted by height, so that both triangles of an edge compute the same crossing bit for bit.
-            (px, py), (qx, qy) = sorted(((ax, ay), (bx, by)), key=lambda p: (p[1], p[0]))
-            if py < qy:
-                inside ^= (py <= y) & (y < qy) & (x < px + (y - py) * ((qx - px) / (qy - py)))
-        if inside.any():
-            o, d = rays(x[inside], y[inside])
-            normal = np.cross(f[1] - f[0], f[2] - f[0])
-            along = d @ normal
-            t = ((f[0] - o) @ normal) / along * np.linalg.norm(d, axis=-1)
-            part = image[y0:y1, x0:x1]
-            part[inside] += np.sign(along) * t
-
-
-def voxelise(triangles, low, step, shape) -> np.ndarray:
-    """The share of every voxel that lies inside closed meshes of triangles [n, 3, 3]: float32 [x, y, z].
-
-    low [3], step [3]   corner of the grid and voxel size, the unit of the triangles
-
-    Columns along z are cut by the mesh, 4 x 4 a voxel; between two crossings a voxel is covered by the length it shares
-    with the column. Which way round the mesh is as a whole plays no part.
-    """
-    low, step, fine = np.asarray(low, float), np.asarray(step, float), 4
-    nx, ny, nz = shape
-    edges = low[2] + np.arange(nz + 1) * step[2]
-    start = min(low[2], triangles[..., 2].min()) - 1
-    covered = np.zeros((nx, ny, nz + 1))
-    cell = step[:2] / fine
-    corners = (triangles[:, :, :2] - low[:2]) / cell
-    first = np.maximum(np.ceil(corners.min(1) - .5), 0).astype(int)
-    last = np.minimum(np.floor(corners.max(1) - .5), (nx * fine - 1, ny * fine - 1)).astype(int) + 1
-    for face, c, (x0, y0), (x1, y1) in zip(triangles, corners, first, last):
-        if x0 >= x1 or y0 >= y1:
-            continue
-        image = np.zeros((y1 - y0, x1 - x0))
-        _draw(image, (c - (x0, y0))[None], face[None], lambda x, y, x0=x0, y0=y0: (
-            np.stack([(x + x0) * cell[0] + low[0], (y + y0) * cell[1] + low[1], 0 * x + start], -1),
-            np.broadcast_to([0., 0., 1.], (len(x), 3))))
-        j, i = np.nonzero(image)
-        sign, z = np.sign(image[j, i]), np.abs(image[j, i]) + start
-        # The length of the column below each voxel edge that lies below the crossing.
-        below = np.maximum(np.minimum(edges, z[:, None]) - edges[0], 0)
-        np.add.at(covered, ((i + x0) // fine, (j + y0) // fine), sign[:, None] * below)
-    data = np.diff(covered, axis=2) / (step[2] * fine * fine)
-    data *= np.sign(data.sum())
-    data[np.abs(data) < 1e-9] = 0
-    return np.clip(data, 0, 1).astype(np.float32)
 
 
 def build(size: int, seed: int):
@@ -199,4 +147,4 @@ def build(size: int, seed: int):
     part."""
     analytic = Mesh(flange())
     step = SIDE / size
-    return voxelise(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size,) * 3), SIDE, analytic
+    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size,) * 3), SIDE, analytic

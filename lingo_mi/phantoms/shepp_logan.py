@@ -9,29 +9,32 @@ is 128 mm.
 
 Data are voxel averages: voxels that an ellipsoid's surface crosses are sampled at 4 x 4 x 4 points.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry import Geometry
+from lingo_mi.geometry.base import Geometry
 
-SIDE = 256.     # mm
+SIDE = 256.0  # mm
 
 # density, semi-axes (x, y, z), centre (x, y, z), rotation about z in degrees; lengths in half sides
-TABLE = np.array([
-    (1., .6900, .920, .810, 0, 0, 0, 0),
-    (-.8, .6624, .874, .780, 0, -.0184, 0, 0),
-    (-.2, .1100, .310, .220, .22, 0, 0, -18),
-    (-.2, .1600, .410, .280, -.22, 0, 0, 18),
-    (.1, .2100, .250, .410, 0, .35, -.15, 0),
-    (.1, .0460, .046, .050, 0, .1, .25, 0),
-    (.1, .0460, .046, .050, 0, -.1, .25, 0),
-    (.1, .0460, .023, .050, -.08, -.605, 0, 0),
-    (.1, .0230, .023, .020, 0, -.606, 0, 0),
-    (.1, .0230, .046, .020, .06, -.605, 0, 0),
-])
+TABLE = np.array(
+    [
+        (1.0, 0.6900, 0.920, 0.810, 0, 0, 0, 0),
+        (-0.8, 0.6624, 0.874, 0.780, 0, -0.0184, 0, 0),
+        (-0.2, 0.1100, 0.310, 0.220, 0.22, 0, 0, -18),
+        (-0.2, 0.1600, 0.410, 0.280, -0.22, 0, 0, 18),
+        (0.1, 0.2100, 0.250, 0.410, 0, 0.35, -0.15, 0),
+        (0.1, 0.0460, 0.046, 0.050, 0, 0.1, 0.25, 0),
+        (0.1, 0.0460, 0.046, 0.050, 0, -0.1, 0.25, 0),
+        (0.1, 0.0460, 0.023, 0.050, -0.08, -0.605, 0, 0),
+        (0.1, 0.0230, 0.023, 0.020, 0, -0.606, 0, 0),
+        (0.1, 0.0230, 0.046, 0.020, 0.06, -0.605, 0, 0),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -53,19 +56,19 @@ class Ellipsoids:
         A chord is what the whole line has in common with an ellipsoid: source and panel lie outside the
         object.
         """
-        frames = geometry.frames()
+        frames = geometry.rays()
         nv, nu = geometry.nDetector
-        x, y = np.meshgrid(np.arange(nu) + .5, np.arange(nv) + .5)
+        x, y = np.meshgrid(np.arange(nu) + 0.5, np.arange(nv) + 0.5)
         out = np.zeros((len(geometry), nv, nu), np.float32)
         for view in range(len(geometry)):
-            origin, direction = frames.rays(view, x, y)
+            origin, direction = frames.through(view, x, y)
             length = np.linalg.norm(direction, axis=-1)
             total = np.zeros((nv, nu))
             for rho, c, m in zip(self.density, self.centre, self.whiten):
                 w, d = (origin - c) @ m.T, direction @ m.T
                 dd = (d * d).sum(-1)
                 t = (w * d).sum(-1) / dd
-                closest = ((w - t[..., None] * d)**2).sum(-1)
+                closest = ((w - t[..., None] * d) ** 2).sum(-1)
                 total += 2 * rho * length * np.sqrt(np.maximum(1 - closest, 0) / dd)
             out[view] = total
         return out
@@ -93,21 +96,21 @@ def build(size: int, seed: int):
     no part."""
     analytic = ellipsoids()
     h = SIDE / size
-    axis = (np.arange(size) + .5) * h - SIDE / 2
-    fine = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing='ij'), -1).reshape(-1, 3) + .5) / 4 * h - h / 2
+    axis = (np.arange(size) + 0.5) * h - SIDE / 2
+    fine = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing='ij'), -1).reshape(-1, 3) + 0.5) / 4 * h - h / 2
     data = np.zeros((size,) * 3, np.float32)
     for rho, c, m in zip(analytic.density, analytic.centre, analytic.whiten):
-        reach = np.linalg.norm(np.linalg.inv(m), axis=1) + h      # half sides of the bounding box
+        reach = np.linalg.norm(np.linalg.inv(m), axis=1) + h  # half sides of the bounding box
         where = tuple(slice(*np.searchsorted(axis, (a - r, a + r))) for a, r in zip(c, reach))
         x, y, z = (axis[s] - q for s, q in zip(where, c))
-        radius = np.sqrt(sum((row[0] * x[:, None, None] + row[1] * y[:, None] + row[2] * z)**2 for row in m))
+        radius = np.sqrt(sum((row[0] * x[:, None, None] + row[1] * y[:, None] + row[2] * z) ** 2 for row in m))
         # |M (p - c)| changes by at most |M| times half a voxel's diagonal within a voxel.
         i, j, k = np.nonzero(np.abs(radius - 1) <= np.linalg.norm(m, 2) * h * np.sqrt(3) / 2)
         cover = (radius < 1).astype(np.float32)
         edge = np.stack([x[i], y[j], z[k]], 1) @ m.T
         inside = np.zeros(len(edge), np.float32)
         for f in fine @ m.T:
-            inside += ((edge + f)**2).sum(1) < 1
+            inside += ((edge + f) ** 2).sum(1) < 1
         cover[i, j, k] = inside / len(fine)
         data[where] += np.float32(rho) * cover
     return np.clip(data, 0, 1), SIDE, analytic

@@ -6,6 +6,7 @@ coordinates. Distances of cones and ellipsoids are approximate away from their s
 Quilez, "Distance functions", iquilezles.org), exact to first order at it, which is where partial volumes are
 read.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -37,9 +38,9 @@ class Cone:
         a, ab = _f(self.a), _f(self.b) - _f(self.a)
         x, y, z = x - a[0], y - a[1], z - a[2]
         t = np.clip((x * ab[0] + y * ab[1] + z * ab[2]) / max(ab @ ab, 1e-12), 0, 1)
-        d = (x - t * ab[0])**2
-        d += (y - t * ab[1])**2
-        d += (z - t * ab[2])**2
+        d = (x - t * ab[0]) ** 2
+        d += (y - t * ab[1]) ** 2
+        d += (z - t * ab[2]) ** 2
         np.sqrt(d, out=d)
         return d - (np.float32(self.ra) + t * np.float32(self.rb - self.ra))
 
@@ -55,7 +56,7 @@ class Ellipsoid:
     @property
     def bounds(self):
         axes = np.eye(3) if self.axes is None else self.axes
-        half = np.sqrt(((axes * np.array(self.radii)[:, None])**2).sum(0))
+        half = np.sqrt(((axes * np.array(self.radii)[:, None]) ** 2).sum(0))
         return np.stack([self.centre - half, self.centre + half])
 
     def __call__(self, x, y, z):
@@ -85,9 +86,8 @@ class Block:
         return np.stack([self.centre - half, self.centre + half])
 
     def __call__(self, x, y, z):
-        q = [np.abs(p) - np.float32(h - self.edge)
-             for p, h in zip(local(x, y, z, self.centre, self.axes), self.half)]
-        outside = np.sqrt(sum(np.maximum(p, 0)**2 for p in q))
+        q = [np.abs(p) - np.float32(h - self.edge) for p, h in zip(local(x, y, z, self.centre, self.axes), self.half)]
+        outside = np.sqrt(sum(np.maximum(p, 0) ** 2 for p in q))
         return outside + np.minimum(np.maximum(np.maximum(q[0], q[1]), q[2]), 0) - np.float32(self.edge)
 
 
@@ -110,8 +110,8 @@ class Cylinder:
     def __call__(self, x, y, z):
         p = local(x, y, z, self.centre, None)
         along = np.abs(p.pop(self.axis)) - np.float32(self.half - self.edge)
-        across = np.sqrt(p[0]**2 + p[1]**2) - np.float32(self.radius - self.edge)
-        outside = np.sqrt(np.maximum(along, 0)**2 + np.maximum(across, 0)**2)
+        across = np.sqrt(p[0] ** 2 + p[1] ** 2) - np.float32(self.radius - self.edge)
+        outside = np.sqrt(np.maximum(along, 0) ** 2 + np.maximum(across, 0) ** 2)
         return outside + np.minimum(np.maximum(along, across), 0) - np.float32(self.edge)
 
 
@@ -120,7 +120,7 @@ class Blend:
     """The smooth union of solids, rounded over the distance k (0: the plain union)."""
 
     parts: tuple
-    k: float = 0.
+    k: float = 0.0
 
     @property
     def bounds(self):
@@ -142,7 +142,7 @@ class Cut:
     solid: object
     point: tuple
     normal: tuple
-    k: float = 0.
+    k: float = 0.0
 
     @property
     def bounds(self):
@@ -153,7 +153,7 @@ class Cut:
         return smooth_max(self.solid(x, y, z), behind, self.k)
 
 
-def tube(points, radii, k=0., smooth=0) -> Blend:
+def tube(points, radii, k=0.0, smooth=0) -> Blend:
     """A chain of cones through `points` with the given radii.
 
     smooth  cones per stretch of a monotone cubic through the points; 0: straight stretches
@@ -163,8 +163,10 @@ def tube(points, radii, k=0., smooth=0) -> Blend:
         knots = np.arange(len(points))
         fine = np.linspace(0, knots[-1], smooth * knots[-1] + 1)
         points, radii = (PchipInterpolator(knots, v)(fine) for v in (points, radii))
-    return Blend(tuple(Cone(tuple(a), tuple(b), ra, rb)
-                       for a, b, ra, rb in zip(points[:-1], points[1:], radii[:-1], radii[1:])), k)
+    return Blend(
+        tuple(Cone(tuple(a), tuple(b), ra, rb) for a, b, ra, rb in zip(points[:-1], points[1:], radii[:-1], radii[1:])),
+        k,
+    )
 
 
 def smooth_min(a, b, k):
@@ -188,7 +190,7 @@ def local(x, y, z, centre, axes):
     return p if axes is None else [r[0] * p[0] + r[1] * p[1] + r[2] * p[2] for r in _f(axes)]
 
 
-def rotation(yaw=0., pitch=0., roll=0.) -> np.ndarray:
+def rotation(yaw=0.0, pitch=0.0, roll=0.0) -> np.ndarray:
     """Axes [3, 3] (rows) turned by yaw about z, then pitch about x, then roll about y, in degrees."""
     angles = np.radians([yaw, pitch, roll])
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
@@ -205,8 +207,9 @@ class Grid:
     def __init__(self, size: int, side: float, origin):
         self.size, self.h = size, side / size
         self.shape = (size, size, size)
-        self.axes = [np.float32(o) + (np.arange(size, dtype=np.float32) + np.float32(.5)) * np.float32(self.h)
-                     for o in origin]
+        self.axes = [
+            np.float32(o) + (np.arange(size, dtype=np.float32) + np.float32(0.5)) * np.float32(self.h) for o in origin
+        ]
         self.origin = np.array(origin, float)
 
     def near(self, solid, pad):
@@ -227,9 +230,9 @@ class Grid:
 
     def cover(self, distance):
         """The covered fraction of a voxel whose centre is at a signed distance from a surface."""
-        return np.clip(np.float32(.5) - distance / np.float32(self.h), 0, 1)
+        return np.clip(np.float32(0.5) - distance / np.float32(self.h), 0, 1)
 
-    def paint(self, image, solid, value, soft=0.):
+    def paint(self, image, solid, value, soft=0.0):
         """Blend `value` (a number or a function of the box's slices) into `image` inside a solid.
 
         soft  width over which the solid's edge fades, at least a voxel
@@ -238,7 +241,7 @@ class Grid:
         if found is None:
             return
         where, p = found
-        c = np.clip(np.float32(.5) - solid(*p) / np.float32(max(self.h, soft)), 0, 1)
+        c = np.clip(np.float32(0.5) - solid(*p) / np.float32(max(self.h, soft)), 0, 1)
         image[where] += c * ((value(where) if callable(value) else np.float32(value)) - image[where])
 
 
@@ -272,7 +275,7 @@ def refine(coarse: np.ndarray, grid: Grid) -> np.ndarray:
     """A smooth field given on a coarser or finer cubic grid over the same cube, at the voxels of `grid`
     (linear)."""
     n = coarse.shape[0]
-    position = np.clip((np.arange(grid.size) + .5) * n / grid.size - .5, 0, n - 1)
+    position = np.clip((np.arange(grid.size) + 0.5) * n / grid.size - 0.5, 0, n - 1)
     first = np.minimum(position.astype(int), n - 2)
     t = (position - first).astype(np.float32)
     for axis in range(3):
@@ -303,15 +306,16 @@ class Texture:
         out = self.noise
         where = where or (slice(0, grid.size),) * 3
         for axis, s in enumerate(where):
-            m = _resampling(len(self.noise), self.step, grid.origin[axis] + s.start * grid.h, grid.h,
-                            s.stop - s.start, True)
+            m = _resampling(
+                len(self.noise), self.step, grid.origin[axis] + s.start * grid.h, grid.h, s.stop - s.start, True
+            )
             moved = np.moveaxis(out, axis, 0)
             flat = m @ np.ascontiguousarray(moved).reshape(moved.shape[0], -1)
             out = np.moveaxis(flat.reshape(-1, *moved.shape[1:]), 0, axis)
         return out
 
 
-def branches(rng, start, direction, length, radius, depth, inside=None, spread=.55, shrink=.8):
+def branches(rng, start, direction, length, radius, depth, inside=None, spread=0.55, shrink=0.8):
     """A random branching tree as cones: each branch bends a little and ends in two thinner ones.
 
     inside  optional predicate of a point [3]: a branch that would leave it ends there
@@ -321,7 +325,7 @@ def branches(rng, start, direction, length, radius, depth, inside=None, spread=.
     cones = []
     thin = radius * shrink
     for i in range(3):
-        direction = direction + rng.normal(0, .13, 3)
+        direction = direction + rng.normal(0, 0.13, 3)
         direction /= np.linalg.norm(direction)
         end = start + direction * length / 3
         if inside is not None and not inside(end):
@@ -333,7 +337,7 @@ def branches(rng, start, direction, length, radius, depth, inside=None, spread=.
         side = np.cross(direction, rng.normal(size=3))
         side /= np.linalg.norm(side)
         for sign in (1, -1):
-            turned = direction + sign * side * spread * rng.uniform(.6, 1.3)
-            shorter = length * rng.uniform(.7, .9)
+            turned = direction + sign * side * spread * rng.uniform(0.6, 1.3)
+            shorter = length * rng.uniform(0.7, 0.9)
             cones += branches(rng, start, turned, shorter, thin, depth - 1, inside, spread, shrink)
     return cones

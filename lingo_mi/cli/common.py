@@ -1,0 +1,167 @@
+"""What the command-line scripts share: clear failures, Ctrl-C, and the arguments of a scene."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from pathlib import Path
+
+from lingo_mi.errors import InputError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, like any other bad input."""
+
+    def error(self, message):
+        self.exit(2, f'error: {message} (see --help)\n')
+
+
+def guard(main) -> None:
+    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
+
+    Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', RuntimeWarning)
+            warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
+            sys.exit(main() or 0)
+    except InputError as error:
+        print(f'error: {error}', file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:  # `| head` has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        print(f'error: {f"{error.filename}: " if error.filename else ""}{error.strerror or error}', file=sys.stderr)
+        sys.exit(2)
+    except MemoryError as error:
+        print(f'error: not enough memory ({error})', file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt as stop:
+        print(f'interrupted{": " + str(stop) if str(stop) else ""}', file=sys.stderr)
+        sys.exit(130)
+
+
+def input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that say what is scanned: scene, --projections, --volume and what goes with them."""
+    parser.add_argument('scene', help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml')
+    parser.add_argument(
+        '--projections',
+        metavar='F',
+        help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, '
+        '.npy with a geometry .yml beside it, or a folder of EXR images',
+    )
+    parser.add_argument(
+        '--volume',
+        metavar='F',
+        help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, "
+        'NPY/NPZ, raw, a TIFF stack or a DICOM folder',
+    )
+    parser.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
+    parser.add_argument('--dtype', help='type of a raw --volume, such as uint8')
+    parser.add_argument(
+        '--mu-water',
+        type=float,
+        metavar='MU',
+        help='a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to densities in [0, 1])',
+    )
+
+
+def check_input(args) -> None:
+    """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
+    for name in ('projections', 'volume'):
+        if getattr(args, name) == '':  # an unset variable of the shell's
+            raise InputError(f'--{name} names no file')
+    if args.views is not None and args.views < 1:
+        raise InputError(f'--views must be at least 1, not {args.views}')
+    if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
+        raise InputError('--shape, --dtype and --mu-water go with --volume')
+    if args.projections and args.volume:
+        raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
+
+
+def read_input(args, scene, views: int | None, seed: int = 0):
+    """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
+
+    scene   the `LoadedScene` of args.scene
+    views   how many evenly spaced views to use (None: all)
+    seed    of the noise, where the scene's detector has any
+    """
+    from lingo_mi.files.scans import read_scan
+    from lingo_mi.files.volumes import read_volume
+    from lingo_mi.scene.checks import check_memory, warn_if_truncated
+    from lingo_mi.scene.simulate import choose_views, take_scan, with_effects
+
+    if args.projections:
+        dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
+        check_memory(dataset.train.geometry)
+        warn_if_truncated(dataset.train.geometry)
+        return dataset
+    volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
+    return take_scan(scene, views or 0, volume, seed)
+
+
+def definitions(pairs) -> dict[str, str]:
+    """The NAME=VALUE arguments of -D as a dictionary."""
+    out = {}
+    for pair in pairs:
+        name, equals, value = pair.partition('=')
+        if not equals or not name:
+            raise InputError(f'-D {pair}: write it as name=value')
+        out[name] = value
+    return out
+
+
+def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
+    """The output folder, which can be made and written to, or an error that refuses to spoil one.
+
+    Leaves nothing behind.
+
+    owns   name of a file that tells an earlier result
+    force, resume   whether a folder with files in it will do
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise InputError(f'{path}: is a file, not a folder; choose another --out')
+    if path.is_dir() and any(path.iterdir()) and not (force or resume):
+        what = 'holds a result already' if (path / owns).exists() else 'is not empty'
+        raise InputError(f'{path}: {what}; add --resume to go on, --force to replace it, or choose another --out')
+    _probe(path, path)
+    return path
+
+
+def writable_file(path: Path, force: bool) -> Path:
+    """The output file, whose folder can be made and written to, or an error that refuses to spoil one.
+
+    Leaves nothing behind.
+
+    force   whether an earlier file may be replaced
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder; choose another --out')
+    if path.exists() and not force:
+        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
+    _probe(path.parent, path)
+    return path
+
+
+def _probe(folder: Path, path: Path):
+    """Make a folder, write into it and take it away again. Raises InputError, naming `path`, where that fails."""
+    made = []
+    try:
+        for part in (*reversed(folder.parents), folder):
+            if not part.exists():
+                part.mkdir()
+                made.append(part)
+        probe = folder / '.writable'
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f'{path}: cannot write there ({error.strerror}); choose another --out') from None
+    finally:
+        for part in reversed(made):
+            part.rmdir()

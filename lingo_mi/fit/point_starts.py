@@ -1,0 +1,40 @@
+"""Initial clouds of the baselines by alpha compositing: points that know nothing of the projections. NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.lingo.ipsd import neighbour_distance
+from lingo_mi.lingo.voxel_filter import voxel_centres
+
+
+def random_points(half, flat: bool, n_points: int, rng) -> InitialCloud:
+    """Points drawn evenly from the volume (3DGS, where it is not given any; there from a cube around the scene).
+
+    half       half the volume's sides in the normalised frame, [3]
+    flat       whether all points lie in the plane z = 0 of a fan beam
+    rng        numpy Generator
+    """
+    points = rng.uniform(-1, 1, (n_points, 3)) * half * (1, 1, 0 if flat else 1)
+    return _cloud('random', points, np.min(half))
+
+
+def cuboid(shape, half, step: int) -> InitialCloud:
+    """The centres of every `step`-th voxel along the three axes, from the first on (X-Gaussian).
+
+    shape, half   voxels of the volume, and half its sides in the normalised frame, [3] each
+
+    Raises InputError for more than four million points.
+    """
+    axes = [np.arange(0, n, step) for n in shape]
+    count = np.prod([len(axis) for axis in axes])
+    if count > 4e6:
+        raise InputError(f'the cuboid has {count:,} points: take a larger cuboid_step than {step}')
+    cells = np.ravel_multi_index(np.meshgrid(*axes, indexing='ij'), shape).ravel()
+    return _cloud('cuboid', voxel_centres(tuple(shape), half, cells), np.min(half))
+
+
+def _cloud(method, points, fallback):
+    return InitialCloud(points, None, neighbour_distance(points, fallback), {'method': method})

@@ -1,0 +1,53 @@
+"""Scattered photons in a fit: estimated from its cloud now and then, and held fixed between."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lingo_mi.effects.forward import Effects
+from lingo_mi.effects.scatter import smoothed
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.objects import Ellipsoids
+from lingo_mi.projectors.view import View
+
+# Shares of a fit's steps after which the estimate is renewed. Scatter depends on the object's coarse form alone, which is
+# found first.
+RENEWED = 0, 1 / 16, 1 / 8, 1 / 4, 1 / 2
+
+
+class Scattered:
+    """What a cloud in the volume of a scan scatters (`effects.scatter`).
+
+    A view's random numbers are always the same, so an estimate changes with the cloud alone.
+
+    scatter   parameters, with the volume as the box outside which nothing scatters: a single Gaussian that grows large must
+              not make the box so
+    """
+
+    def __init__(self, effects: Effects, geometry: Geometry):
+        self.scatter = effects.scatter.within(geometry)
+        self.tube = replace(
+            effects.tube, material=effects.tube.fitted(), materials={}
+        )  # the cloud stands for all shapes
+        self.response = effects.response
+
+    def estimate(self, cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
+        """Means and their standard errors on the coarse grid of every view, float64 [2, n, rows, columns].
+
+        cloud, geometry   in mm
+        """
+        frames = geometry.rays()
+        return np.stack(
+            [
+                self.scatter.estimate([cloud], self.tube, self.response, View.of(frames, i, *geometry.nDetector), i)
+                for i in range(len(geometry))
+            ],
+            1,
+        )
+
+
+def light(found: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """The scattered signal over the open beam's at all pixels, float32 [view, v, u], from what `estimate` gave."""
+    return np.stack([smoothed(*view, *geometry.nDetector) for view in found.swapaxes(0, 1)]).astype(np.float32)

@@ -1,0 +1,33 @@
+"""Ctrl-C between the steps of a long loop, never within one."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from contextlib import contextmanager
+
+
+@contextmanager
+def between_steps():
+    """Hold Ctrl-C back: yields a function that raises KeyboardInterrupt if it was pressed since the last call.
+
+    A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A
+    second Ctrl-C stops at once.
+    """
+    pressed = []
+
+    def press(*_):
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(True)
+        print('\nstopping after this step; Ctrl-C again to stop at once', file=sys.stderr)
+
+    def check():
+        if pressed:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,68 @@
+"""The default scan of a phantom: X3D's circular cone beam, simulated without noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.phantoms import Phantom
+from lingo_mi.scan import Dataset, Scan
+
+
+def default_geometry(phantom: Phantom, angles, pixels: int = 512) -> Geometry:
+    """X3D's scanner about a phantom.
+
+    DSD 1500 and DSO 1000 mm; `pixels` x `pixels` that together are twice as wide as the phantom's longest side (512
+    pixels of 1 mm for a cube of 256 mm).
+    """
+    pixel = 2 * max(n * d for n, d in zip(phantom.data.shape, phantom.spacing)) / pixels
+    return Geometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(pixels, pixels),
+        dDetector=(pixel, pixel),
+        nVoxel=phantom.data.shape,
+        dVoxel=phantom.spacing,
+        angles=angles,
+    )
+
+
+def simulate(phantom: Phantom, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Noise-free line integrals, float32 [view, v, u], density times mm.
+
+    Exact projections of the object where the phantom has them, else exact ones of its trilinear voxels, which
+    need an active Mitsuba variant. progress: called as progress(views done, views) after every view.
+    """
+    if phantom.analytic is None:
+        from lingo_mi.projectors import grid
+
+        return grid.project(phantom.data, geometry, progress)
+    out = np.empty((len(geometry), *geometry.nDetector), np.float32)
+    for i in range(len(geometry)):
+        out[i] = phantom.analytic.project(geometry.subset([i]))[0]
+        if progress:
+            progress(i + 1, len(geometry))
+    return out
+
+
+def scan(
+    phantom: Phantom,
+    views: int = 50,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    pixels: int = 512,
+) -> Dataset:
+    """The default scan: `views` evenly spaced over [0, 180) degrees to fit, as many random ones in it held
+    out.
+
+    seed decides the held-out angles, `pixels` the panel (see `default_geometry`). Raises InputError unless views is at least 1.
+    """
+    if views < 1:
+        raise InputError(f'a scan needs at least one view, not {views}')
+    angles = np.concatenate([circular(views, 180.0), np.sort(np.random.default_rng(seed).uniform(0, np.pi, views))])
+    geometry = default_geometry(phantom, angles, pixels)
+    both = Scan(geometry, simulate(phantom, geometry, progress))
+    return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)

@@ -1,0 +1,1 @@
+"""Line integrals and their derivatives on the device: Gaussians, grids and meshes."""

@@ -1,0 +1,82 @@
+"""What a scene may pay for accuracy: the cut-off, the model of a footprint, the rule for a pixel, and presets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.errors import InputError
+
+# Cut-off in standard deviations; why these, in docs/accuracy.md.
+PRESETS = {'draft': 3.0, 'default': 5.0, 'reference': 7.0}
+FOOTPRINTS = 'exact', 'affine'
+MOST_SUBPIXELS = 16
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The knobs of `lingo_xray`.
+
+    extent      cut-off of Gaussians in standard deviations
+    footprint   'exact', or 'affine': the ray's whitened length |d|^2 frozen at a Gaussian's centre (EWA)
+    pixel       n: the mean of n x n rays a pixel, those through the centres of its n x n parts
+    area        the mean over each pixel's area, for Gaussians: see `cloud.line_integrals`
+    """
+
+    extent: float = PRESETS['default']
+    footprint: str = 'exact'
+    pixel: int = 1
+    area: bool = False
+
+    @staticmethod
+    def of(accuracy='default', extent=None, footprint='exact', pixel='centre') -> Quality:
+        """The knobs from plugin parameters; what is None comes from the preset `accuracy`. Raises InputError."""
+        if accuracy not in PRESETS:
+            raise InputError(f'lingo_xray: accuracy is one of {", ".join(PRESETS)}, not {accuracy!r}')
+        extent = PRESETS[accuracy] if extent is None else extent
+        if not 1 <= extent <= 20:
+            raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {extent:g}')
+        if footprint not in FOOTPRINTS:
+            raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')
+        return Quality(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
+
+    def line_integrals(self, thing, view, primal: bool = True):
+        """Line integrals of an object of `objects.find_objects` along all rays of a view, Float [height * width]."""
+        return thing.line_integrals(view, self.extent, primal, self.footprint == 'affine', self.area)
+
+    def subdivided(self, view):
+        """The view with every pixel divided into its n x n parts."""
+        n = self.pixel
+        return replace(view, u=view.u / n, v=view.v / n, width=view.width * n, height=view.height * n)
+
+    def averaged(self, image, view):
+        """The mean over the parts of each pixel of `view`, from an image of `subdivided(view)`."""
+        n = self.pixel
+        if n == 1:
+            return image
+        i, width = dr.arange(mi.UInt32, view.height * view.width), dr.opaque(mi.UInt32, view.width)
+        first = (i // width * width * n + i % width) * n
+        # Every ray is read once, so the derivative needs no atomics.
+        parts = [
+            dr.gather(mi.Float, image, first + y * width * n + x, mode=dr.ReduceMode.Permute)
+            for y in range(n)
+            for x in range(n)
+        ]
+        return sum(parts) / (n * n)
+
+
+def _subpixels(pixel) -> int:
+    """n of n x n rays, from 'centre', a number or its digits."""
+    n = 1 if pixel == 'centre' else pixel
+    try:
+        n = float(n)
+    except (TypeError, ValueError):
+        n = math.nan
+    if not (math.isfinite(n) and n == round(n) and 1 <= n <= MOST_SUBPIXELS):
+        raise InputError(
+            f"lingo_xray: pixel is 'centre', 'area' or n for n x n rays, from 1 to {MOST_SUBPIXELS}, not {pixel!r}"
+        )
+    return int(n)

@@ -1,0 +1,209 @@
+"""Sharing out uneven work: a fixed number of teams, each with the same share of the total cost.
+
+An *item* (a Gaussian, a triangle) is some *blocks* of LANES rows, each at the item's own cost; the ends of the items' costs
+are a prefix sum. A *team* is LANES lanes that walk one item at a time, a lane a row. Every team takes the blocks that begin
+within its share, so that one enormous item is shared by all, an empty one costs nothing, and neither the launch nor its
+kernel ever changes.
+
+On the CPU, teams add to images of their own without atomics (which would take most of the time), and the copies are summed
+at the end, unless they were too large. On the GPU there are many teams, one image and atomic additions.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.projectors.depth import scattered
+
+LANES = 8  # rows that a team works on side by side
+PACKET = 4  # consecutive elements that a lane reads and writes at a time
+MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
+
+
+class Work:
+    """Items shared out among teams, from arrays that are evaluated:
+
+    blocks, block_cost   UInt32 [N], costs at least 1
+    ends                 UInt64 [N], the sums of cost up to the end of each item
+    """
+
+    def __init__(self, blocks, block_cost, ends):
+        self.count = dr.width(blocks)
+        self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        self.teams = 2 * dr.thread_count() if self.on_cpu else 4096
+        self.arrays = self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
+
+    @classmethod
+    def of(cls, blocks, block_cost) -> Work:
+        ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
+        dr.eval(blocks, block_cost, ends)
+        return cls(blocks, block_cost, ends)
+
+    def shares(self) -> dict:
+        """The arguments of a kernel for `each_item`: lane, the begin and end of its share as (item, block), and blocks."""
+        total = dr.gather(mi.UInt64, self.ends, dr.opaque(mi.UInt32, self.count - 1))
+        lane = dr.arange(mi.UInt32, self.teams * LANES)
+        share = total // self.teams + 1
+        begin = mi.UInt64(lane // LANES) * share
+        begin, end = (
+            _cut(dr.minimum(x, total), self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
+            for x in (begin, begin + share)
+        )
+        return dict(lane=lane, begin=begin, end=end, blocks=self.blocks)
+
+    def add_up(self, kernel, rows: int, width: int, parts: int = 1, /, **arguments):
+        """Run a kernel that adds to rows of so many elements, padded to whole packets; returns them, Float [rows * width].
+
+        The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
+        With more than one of the `parts`, items are dealt out to them and each part is added up by itself, their sums in
+        float64.
+        """
+        if parts > 1:
+            which, total = scattered(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
+            for part in range(parts):
+                some = Work.of(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
+                total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
+                dr.eval(total)
+            return mi.Float(total)
+        size = rows * packets_of(width)
+        private = self.on_cpu and self.teams * size <= MOST_COPIED
+        copies = self.teams if private else 1
+        target = dr.zeros(mi.Float, copies * size * PACKET)
+        dr.make_opaque(target)
+        shares, stride = self.shares(), dr.opaque(mi.UInt32, size)
+        base = mi.Int32(shares['lane'] // LANES * stride if private else mi.UInt32(0))
+        dr.eval(kernel(**shares, **arguments, target=target, base=base, private=private), target)
+        if copies > 1:
+            i, total = dr.arange(mi.UInt32, size), dr.zeros(mi.Vector4f, size)
+            for copy in range(copies):
+                total += dr.gather(mi.Vector4f, target, i + copy * stride)
+            target = dr.empty(mi.Float, size * PACKET)
+            dr.scatter(target, total, i, mode=dr.ReduceMode.Permute)
+        return crop(target, rows, width)
+
+
+def _cut(position, ends, block_cost, count):
+    """The first block that begins at a position of the costs or behind it, as (item, block)."""
+
+    def halve(g, size):
+        half = size // 2
+        behind = dr.gather(mi.UInt64, ends, g + half) <= position
+        return dr.select(behind, g + half + 1, g), dr.select(behind, size - half - 1, half)
+
+    g, _ = dr.while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
+    start = dr.gather(mi.UInt64, ends, g - 1, g > 0)
+    # A masked lane reads 0, and an integer division by it would kill the process.
+    cost = dr.maximum(mi.UInt64(dr.gather(mi.UInt32, block_cost, g, g < count)), 1)
+    return g, mi.UInt32((position - start + cost - 1) // cost)
+
+
+def each_item(begin, end, blocks, visit):
+    """Call visit(g, block, stop) with each item of a share and the range of its blocks in the share; the kernel's result.
+
+    Loops carry what they change and no more: Dr.Jit traces others twice, and nested ones four and eight times.
+    """
+
+    def step(g, block):
+        visit(g, block, dr.select(g < end[0], dr.gather(mi.UInt32, blocks, g), end[1]))
+        return g + 1, mi.UInt32(0)
+
+    return dr.while_loop(begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
+
+
+def repeat(first, last, body, *state):
+    """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state, if there is any."""
+    return dr.while_loop(
+        (first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *(body(i, *state) or ()))
+    )[1:]
+
+
+def packets_of(width: int) -> int:
+    """Packets that a row of so many elements takes."""
+    return -(-width // PACKET)
+
+
+def pad(image, rows: int, width: int):
+    """Float [rows * width] with zeros at the end of each row, up to whole packets."""
+    if width % PACKET == 0:
+        return image
+    padded = packets_of(width) * PACKET
+    i = dr.arange(mi.UInt32, rows * padded)
+    padded, width = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
+    row, column = i // padded, i % padded
+    return dr.gather(mi.Float, image, row * width + column, column < width)
+
+
+def crop(padded, rows: int, width: int):
+    """The image that `pad` padded."""
+    if width % PACKET == 0:
+        return padded
+    i, columns, pitch = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width), packets_of(width) * PACKET
+    return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, pitch) + i % columns)
+
+
+def pack(Packet, Element, columns):
+    """Interleave columns [N] into rows of whole packets, which a lane fetches with few loads."""
+    count, packets = dr.width(columns[0]), len(columns) // PACKET
+    target = dr.empty(Element, count * packets * PACKET)
+    i = dr.arange(mi.UInt32, count)
+    for j in range(packets):
+        dr.scatter(target, Packet(*columns[PACKET * j : PACKET * (j + 1)]), i * packets + j, mode=dr.ReduceMode.Permute)
+    return target
+
+
+def load(packed, index, packets=3):
+    """Row `index` of an array made by `pack`."""
+    return [x for j in range(packets) for x in dr.gather(mi.Vector4f, packed, index * packets + j)]
+
+
+FAR = 3e8  # keeps whole numbers of elements, and sums of a few, within Int32; what exceeds it stays in the fraction
+
+
+def whole(x):
+    """The whole number next to x, for Float and Float64."""
+    return dr.clip(dr.round(x), -FAR, FAR)
+
+
+def high_low(x):
+    """A Float64 as the sum of two Floats."""
+    high = mi.Float(x)
+    return high, mi.Float(x - type(x)(high))
+
+
+def times(high, low, n):
+    """The product of a pair of Floats with a whole number, as a pair."""
+    product = high * n
+    return product, dr.fma(low, n, dr.fma(high, n, -product))
+
+
+def pair(a, b):
+    """Two corrections in one number, eight binary digits each; `unpair` gives them back."""
+    a, b = (dr.reinterpret_array(mi.UInt32, x) & 0xFFFF0000 for x in (a, b))
+    return dr.reinterpret_array(mi.Float, a | (b >> 16))
+
+
+def unpair(both):
+    bits = dr.reinterpret_array(mi.UInt32, both)
+    return dr.reinterpret_array(mi.Float, bits & 0xFFFF0000), dr.reinterpret_array(mi.Float, bits << 16)
+
+
+def span(low, high, offset, column, empty, packets):
+    """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
+    far = 1e8  # keeps what lies far outside within Int32
+    first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
+    last = mi.Int32(dr.clip(dr.floor(high + offset), -far, far)) + column
+    begin = dr.maximum(first, 0) // PACKET
+    empty |= (last < first) | (last < 0)
+    return begin, dr.select(empty, begin, dr.minimum(last // PACKET + 1, packets))
+
+
+def position(packet, column, offset):
+    """t of the elements of a packet: exact to its last digit wherever the whole elements cancel."""
+    whole = mi.Float(packet * PACKET - column)
+    return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)
+
+
+def deposit(target, value, index, private):
+    """Add a packet to a target, without atomics where the target is the team's own."""
+    dr.scatter_add(target, value, index, mode=dr.ReduceMode.NoConflicts if private else dr.ReduceMode.Auto)

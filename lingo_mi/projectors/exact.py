@@ -1,0 +1,70 @@
+"""The exact projector of `grid` and its transpose as a matrix to iterate with: any poses, pixels left out (Dr.Jit).
+
+`joseph` is two to three times as fast (128^3 voxels, 20 views, CPU), where the source moves on a circle before an upright
+panel and all pixels are valid.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.grid import gather, scatter, view_table, view_walk, whole_box
+from lingo_mi.projectors.joseph import Stack
+
+
+class ExactPair(Stack):
+    """The matrix A of a scan, with rows of zeros for pixels that are not valid; `adjoint` is its transpose to rounding.
+
+    A view is a launch; all are of the same kernels.
+
+    valid   bool [view, v, u], None for all
+    """
+
+    def __init__(self, geometry: Geometry, valid=None):
+        super().__init__(geometry)
+        self._rays = [mi.Float(row) for row in view_table(geometry)]
+        self._valid = None if valid is None else self.images(valid)
+
+    def forward(self, volume, views):
+        """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
+
+        A 1 is the path of the ray through the box, mm, or zero.
+        """
+        out = [dr.empty(mi.Float, len(views) * self.pixels) for _ in range(2)]
+        for block, view in enumerate(views):
+            walk, length = self._walk(view)
+            length *= self._of(self._valid, view)
+            target = dr.arange(mi.UInt, self.pixels) + dr.opaque(mi.UInt, block * self.pixels)
+            path = dr.maximum(walk[-1] - walk[-2], 0)
+            for image, value in zip(out, (gather(volume, self.size, *walk), path)):
+                dr.scatter(image, length * value, target, mode=dr.ReduceMode.Permute)
+            dr.eval(out)
+        return tuple(out)
+
+    def adjoint(self, images, views, rule=None):
+        """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
+
+        images : mi.Float [block, u, v]
+        rule   : what to return instead, a function of (voxel, A^T y, A^T 1): flat indices mi.UInt and the sums
+        """
+        sums = [dr.zeros(mi.Float, self.voxels) for _ in range(1 if rule is None else 2)]
+        for block, view in enumerate(views):
+            walk, length = self._walk(view)
+            length *= self._of(self._valid, view)
+            for target, value in zip(sums, (self._of(images, block), 1)):
+                scatter(target, length * value, self.size, *walk)
+                dr.eval(target)
+        return sums[0] if rule is None else rule(dr.arange(mi.UInt, self.voxels), *sums)
+
+    def _walk(self, view):
+        return view_walk(self.geometry, self._rays[view], *whole_box(self.size))
+
+    def _of(self, images, block):
+        """One of several images; 1 where there are none."""
+        if images is None:
+            return mi.Float(1)
+        return dr.gather(
+            mi.Float, images, dr.arange(mi.UInt, self.pixels) + dr.opaque(mi.UInt, int(block) * self.pixels)
+        )

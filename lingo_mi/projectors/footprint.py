@@ -1,0 +1,191 @@
+r"""The exact footprint of a Gaussian on a flat detector.
+
+For a ray :math:`o + tD` and a Gaussian (p, R, s, rho), whitened by :math:`W = \mathrm{diag}(1/s) R^T` to
+:math:`w = W(p - o)`, :math:`d = WD`, the line integral is
+
+.. math::  \rho \sqrt{2\pi} \, |D| / |d| \; \exp(-\tfrac12 |w \times d|^2 / |d|^2).
+
+On a flat detector :math:`D = k(p - o) + \delta x\, a + \delta y\, b`, with the pixel steps a and b and the pixel position
+relative to the projected centre. The constant term of :math:`w \times d` vanishes, so nothing cancels near the centre:
+
+    |w x d|^2 = |dx na + dy nb|^2             na = w x Wa,  nb = w x Wb
+    |d|^2     = |k w + dx Wa + dy Wb|^2
+
+Both are divided by (k|w|)^2, and the first is sheared to a sum of two squares, t = dx + shear dy:
+
+    num = (mx t)^2 + (my dy)^2
+    den = 1 + e1 t + e2 dy + e11 t^2 + 2 e12 t dy + e22 dy^2
+    integral = |D| amplitude den^(-1/2) exp(-num / (2 den))
+
+The sum of squares is what keeps a needle's footprint accurate in float32. For a parallel beam den = 1. These eleven numbers
+a Gaussian (amplitude, mx, my, shear, e1 ... e22, and the centre) are computed in float64, which costs nothing beside the
+pixels and saves the digits that differences of world coordinates lose. Shear and centre are handed on in float64, since a
+needle that crosses the image cancels t to its own width, the others in float32.
+
+The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|: an ellipse as long as the
+kappa-ellipsoid lies between source and detector. Gaussians for which it does not are left to `segment`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.projectors.rotation import rotate_inverse, rows_of
+
+SQRT_2PI = 2.5066282746310002
+
+# Names of the differentiable numbers, in the order in which the kernels keep them.
+NAMES = ('amplitude', 'mx', 'my', 'shear', 'e1', 'e2', 'e11', 'e12', 'e22', 'x', 'y')
+DOUBLE = 'shear', 'x', 'y'
+
+
+@dataclass
+class Footprints:
+    """Footprints of N Gaussians in one view.
+
+    values    the eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; x and y
+              place the projected centre, in pixels from the centre of the pixel (column, row) in which it lies
+    column, row            Int32 [N]
+    row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; empty where it has none
+    width                  Float [N], pixels across the widest row, for balancing work
+    area                   Float [N], pixels covered: of the ellipse, or of the box where that is smaller
+    straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate; also those that
+                           nothing can, because a number is not finite or a scale or quaternion zero
+    """
+
+    values: tuple
+    column: object
+    row: object
+    row_begin: object
+    row_end: object
+    width: object
+    area: object
+    straddles: object
+
+    @property
+    def seen(self):
+        """Whether a Gaussian has pixels in the image, Bool [N]."""
+        return self.row_end > self.row_begin
+
+
+def project(centre, scale, rotation, density, view, extent: float, widen: float = 0.0) -> Footprints:
+    """Footprints of N Gaussians in a view.
+
+    centre, scale   Point3f, Vector3f [N]; standard deviations
+    rotation        Vector4f [N], quaternion (x, y, z, w), normalised here
+    density         Float [N], value at the centre
+    extent          cut-off in standard deviations
+    widen           variance in pixels^2 of a round Gaussian that footprints are convolved with, |d|^2 taken as constant
+    """
+    Vector3d = mi.Vector3d
+    Float64 = dr.value_t(Vector3d)
+    p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
+    rows = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    inverse = 1 / s
+    a, b = view.u, view.v
+    n = dr.cross(a, b)
+
+    if view.parallel:
+        to_plane = p - view.corner
+        depth = dr.dot(n, view.source)
+        hit = to_plane - view.source * (dr.dot(n, to_plane) / depth)
+        w = inverse * rotate_inverse(rows, view.source)
+        visible = dr.isfinite(dr.detach(dr.squared_norm(w) + dr.squared_norm(hit) + rho))
+        straddles = ~visible
+        norm = dr.rsqrt(dr.squared_norm(w))
+        what = w * norm
+        na, nb = (dr.cross(what, inverse * rotate_inverse(rows, step)) for step in (a, b))
+        e1 = e2 = e11 = e12 = e22 = dr.zeros(Float64, dr.width(p))
+        factor = norm
+    else:
+        r = p - view.source
+        axis = view.corner - view.source
+        plane = dr.dot(n, axis)
+        with dr.suspend_grad():
+            # Half the depth that the kappa-ellipsoid spans: its support function along the panel's normal.
+            support = s * rotate_inverse(rows, n)
+            depth, half = dr.dot(n, r) * dr.sign(plane), extent * dr.norm(support)
+            near, far = depth - half, depth + half
+            hidden = far <= 0
+            straddles = near < 0.01 * far
+            if view.panel:
+                hidden |= near >= dr.abs(plane)
+                straddles |= far > dr.abs(plane)
+            sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(inverse) + rho)
+            straddles = straddles & ~hidden | ~sound
+            visible = ~hidden & ~straddles
+        r = dr.select(visible, r, n)  # along the panel's normal nothing below vanishes
+        depth = dr.dot(n, r)
+        k = plane / depth
+        hit = k * r - axis
+        w = inverse * rotate_inverse(rows, r)
+        length = dr.norm(w)
+        norm = 1 / (k * length)
+        wa, wb = (inverse * norm * rotate_inverse(rows, step) for step in (a, b))
+        na, nb = dr.cross(w, wa), dr.cross(w, wb)
+        what = w / length
+        e1, e2 = 2 * dr.dot(what, wa), 2 * dr.dot(what, wb)
+        e11, e12, e22 = dr.squared_norm(wa), dr.dot(wa, wb), dr.squared_norm(wb)
+        factor = length * dr.square(norm)
+
+    amplitude = rho * SQRT_2PI * norm
+    # |na x nb|, from the determinant of the whitening: a needle's na and nb are all but parallel.
+    det = factor * dr.abs(depth) * inverse.x * inverse.y * inverse.z
+    aa, ab, bb = dr.squared_norm(na), dr.dot(na, nb), dr.squared_norm(nb)
+    with dr.suspend_grad():
+        if view.parallel:
+            high_x, high_y = extent * dr.sqrt(bb) / det, extent * dr.sqrt(aa) / det
+            low_x, low_y = -high_x, -high_y
+        else:
+            # Detector rows and columns are planes through the source; whitened, the outermost touch the kappa-sphere.
+            reach = extent * dr.abs(depth) / det
+            quad, offset = near * far, extent * reach
+            low_y, high_y = _roots(quad, -offset * dr.dot(na, support), dr.square(reach) * aa)
+            low_x, high_x = _roots(quad, offset * dr.dot(nb, support), dr.square(reach) * bb)
+    if widen:
+        # The inverse of num's matrix is the footprint's covariance, which grows by `widen` on its diagonal.
+        wide = aa + widen * dr.square(det)
+        shrink = dr.rsqrt(1 + widen * (bb + wide))
+        with dr.suspend_grad():
+            grow_x, grow_y = dr.sqrt(1 + widen * dr.square(det) / bb), dr.sqrt(wide / aa)
+            low_x, high_x, low_y, high_y = low_x * grow_x, high_x * grow_x, low_y * grow_y, high_y * grow_y
+        amplitude, aa = amplitude * shrink, wide
+    root = dr.sqrt(aa)
+    mx, my, shear = root, det / root, ab / aa
+    if widen:
+        mx = mx * shrink
+    nn = dr.squared_norm(n)
+    x, y = dr.dot(hit, dr.cross(b, n) / nn), dr.dot(hit, dr.cross(n, a) / nn)
+    # The denominator in the sheared coordinate, dx = t - shear dy.
+    e22 = e22 + shear * (shear * e11 - 2 * e12)
+    e12 = e12 - shear * e11
+    e2 = e2 - shear * e1
+
+    with dr.suspend_grad():
+
+        def pixel(position, size):
+            return mi.Int32(dr.clip(dr.select(visible, position, 0), 0, size))
+
+        row_begin = pixel(dr.ceil(y + low_y - 0.5), view.height)
+        row_end = dr.select(visible, pixel(dr.floor(y + high_y - 0.5) + 1, view.height), 0)
+        begin, end = pixel(dr.floor(x + low_x - 0.5), view.width), pixel(dr.ceil(x + high_x + 0.5), view.width)
+        row_end = dr.select(end > begin, row_end, 0)
+        far_out = 1e9  # keeps the whole part of a centre far outside the image within Int32
+        column = mi.Int32(dr.clip(dr.select(visible, dr.floor(x), 0), -far_out, far_out))
+        row = mi.Int32(dr.clip(dr.select(visible, dr.floor(y), 0), -far_out, far_out))
+        width, row_end = mi.Float(end - begin), dr.maximum(row_end, row_begin)
+        area = dr.minimum(mi.Float(row_end - row_begin) * width, mi.Float(dr.pi * extent * extent / (mx * my)))
+    values = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, x - (Float64(column) + 0.5), y - (Float64(row) + 0.5))
+    values = tuple(v if name in DOUBLE else mi.Float(v) for name, v in zip(NAMES, values))
+    return Footprints(values, column, row, row_begin, row_end, width, area, straddles)
+
+
+def _roots(a, b, c):
+    """Roots of a x^2 - 2 b x - c = 0 for a > 0, c >= 0, without cancellation: their product is -c / a."""
+    root = dr.sqrt(dr.maximum(b * b + a * c, 0))
+    big = dr.select(b >= 0, b + root, b - root)
+    first, second = big / a, -c / big
+    return dr.minimum(first, second), dr.maximum(first, second)

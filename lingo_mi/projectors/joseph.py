@@ -1,0 +1,307 @@
+"""Joseph's projector and its exact transpose for circular scans, fast enough to iterate with (Dr.Jit, llvm or cuda).
+
+Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982): a ray is sampled where
+it meets the slices of voxel centres along x or y, whichever it is nearer to; in each slice the volume is interpolated
+bilinearly. The weight of voxel (i, j, k) in the ray of pixel (u, v), whose main axis is x, is
+
+    a = L(u, v) hat(y(u, i) - j) hat(z(u, v, i) - k),    hat(s) = max(0, 1 - |s|)
+
+with L the path per slice. As in `grid`, the edge value is held in the outer half voxel and the box ends there. Because the
+panel's rows are parallel to the axis of rotation, y depends on the column alone: the few pixels whose hats cover a given
+voxel can be listed. So both directions are gathers with the same weights, nothing is scattered, and results do not depend on
+the order of threads.
+
+Volumes and images live on the device: volumes mi.Float [nx * ny * nz], z fastest; images mi.Float [block, u, v], v
+fastest.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.camera import voxel_matrices
+
+COLUMN = 8  # floats a detector column
+RUN = 8  # voxels a lane of the transpose
+ROWS = 4  # most rows of the panel that its innermost loop unrolls
+
+
+def column_table(geometry: Geometry) -> np.ndarray:
+    """The rays of every detector column, in voxel indices: float32 [view, u, 8].
+
+    With m the index along the main axis: the transverse index is `a + b m`, the share of the way from the source to the
+    panel is `c + e m` (parallel: 1), the path per slice is sqrt(g + h dz^2) mm with dz the height of the pixel
+    over the source in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
+    """
+    frames, n_u = geometry.rays(), geometry.nDetector[1]
+    voxel = np.array(geometry.dVoxel[:2])
+    first = np.array(geometry.offOrigin[:2]) + (voxel - geometry.sVoxel[:2]) / 2
+    column = np.arange(n_u)[:, None] + 0.5
+    pixel = frames.corner[:, None, :2] + column * frames.u[:, None, :2]  # [view, u, 2], mm
+    source = frames.source[:, None, :2]
+    direction = np.broadcast_to(source, pixel.shape) if frames.parallel else pixel - source
+    start = pixel if frames.parallel else source
+    index, step = (start - first) / voxel, direction / voxel
+    along_y = np.abs(direction[..., 1]) > np.abs(direction[..., 0])
+
+    def main(x):
+        return np.where(along_y, x[..., 1], x[..., 0])
+
+    def other(x):
+        return np.where(along_y, x[..., 0], x[..., 1])
+
+    e = 1 / main(step)
+    c = -main(np.broadcast_to(index, step.shape)) * e
+    b = other(step) * e
+    a = other(np.broadcast_to(index, step.shape)) + other(step) * c
+    path = main(np.broadcast_to(voxel, step.shape)) / main(direction)
+    g, h = path**2 * (direction**2).sum(-1), (path * geometry.dVoxel[2]) ** 2
+    if frames.parallel:
+        c, e, h = np.ones_like(c), np.zeros_like(c), np.zeros_like(c)
+    return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
+
+
+class Stack:
+    """Volumes and stacks of images of a scan on the device. Raises InputError for 2^32 voxels or more."""
+
+    def __init__(self, geometry: Geometry):
+        self.geometry, self.size, self.panel = geometry, geometry.nVoxel, geometry.nDetector
+        self.voxels, self.pixels = int(np.prod(self.size)), int(np.prod(self.panel))
+        if self.voxels >= 2**32:
+            raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
+
+    def images(self, projections):
+        """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
+        return mi.Float(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1).ravel()) + dr.opaque(
+            mi.Float, 0
+        )
+
+    def select(self, images, views):
+        """The images of the views `views` out of those of all views."""
+        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
+        block = index // self.pixels
+        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen, block) - block) * self.pixels)
+
+
+class Joseph(Stack):
+    """The matrix A of a circular scan, view by view; `adjoint` is its transpose to rounding.
+
+    The compiled kernels, one forward and two back, serve all blocks of views, whatever their number.
+
+    Raises InputError where the source of a cone beam is inside the volume, or the volume has 2^32 voxels or more.
+    """
+
+    def __init__(self, geometry: Geometry):
+        super().__init__(geometry)
+        if geometry.poses is not None:
+            raise InputError('this projector needs a source on a circle about z and an upright panel')
+        half = np.hypot(*(abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2])))
+        if geometry.mode == 'cone' and geometry.DSO <= half:
+            raise InputError(
+                f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
+                f'{half:.4g} mm from the axis; lower nVoxel or dVoxel'
+            )
+        frames, voxel = geometry.rays(), geometry.dVoxel[2]
+        first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
+        self._columns = mi.Float(column_table(geometry).ravel())
+        source = 0.0 if frames.parallel else (frames.source[0, 2] - first) / voxel
+        top = (frames.corner[0, 2] + frames.v[0, 2] / 2 - first) / voxel
+        # Height of the source, of the first row over it, and between rows, in voxels.
+        self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, frames.v[0, 2] / voxel)]
+        self._matrix = mi.Float(self._column_matrix().ravel())
+        # Rows whose hats cover a voxel, at most: where it is nearest to the source.
+        nearest = 1.0 if frames.parallel else (geometry.DSO - half) / geometry.DSD
+        rows = int(np.ceil(2 * voxel / (nearest * abs(frames.v[0, 2])) + 1e-3))
+        self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
+
+    def _column_matrix(self):
+        """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
+        return voxel_matrices(self.geometry)[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
+
+    def forward(self, volume, views):
+        """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
+
+        A 1 is the path of the ray through the box, mm.
+        """
+        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
+        column = index // self.panel[0]
+        block = column // self.panel[1]
+        row = index - column * self.panel[0]
+        column += (dr.gather(mi.UInt, chosen, block) - block) * self.panel[1]
+        return _integrate(volume, self.size, self._columns, self._rows, column, row)
+
+    def adjoint(self, images, views, rule=None):
+        """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
+
+        images : mi.Float [block, u, v]
+        rule   : what to store instead, a function of (voxel, A^T y, A^T 1): flat indices mi.UInt of some voxels and their
+                 sums. It is traced into the kernel, so it saves volumes in memory
+        """
+        chosen, n_views = _numbers(views), dr.opaque(mi.UInt, len(views))
+        weighted = _weighted(images, chosen, self.panel, self._columns, self._rows, self._margin, rule is not None)
+        dr.eval(weighted)
+        voxels, sums = _collect(
+            weighted,
+            chosen,
+            n_views,
+            self.size,
+            self.panel,
+            self._columns,
+            self._rows,
+            self._matrix,
+            self._margin,
+            rule is not None,
+        )
+        out = dr.empty(mi.Float, self.voxels)
+        for voxel, inside, value in zip(*voxels, sums):
+            value = value[0] if rule is None else rule(dr.select(inside, voxel, 0), *value)
+            dr.scatter(out, value, voxel, inside, mode=dr.ReduceMode.Permute)
+        return out
+
+
+def _numbers(views):
+    """View numbers on the device, and one more: an array of one would make another kernel."""
+    return mi.UInt(np.append(np.asarray(views, np.uint32), np.uint32(0)))
+
+
+def _hat(position, index, n):
+    """Weight of grid index `index` at a position along an axis of n voxels, edge values held for half a voxel."""
+    weight = dr.maximum(1 - dr.abs(dr.clip(position, 0, n - 1) - index), 0)
+    return dr.select((position >= -0.5) & (position <= n - 0.5), weight, 0)
+
+
+def _column(columns, index, active=True):
+    return [dr.gather(mi.Float, columns, index * COLUMN + i, active) for i in range(7)]
+
+
+def _span(a, b, n):
+    """First and last index m >= 0 at which a + b m may be in [-1/2, n - 1/2], as floats; one too many is harmless."""
+    inv = dr.rcp(dr.select(dr.abs(b) < 1e-12, 1e-12, b))
+    p, q = (-0.5 - a) * inv, (n - 0.5 - a) * inv
+    return dr.minimum(p, q), dr.maximum(p, q)
+
+
+@dr.syntax
+def _integrate(data, size, columns, rows, column, row):
+    """(A x, A 1) of rays, one a lane."""
+    nx, ny, nz = size
+    a, b, c, e, g, h, along_y = _column(columns, column)
+    source, top, step = rows
+    on_y = along_y > 0
+    height = dr.fma(mi.Float(row), step, top)
+    n_main, n_other = dr.select(on_y, mi.Float(ny), mi.Float(nx)), dr.select(on_y, mi.Float(nx), mi.Float(ny))
+    s_main, s_other = dr.select(on_y, mi.UInt(nz), mi.UInt(ny * nz)), dr.select(on_y, mi.UInt(ny * nz), mi.UInt(nz))
+    low, high = _span(a, b, n_other)
+    z_low, z_high = _span(dr.fma(c, height, source), e * height, mi.Float(nz))
+    m = dr.floor(dr.clip(dr.maximum(low, z_low), 0, n_main))
+    last = dr.ceil(dr.clip(dr.minimum(high, z_high), -1, n_main - 1))
+    total, count = mi.Float(0), mi.Float(0)
+    while m <= last:
+        y, t = dr.fma(b, m, a), dr.fma(e, m, c)
+        z = dr.fma(t, height, source)
+        inside = (y >= -0.5) & (y <= n_other - 0.5) & (z >= -0.5) & (z <= nz - 0.5) & (t > 0)
+        y, z = dr.clip(y, 0, n_other - 1), dr.clip(z, 0, nz - 1)
+        j, k = dr.floor(y), dr.floor(z)
+        fy, fz = y - j, z - k
+        near = mi.UInt(m) * s_main + mi.UInt(j) * s_other + mi.UInt(k)
+        up = dr.select(fz > 0, mi.UInt(1), 0)
+        far = near + dr.select(fy > 0, s_other, 0)
+        p = [dr.gather(mi.Float, data, i, inside) for i in (near, near + up, far, far + up)]
+        p0, p1 = dr.fma(fz, p[1] - p[0], p[0]), dr.fma(fz, p[3] - p[2], p[2])
+        total += dr.fma(fy, p1 - p0, p0)
+        count += dr.select(inside, 1.0, 0.0)
+        m += 1
+    path = dr.sqrt(dr.fma(h, height * height, g))
+    return path * total, path * count
+
+
+def _weighted(images, chosen, panel, columns, rows, margin, ones):
+    """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
+
+    With `ones`, mi.Vector2f interleaved: an image of ones, treated alike, stands beside each value.
+    """
+    n_v, n_u = panel
+    pitch = n_v + 2 * margin
+    index = dr.arange(mi.UInt, dr.width(images) // n_v * pitch)
+    column = index // pitch
+    row = mi.Int(index - column * pitch) - margin
+    inside = (row >= 0) & (row < n_v)
+    block = column // n_u
+    entry = (column + (dr.gather(mi.UInt, chosen, block) - block) * n_u) * COLUMN
+    height = dr.fma(mi.Float(row), rows[2], rows[1])
+    g, h = (dr.gather(mi.Float, columns, entry + i) for i in (4, 5))
+    path = dr.select(inside, dr.sqrt(dr.fma(h, height * height, g)), 0)
+    value = path * dr.gather(mi.Float, images, column * n_v + mi.UInt(dr.clip(row, 0, n_v - 1)))
+    return dr.ravel(mi.Vector2f(value, path)) if ones else value
+
+
+@dr.syntax
+def _collect(weighted, chosen, n_views, size, panel, columns, rows, matrices, margin, ones):
+    """A^T y of voxels: RUN of a line along z a lane, as far apart as they can be, so that lanes and their fetches stay
+    neighbours while all that does not depend on z is shared.
+
+    weighted : see `_weighted`; the margin is at least the number of rows whose hats cover a voxel
+
+    Returns ((voxels, whether they exist), sums), lists of RUN; a sum is a list, with A^T 1 as its second entry where the
+    images have ones.
+    """
+    (nx, ny, nz), (n_v, n_u) = size, panel
+    source, top, step = rows
+    run = min(RUN, nz)
+    stride = -(-nz // run)
+    index = dr.arange(mi.UInt, nx * ny * stride)
+    line = index // stride
+    first_z = index - line * stride
+    voxels = [line * nz + first_z + s * stride for s in range(run)]
+    exists = [first_z + s * stride < nz for s in range(run)]
+    x = mi.Float(line // ny)
+    y, z0 = mi.Float(line) - x * ny, mi.Float(first_z)
+    inv_step = dr.rcp(step)
+    pitch, chunks = n_v + 2 * margin, -(-margin // ROWS)
+    sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
+    block = mi.UInt(0)
+    while block < n_views:
+        view = dr.gather(mi.UInt, chosen, block)
+        r = [dr.gather(mi.Float, matrices, view * 6 + i) for i in range(6)]
+        # The columns whose rays pass within a voxel along x or along y.
+        top_u = dr.fma(r[0], x, dr.fma(r[1], y, r[2]))
+        bottom = dr.fma(r[3], x, dr.fma(r[4], y, r[5]))
+        spots = [(top_u + s * r[i]) * dr.rcp(dr.maximum(bottom + s * r[i + 3], 1e-6)) for i in (0, 1) for s in (-1, 1)]
+        low = dr.minimum(dr.minimum(spots[0], spots[1]), dr.minimum(spots[2], spots[3]))
+        high = dr.maximum(dr.maximum(spots[0], spots[1]), dr.maximum(spots[2], spots[3]))
+        u = dr.ceil(dr.clip(low - 0.501, 0, n_u))
+        u_last = dr.floor(dr.clip(high - 0.499, -1, n_u - 1))
+        while u <= u_last:
+            a, b, c, e, g, h, along_y = _column(columns, view * n_u + mi.UInt(u))
+            on_y = along_y > 0
+            m = dr.select(on_y, y, x)
+            t = dr.fma(e, m, c)
+            weight = _hat(dr.fma(b, m, a), dr.select(on_y, x, y), dr.select(on_y, mi.Float(nx), mi.Float(ny)))
+            weight = dr.select(t > 0, weight, 0)
+            # Heights go from row to row by `slope` voxels; z meets the panel at the row `middle`.
+            inv, slope = dr.rcp(dr.maximum(t, 1e-6)), t * step
+            middle, reach = ((z0 - source) * inv - top) * inv_step, dr.abs(inv * inv_step)
+            column = (block * n_u + mi.UInt(u)) * pitch + margin
+            for s in range(run):
+                centre = dr.fma(inv * inv_step, s * stride, middle)
+                row = dr.ceil(dr.clip(centre - reach, -margin, n_v))
+                chunk = 0 if chunks == 1 else mi.UInt(0)
+                while chunk < chunks:
+                    for i in range(ROWS if chunks > 1 else margin):
+                        offset = (row + i - centre) * slope
+                        if s == 0 or s == (nz - 1) // stride:
+                            w = weight * _hat(z0 + s * stride + offset, z0 + s * stride, nz)
+                        else:
+                            w = weight * dr.maximum(1 - dr.abs(offset), 0)
+                        here = mi.UInt(mi.Int(column) + mi.Int(row) + i)
+                        p = dr.gather(mi.Vector2f, weighted, here) if ones else [dr.gather(mi.Float, weighted, here)]
+                        sums[s] = [dr.fma(w, p[j], sums[s][j]) for j in range(2 if ones else 1)]
+                    row += 0 if chunks == 1 else ROWS
+                    chunk += 1
+            u += 1
+        block += 1
+    return (voxels, exists), sums

@@ -1,0 +1,245 @@
+"""What attenuates in a Mitsuba scene: clouds of Gaussians, grids in cubes, closed meshes."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.projectors import cloud, grid
+
+# Shapes hold no Python attributes of ours, so what was learnt of a shape is kept here, the latest ones: a mesh's edges, and
+# that a cloud is usable. While an array is kept alive no other one has its index, so what has changed is not taken for it.
+_MESHES: dict = {}
+MOST_MESHES = 64
+_USABLE: dict = {}
+MOST_USABLE = 2
+
+# Of Gaussians, in the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
+MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
+SAFE_ASPECT = 1e6
+
+
+def find_objects(scene) -> list:
+    """The attenuating objects of a scene.
+
+    Raises InputError for an object that `lingo_xray` cannot integrate, and where there is none at all.
+    """
+    found = [thing for shape in scene.shapes() if (thing := _object(shape)) is not None]
+    if not found:
+        raise InputError(
+            'the scene has nothing that attenuates: add ellipsoids with a density, a cube with a '
+            'heterogeneous medium or a closed mesh with a homogeneous one'
+        )
+    return found
+
+
+def _object(shape):
+    if shape.is_ellipsoids():
+        return Ellipsoids(shape)
+    medium = shape.interior_medium()
+    if medium is None:
+        return None
+    kind = str(medium).split('[')[0]
+    if kind == 'HeterogeneousMedium':
+        return GridInCube(shape, medium)
+    if kind == 'HomogeneousMedium':
+        return HomogeneousMesh(shape, medium)
+    raise InputError(
+        f'lingo_xray does not know the medium {kind} of the shape {shape.id()!r}: use a heterogeneous or a '
+        'homogeneous one'
+    )
+
+
+class Ellipsoids:
+    """The built-in `ellipsoids` shape with an attribute `density` [N, 1], as a cloud of Gaussians."""
+
+    def __init__(self, shape):
+        params, self.name = mi.traverse(shape), shape.id()
+        if 'density' not in params:
+            raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
+        data, self.density = params['data'], params['density']
+        self.second = params['second'] if 'second' in params else None  # share of a second material
+        self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
+        key = data.index, self.density.index
+        if key not in _USABLE and self._usable():
+            while len(_USABLE) >= MOST_USABLE:
+                _USABLE.pop(next(iter(_USABLE)))
+            _USABLE[key] = dr.detach(data), dr.detach(self.density)
+
+    def _usable(self) -> bool:
+        """Whether all Gaussians can be integrated accurately; AccuracyWarning where they can, but not accurately, InputError
+        where they cannot. Waits for the device."""
+        with dr.suspend_grad():
+            shortest, longest = dr.min(self.scale), dr.max(self.scale)
+            turn = dr.squared_norm(self.rotation)
+            sound = (
+                dr.isfinite(dr.sum(self.centre) + dr.sum(self.scale) + self.density + turn)
+                & (dr.max(dr.abs(self.centre)) <= MOST_LENGTH)
+                & (longest <= MOST_LENGTH)
+                & (shortest >= 1 / MOST_LENGTH)
+                & (dr.abs(self.density) <= MOST_DENSITY)
+                & (turn > 1e-30)
+                & (longest <= MOST_ASPECT * shortest)
+            )
+            thin = longest > SAFE_ASPECT * shortest
+            worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if dr.width(sound) else 0
+            if worst == 2:
+                first = int(dr.compress(~sound)[0])
+                raise InputError(
+                    f'Gaussian {first} of the ellipsoids {self.name!r} is not usable: centre, density and rotation must '
+                    f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
+                    f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}'
+                )
+            if worst == 1:
+                first = int(dr.compress(thin)[0])
+                warnings.warn(
+                    AccuracyWarning(
+                        f'the scales of Gaussian {first} of the ellipsoids {self.name!r} are more than {SAFE_ASPECT:.0e} '
+                        'apart: its image may be off by 1e-4 and its derivatives by 1e-3'
+                    ),
+                    stacklevel=2,
+                )
+        return worst == 0
+
+    @classmethod
+    def of(cls, centre, scale, rotation, density, second, name: str) -> Ellipsoids:
+        """Gaussians without a shape of Mitsuba's, as trusted as they are: Point3f, Vector3f, Vector4f and Float [N]; second may
+        be None."""
+        self = cls.__new__(cls)
+        self.centre, self.scale, self.rotation, self.density = centre, scale, rotation, density
+        self.second, self.name, self.rows = second, name, None
+        return self
+
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
+        return cloud.line_integrals(
+            self.centre, self.scale, self.rotation, self.density, view, extent, primal, affine, area, self.rows
+        )
+
+
+class GridInCube:
+    """An axis-aligned `cube` with a heterogeneous medium whose extinction is a scalar `gridvolume`."""
+
+    def __init__(self, shape, medium):
+        self.name, where = shape.id(), f'the medium of the shape {shape.id()!r}'
+        params = mi.traverse(medium)
+        tensor = next((v for k, v in params.items() if k.endswith('sigma_t.data')), None)
+        if tensor is None or len(tensor.shape) not in (3, 4) or (len(tensor.shape) == 4 and tensor.shape[3] != 1):
+            raise InputError(f'{where} must have a gridvolume with one channel as sigma_t')
+        volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and 'GridVolume' in str(node))
+        box, cube = volume.bbox(), shape.bbox()
+        if not (
+            str(shape).startswith('Cube')
+            and _upright(shape, volume)
+            and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
+            and np.allclose(box.max, cube.max, atol=1e-4 * np.abs(cube.max - cube.min))
+        ):
+            raise InputError(
+                f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, '
+                'and the gridvolume, [0, 1]^3 in its own, transforms onto the same box'
+            )
+        self.scale = params['scale'] if 'scale' in params else 1.0
+        self.data, self.size = tensor.array, tensor.shape[2::-1]
+        self.low, self.high = box.min, box.max
+
+    @classmethod
+    def of(cls, values, low, high, name: str) -> GridInCube:
+        """Densities [x, y, z] that fill the box from `low` to `high`, without a shape of Mitsuba's."""
+        self = cls.__new__(cls)
+        self.name, self.scale, self.size = name, 1.0, values.shape
+        self.data = mi.Float(np.ascontiguousarray(values.transpose(2, 1, 0), np.float32).ravel())
+        self.low, self.high = mi.ScalarPoint3f(low), mi.ScalarPoint3f(high)
+        return self
+
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
+        _no_area(area)
+        nx, ny, nz = self.size
+        # The projector wants z fastest, Mitsuba stores x fastest.
+        i = dr.arange(mi.UInt32, nx * ny * nz)
+        z, rest = i % nz, i // nz
+        data = dr.gather(mi.Float, self.data, (z * ny + rest % ny) * nx + rest // ny, mode=dr.ReduceMode.Permute)
+        origin, direction, t_min = _rays(view, (self.low + self.high) / 2)
+        return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
+
+
+def _no_area(area):
+    if area:
+        raise InputError(
+            "lingo_xray: pixel = 'area' is for scenes of ellipsoids alone; with grids or meshes give n, for n x n rays"
+        )
+
+
+def _upright(cube, volume) -> bool:
+    """Whether neither a cube nor a gridvolume is turned, and the volume not mirrored: boxes alone do not tell."""
+    corners = np.array(mi.traverse(cube)['vertex_positions']).reshape(-1, 3)
+    low, high = corners.min(0), corners.max(0)
+    off_corner = np.minimum(corners - low, high - corners)
+    # A volume's transform is no parameter; its description begins with the matrix.
+    numbers = re.findall(r'matrix=\[(.*?)\]\]', str(volume), re.DOTALL)[0].replace('[', ' ').replace(']', ' ')
+    matrix = np.array([float(x) for x in numbers.replace(',', ' ').split()]).reshape(4, 4)[:3, :3]
+    scale = np.diag(matrix)
+    return bool(
+        np.all(off_corner <= 1e-4 * (high - low))
+        and np.all(scale > 0)
+        and np.all(np.abs(matrix - np.diag(scale)) <= 1e-4 * scale[:, None])
+    )
+
+
+class HomogeneousMesh:
+    """A closed mesh with a homogeneous medium inside."""
+
+    def __init__(self, shape, medium):
+        from lingo_mi.projectors.mesh import from_mitsuba
+
+        self.name = shape.id()
+        if not shape.is_mesh():
+            raise InputError(f'the shape {shape.id()!r} has a homogeneous medium, but is no mesh: use ply, obj or cube')
+        params = mi.traverse(medium)
+        self.sigma = next(
+            v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
+        )
+        self.scale = params['scale'] if 'scale' in params else 1.0
+        geometry = mi.traverse(shape)
+        # While an array is kept alive no other one has its index, so a moved mesh is not taken for the one that it was.
+        arrays = geometry['vertex_positions'], geometry['faces']
+        key = (id(shape), *(x.index for x in arrays))
+        if key not in _MESHES:
+            while len(_MESHES) >= MOST_MESHES:
+                _MESHES.pop(next(iter(_MESHES)))
+            _MESHES[key] = (shape, arrays, from_mitsuba(shape))
+        self.paths, self._arrays = _MESHES[key][-1], arrays
+
+    def triangles(self) -> np.ndarray:
+        """Corners, float64 [n, 3, 3]."""
+        vertices, faces = (np.array(a).reshape(-1, 3) for a in self._arrays)
+        return vertices[faces].astype(float)
+
+    def line_integrals(self, view, extent, primal, affine=False, area=False):
+        _no_area(area)
+        return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
+
+
+def _rays(view, near):
+    """Rays of all pixels for `grid.line_integrals`, starting on the plane through `near` parallel to the panel.
+
+    Starting near the object keeps the digits that a distant source would cost float32.
+    """
+    i = dr.arange(mi.UInt32, view.height * view.width)
+    width = dr.opaque(mi.UInt32, view.width)
+    x, y = mi.Float(i % width) + 0.5, mi.Float(i // width) + 0.5
+    near = mi.Vector3d(*near)
+    n = dr.cross(view.u, view.v)
+    Float, Vector3f = mi.Float, mi.Vector3f
+    if view.parallel:
+        t = dr.dot(n, near - view.corner) / dr.dot(n, view.source)
+        origin = Vector3f(view.corner + t * view.source) + x * Vector3f(view.u) + y * Vector3f(view.v)
+        return mi.Point3f(origin), Vector3f(view.source), -dr.inf
+    axis = view.corner - view.source
+    k = dr.dot(n, near - view.source) / dr.dot(n, axis)
+    direction = Vector3f(axis) + x * Vector3f(view.u) + y * Vector3f(view.v)
+    origin = Vector3f(view.source + k * axis) + x * Vector3f(k * view.u) + y * Vector3f(k * view.v)
+    return mi.Point3f(origin), direction, Float(-k)

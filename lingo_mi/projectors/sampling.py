@@ -1,0 +1,78 @@
+"""Objects of a scene on a grid: their density at its voxels, and the box that holds them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import map_coordinates, uniform_filter
+
+from lingo_mi.geometry import triangles
+from lingo_mi.projectors.objects import Ellipsoids, GridInCube, HomogeneousMesh
+from lingo_mi.projectors.rotation import rows_of
+from lingo_mi.projectors.view import vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+
+BOUND = 4.0  # standard deviations where a box may cut a Gaussian: 0.02 % of its mass lies outside
+
+
+def on_grid(thing, corner, step, shape, extent: float = 6.0) -> np.ndarray:
+    """Density of an object of `objects` on a grid, float32 [x, y, z].
+
+    corner, step   [3] the outer corner of the first voxel, and the voxel size, mm
+    shape          voxels along x, y and z
+    extent         cut-off of Gaussians in standard deviations
+
+    Gaussians are sampled at the voxel centres, a mesh gives the share of every voxel that it fills, a grid its trilinear
+    interpolation, averaged over voxels where these are larger than its own; on its own voxels it is left as it is.
+    """
+    if isinstance(thing, Ellipsoids):
+        cells = Grid(vector64(corner), vector64(step), tuple(shape))
+        return cells.volume(
+            voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent, deep=True)
+        )
+    if isinstance(thing, HomogeneousMesh):
+        sigma = np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0]
+        return triangles.voxelize(thing.triangles(), corner, step, shape) * np.float32(sigma)
+    values = grid_values(thing)
+    low, high = _box(thing)
+    own = (high - low) / values.shape
+    if (
+        values.shape == tuple(shape)
+        and np.allclose(low, corner, atol=1e-4 * own.min())
+        and np.allclose(own, step, rtol=1e-4)
+    ):
+        return values
+    ratio = np.asarray(step) / own
+    if (ratio > 1).any():
+        values = uniform_filter(values, np.maximum(1, np.round(ratio)).astype(int).tolist(), mode='nearest')
+    # Voxel centres in the object's own voxels; those outside its box are empty.
+    at = [((corner[k] + (np.arange(shape[k]) + 0.5) * step[k]) - low[k]) / own[k] - 0.5 for k in range(3)]
+    inside = [(a >= -0.5) & (a <= n - 0.5) for a, n in zip(at, values.shape)]
+    found = map_coordinates(values, np.meshgrid(*at, indexing='ij'), order=1, mode='nearest')
+    return found * (inside[0][:, None, None] & inside[1][:, None] & inside[2])
+
+
+def grid_values(thing: GridInCube) -> np.ndarray:
+    """Densities of a grid, float32 [x, y, z]."""
+    return thing.data.numpy().reshape(thing.size[::-1]).transpose(2, 1, 0) * np.float32(np.ravel(thing.scale)[0])
+
+
+def bounds(objects) -> tuple[np.ndarray, np.ndarray]:
+    """The lower and upper corner, float64 [3], of the box that holds all objects, Gaussians out to 4 standard deviations."""
+    boxes = [_box(thing) for thing in objects]
+    return np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)
+
+
+def _box(thing):
+    if isinstance(thing, GridInCube):
+        return np.array(thing.low, float).ravel(), np.array(thing.high, float).ravel()
+    if isinstance(thing, HomogeneousMesh):
+        points = thing.triangles().reshape(-1, 3)
+        return points.min(0), points.max(0)
+    reach = mi.Vector3f(*(BOUND * dr.norm(thing.scale * row) for row in rows_of(thing.rotation, mi.Vector3f)))
+    low, high = thing.centre - reach, thing.centre + reach
+    return (
+        np.array([float(dr.min(low[i])[0]) for i in range(3)]),
+        np.array([float(dr.max(high[i])[0]) for i in range(3)]),
+    )

@@ -1,0 +1,269 @@
+"""The balanced splat: footprints to an image and back, with work shared out by pixel count.
+
+Every lane works on one detector row of a Gaussian, four pixels (a packet) at a step; `balance` shares the rows out.
+
+Backward is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers. Nothing is
+stored between forward and backward but the footprints.
+
+Each row of a footprint is cut exactly where the cut-off ends, then widened to whole packets. Forward, backward and tangent
+visit the same pixels, so they are each other's exact adjoints and derivatives.
+
+t = dx + shear dy cancels where a needle leans: thousands of pixels from its centre, t is a fraction of a pixel. Therefore
+the kernels know where the ridge t = 0 crosses the row of the centre (`ridge`, rather than the centre's x) and take it from
+row to row in twice float32's digits. In a row, t is then the whole pixels from the one on the ridge, less a fraction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.projectors.balance import (
+    LANES,
+    PACKET,
+    Work,
+    deposit,
+    each_item,
+    high_low,
+    load,
+    pack,
+    packets_of,
+    pad,
+    pair,
+    position,
+    repeat,
+    span,
+    times,
+    unpair,
+    whole,
+)
+from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
+from lingo_mi.projectors.footprint import DOUBLE, NAMES, Footprints
+
+SETUP = 6  # cost of a team's visit to eight rows, in packets
+
+
+def splat(footprints: Footprints, height: int, width: int, extent: float, parts: int = 1):
+    """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
+
+    Differentiable in `footprints.values`, in forward and in reverse mode. The footprints are added up in that many `parts`
+    (`depth`).
+    """
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, parts)
+
+
+class _Splat(dr.CustomOp):
+    def eval(self, values, rest, height, width, extent, parts):
+        self.plan, self.shear, self.parts = Plan(prepare(values, rest), height, width, extent), values[3], parts
+        return self.plan.image(parts)
+
+    def forward(self):
+        self.set_grad_out(self.plan.tangent(self.grad_in('values'), self.shear, self.parts))
+
+    def backward(self):
+        self.set_grad_in('values', by_values(self.plan.gradient(self.grad_out()), self.shear))
+
+    def name(self):
+        return 'splat'
+
+
+def prepare(values, rest):
+    """Footprints as the kernels take them, evaluated arrays for `Plan`; those of `rest` are evaluated with them."""
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
+    ridge = x + shear * y
+    steps = whole(ridge)
+    (high, low), (ridge, ridge_low) = high_low(shear), high_low(ridge - steps)
+    columns = (amplitude, mx, my, high, e1, e2, e11, e12, e22, ridge, mi.Float(y), pair(low, ridge_low))
+    packed = pack(mi.Vector4f, mi.Float, columns)
+    places = pack(mi.Vector4i, mi.Int32, (rest.column + mi.Int32(steps), rest.row, rest.row_begin, rest.row_end))
+    blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
+    cost = mi.UInt32(rest.width) // PACKET + SETUP
+    dr.eval(packed, places, blocks, cost, rest)  # together: each alone would project all Gaussians again
+    return packed, places, *Work.of(blocks, cost).arrays
+
+
+class Plan:
+    """The work of one image: footprints that `prepare` packed, shared out by their pixels."""
+
+    def __init__(self, prepared, height: int, width: int, extent: float):
+        packed, places, *work = prepared
+        self.height, self.width, self.work = height, width, Work(*work)
+        self.arguments = dict(
+            packed=packed,
+            whole=places,
+            extent2=dr.opaque(mi.Float, extent * extent),
+            packets=dr.opaque(mi.Int32, packets_of(width)),
+        )
+
+    def image(self, parts: int = 1):
+        """Float [height * width]."""
+        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments)
+
+    def tangent(self, tangents, shear, parts: int = 1):
+        """The image's derivative in a direction of the footprints' numbers, of which `shear` is one."""
+        *others, x, y = tangents
+        # A needle that moves along itself: in float32 its ridge would seem to move, too.
+        ridge = type(shear)(x) + shear * type(shear)(y)
+        zeros = dr.zeros(mi.Float, self.work.count)  # a tangent that vanishes has width 1
+        moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
+        dr.eval(moved)
+        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments, moved=moved)
+
+    def gradient(self, grad_image):
+        """Derivatives by the footprints' numbers from that by the image, Float [N] each, the last with the ridge left where it
+        is: see `by_values`."""
+        upstream = pad(grad_image, self.height, self.width)
+        out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
+        dr.make_opaque(upstream, out)
+        dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
+        return out
+
+
+def by_values(found, shear):
+    """Derivatives by the values of `Footprints`, of which `shear` is one, from those that `Plan.gradient` gives."""
+    *others, x, y = found
+    y = type(shear)(y) + shear * type(shear)(x)
+    return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
+
+
+def _row(c, w, y, extent2, packets):
+    """Constants of row y of a footprint and its packets [begin, end).
+
+    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin,
+    end.
+    """
+    _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
+    shear_low, ridge_low = unpair(low)
+    n = mi.Float(y - w.y)
+    dy = n - fy
+    m = dr.square(my * dy)
+    d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
+    d1 = dr.fma(2 * e12, dy, e1)
+    # num <= extent^2 den, a quadratic in t
+    a, b, c0 = dr.square(mx) - extent2 * e11, 0.5 * extent2 * d1, extent2 * d0 - m
+    root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
+    along, along_low = times(shear, shear_low, n)
+    steps = whole(along - ridge)
+    # Where the ridge is close to a pixel's centre, so that t needs its digits, these differences are exact.
+    offset = (ridge - (along - steps)) + (ridge_low - along_low)
+    column = w.x - mi.Int32(steps)
+    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, packets)
+    return dy, m, d0, d1, column, offset, begin, end
+
+
+def _shape(t, c, m, d0, d1):
+    """The footprint without its amplitude: 1/den, the exponent of 2, which is -num/den log2(e)/2, and the value."""
+    u = c[1] * HALF_LOG2E**0.5 * t
+    num = dr.fma(-u, u, m * -HALF_LOG2E)
+    root = dr.rsqrt(dr.fma(t, dr.fma(c[6], t, d1), d0))
+    inverse = root * root
+    exponent = num * inverse
+    return inverse, exponent, root * exp2_of_negative(exponent)
+
+
+def _draw(lane, begin, end, blocks, packed, whole, extent2, packets, target, base, private, moved=None):
+    """Add all footprints to the target; with `moved`, packed like them, their derivatives in that direction."""
+
+    def draw(g, block, stop):
+        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+        dc = None if moved is None else load(moved, g)
+
+        def rows(block):
+            y = w.z + mi.Int32(block * LANES + lane % LANES)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
+            line = base + y * packets
+
+            def pixels(packet):
+                t = position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, c, m, d0, d1)
+                factor = c[0] if moved is None else _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
+                deposit(target, factor * shape, line + packet, private)
+
+            repeat(first, last, pixels)
+
+        repeat(block, stop, rows)
+
+    return each_item(begin, end, blocks, draw)
+
+
+def _gather(lane, begin, end, blocks, packed, whole, extent2, packets, upstream, out):
+    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `out`."""
+
+    def gather(g, block, stop):
+        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+
+        def rows(block, *sums):
+            y = w.z + mi.Int32(block * LANES + lane % LANES)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
+            line = y * packets
+
+            def pixels(packet, s, n0, n1, n2, q0, q1, q2):
+                t = position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, c, m, d0, d1)
+                # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), but for the amplitude
+                value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
+                n = value * inverse
+                q = n * exponent
+                nt, qt = n * t, q * t
+                # Summed at once: packets of sums do not fit the CPU's registers.
+                return (
+                    s + dr.sum(value),
+                    n0 + dr.sum(n),
+                    n1 + dr.sum(nt),
+                    n2 + dr.dot(nt, t),
+                    q0 + dr.sum(q),
+                    q1 + dr.sum(qt),
+                    q2 + dr.dot(qt, t),
+                )
+
+            return _chain(sums, c, dy, *repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
+
+        sums = repeat(block, stop, rows, *(mi.Float(0) for _ in NAMES))
+        for target, value in zip(out, sums):
+            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+
+    return each_item(begin, end, blocks, gather)
+
+
+def _chain(sums, c, dy, s, n0, n1, n2, q0, q1, q2):
+    """Add a row's part to the eleven sums, from its moments in t."""
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
+    half = -0.5 * amplitude
+    h0, h1, h2 = (dr.fma(1 / HALF_LOG2E, q, n) for q, n in zip((q0, q1, q2), (n0, n1, n2)))
+    n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
+    # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy. The last number is the
+    # derivative by the centre's y along the ridge, at constant t.
+    d1 = dr.fma(2 * e12, dy, e1)
+    dt = 2 * dr.square(mx) * n1 + d1 * h0 + 2 * e11 * h1
+    ddy = 2 * dr.square(my) * dy * n0 + dr.fma(2 * e22, dy, e2) * h0 + 2 * e12 * h1
+    parts = (
+        s,
+        2 * mx * n2,
+        2 * my * dr.square(dy) * n0,
+        dy * dt,
+        h1,
+        dy * h0,
+        h2,
+        2 * dy * h1,
+        dr.square(dy) * h0,
+        -dt,
+        -ddy,
+    )
+    return tuple(a + b for a, b in zip(sums, parts))
+
+
+def _tangent_factor(c, dc, t, dy, d1, inverse, exponent):
+    """The footprint's directional derivative over its shape."""
+    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
+    d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_ridge, d_y, _ = dc
+    t_dot = dy * d_shear - d_ridge
+    num_dot = 2 * mx * t * (d_mx * t + mx * t_dot) + 2 * my * dy * (d_my * dy - my * d_y)
+    den_dot = (
+        t * (d_e1 + d_e11 * t)
+        + dy * (d_e2 + 2 * d_e12 * t + d_e22 * dy)
+        + (d1 + 2 * e11 * t) * t_dot
+        - (e2 + 2 * e12 * t + 2 * e22 * dy) * d_y
+    )
+    return d_amplitude - 0.5 * amplitude * inverse * (num_dot + dr.fma(1 / HALF_LOG2E, exponent, 1) * den_dot)

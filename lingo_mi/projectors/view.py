@@ -1,0 +1,60 @@
+"""One flat-panel view as Dr.Jit values: what the projector kernels know of a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+def vector64(xyz):
+    """An opaque Array3f64 of three Python numbers: a literal would be compiled into the kernel."""
+    Array3d, Float64 = mi.Vector3d, dr.value_t(mi.Vector3d)
+    return Array3d(*(dr.opaque(Float64, float(x)) for x in xyz))
+
+
+@dataclass
+class View:
+    """Rays of one view. The ray through the pixel position (x, y), pixel centres at (i + 1/2), runs
+
+        cone       from `source` along D = corner + x u + y v - source
+        parallel   through corner + x u + y v along the unit vector `source`
+
+    source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
+    width, height          pixels
+    parallel               whether the beam is parallel
+    panel                  whether integrals end at the detector (a scanner) or run on (a camera, whose image plane is
+                           only a chart of directions); those of a parallel beam are never cut
+    """
+
+    source: object
+    corner: object
+    u: object
+    v: object
+    width: int
+    height: int
+    parallel: bool = False
+    panel: bool = True
+
+    @staticmethod
+    def of(frames, index: int, height: int, width: int, panel: bool = True) -> View:
+        """View `index` of `lingo_mi.geometry.base.Rays`."""
+        return View(
+            *(vector64(a[index]) for a in (frames.source, frames.corner, frames.u, frames.v)),
+            width,
+            height,
+            frames.parallel,
+            panel,
+        )
+
+    def lengths(self):
+        """|D| of every pixel, Float [height * width], row by row: the Jacobian of the ray parameter, 1 for parallel beams."""
+        if self.parallel:
+            return mi.Float(1)
+        i = dr.arange(mi.UInt32, self.width * self.height)
+        x, y = i % self.width + 0.5, i // self.width + 0.5
+        axis = self.corner - self.source
+        # Two float32 products added to a float64 constant would promote everything; |D| only needs relative accuracy.
+        d = mi.Vector3f(axis) + mi.Float(x) * mi.Vector3f(self.u) + mi.Float(y) * mi.Vector3f(self.v)
+        return dr.norm(d)

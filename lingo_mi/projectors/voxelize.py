@@ -1,0 +1,243 @@
+"""A cloud of Gaussians sampled at the voxel centres of a grid, and the gradient of that.
+
+sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2), the splat's machinery with one more dimension: a lane works
+on one line of voxels along x, and the whitened distance is a sum of three squares (a Cholesky factor), so that needles
+lose no digits:
+
+    |W delta|^2 = (m1 t)^2 + (m2 r)^2 + (m3 dz)^2,   r = dy + s3 dz,   t = dx + s1 dy + s2 dz
+
+As in the splat, t and r cancel where a needle leans. The kernels know where t = 0 and r = 0 on the lines through the
+centre (`ridge`, in voxels along x, and `spine`, along y) and take both from line to line in twice float32's digits.
+Likewise they sum derivatives by what stays small, t and r, and those by dy and dz follow in float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.projectors.balance import (
+    LANES,
+    PACKET,
+    Work,
+    deposit,
+    each_item,
+    high_low,
+    load,
+    pack,
+    packets_of,
+    pad,
+    position,
+    repeat,
+    span,
+    times,
+    whole,
+)
+from lingo_mi.projectors.depth import deepest, parts_of
+from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
+from lingo_mi.projectors.rotation import rows_of
+from lingo_mi.projectors.splat import SETUP
+
+NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s2, s3, x, y, z, the last six in float64
+
+
+@dataclass
+class Grid:
+    """Voxels: the outer corner of the first one, the step (both Vector3d, opaque) and the number along x, y and z."""
+
+    corner: object
+    step: object
+    shape: tuple[int, int, int]
+
+    def volume(self, values):
+        """Float [nz * ny * nx] as a host volume, float32 [x, y, z]."""
+        return np.ascontiguousarray(values.numpy().reshape(self.shape[::-1]).transpose(2, 1, 0))
+
+
+def voxelize(centre, scale, rotation, density, grid: Grid, extent: float, deep: bool = False):
+    """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
+
+    centre, scale, rotation, density   as for `footprint.project`; one that is not finite, has no extent or no rotation leaves
+                                       no finite voxel
+    extent                             cut-off in standard deviations
+    deep                               as for `splat.splat`
+    """
+    Vector3d = mi.Vector3d
+    Float64 = dr.value_t(Vector3d)
+    p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
+    axes = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    cx, cy, cz = (axis * (grid.step[i] / s) for i, axis in enumerate(axes))
+    m1 = dr.norm(cx)
+    s1, s2 = dr.dot(cx, cy) / dr.square(m1), dr.dot(cx, cz) / dr.square(m1)
+    cy, cz = cy - s1 * cx, cz - s2 * cx
+    m2 = dr.norm(cy)
+    s3 = dr.dot(cy, cz) / dr.square(m2)
+    m3 = dr.norm(cz - s3 * cy)
+    at = (p - grid.corner) / grid.step
+    with dr.suspend_grad():
+        half = [extent * dr.norm(s * axis) / grid.step[i] for i, axis in enumerate(axes)]
+        middle = [mi.Int32(dr.floor(dr.clip(x, -1e9, 1e9))) for x in at]
+        begin = [mi.Int32(dr.clip(dr.ceil(at[i] - half[i] - 0.5), 0, grid.shape[i])) for i in range(3)]
+        end = [mi.Int32(dr.clip(dr.floor(at[i] + half[i] - 0.5) + 1, 0, grid.shape[i])) for i in range(3)]
+        size = [dr.maximum(end[i] - begin[i], 0) for i in range(3)]
+        lines = dr.select(size[0] > 0, size[1] * size[2], 0)
+        rest = (*middle, lines, begin[1], begin[2], size[1])
+        # An ellipsoid's voxels, or those of its box where they are fewer.
+        covered = mi.Float(dr.minimum(4 / 3 * dr.pi * extent**3 / (m1 * m2 * m3), Float64(lines) * Float64(size[0])))
+        sound = dr.isfinite(dr.sum(p) + rho + m1 + m2 + m3)
+    values = (
+        *(mi.Float(v) for v in (rho, m1, m2, m3)),
+        s1,
+        s2,
+        s3,
+        *(at[i] - (Float64(middle[i]) + 0.5) for i in range(3)),
+    )
+    out = dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), covered, grid.shape, extent, deep)
+    return out + dr.sum(dr.select(sound, 0, mi.Float(dr.nan)))
+
+
+class _Voxelize(dr.CustomOp):
+    def eval(self, values, rest, length, covered, shape, extent, deep):
+        self.shape, (nx, ny, nz) = shape, shape
+        self.packets = packets_of(nx)
+        rho, m1, m2, m3, s1, s2, s3, x, y, z = values
+        self.slopes = s1, s2, s3
+        ridge, spine = x + s1 * y + s2 * z, y + s3 * z
+        along_x, along_y = whole(ridge), whole(spine)
+        pairs = [high_low(v) for v in (s1, s2, s3, ridge - along_x, spine - along_y)]
+        columns = (rho, m1, m2, m3, *(v for both in pairs for v in both), mi.Float(z), mi.Float(0))
+        packed = pack(mi.Vector4f, mi.Float, columns)
+        # (column of the ridge, row, slice, lines) and (first row, first slice, rows, row of the spine)
+        column, row, *others = rest
+        places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
+        blocks, cost = (mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP
+        dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
+        self.work = Work.of(blocks, cost)
+        parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
+        self.arguments = dict(
+            packed=packed,
+            places=places,
+            extent2=dr.opaque(mi.Float, extent * extent),
+            packets=dr.opaque(mi.Int32, self.packets),
+            rows=dr.opaque(mi.Int32, ny),
+        )
+        return self.work.add_up(_fill, ny * nz, nx, parts, **self.arguments)
+
+    def backward(self):
+        nx, ny, nz = self.shape
+        upstream = pad(self.grad_out(), ny * nz, nx)
+        out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
+        dr.make_opaque(upstream, out)
+        dr.eval(_collect(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
+        # The kernel's derivatives by y and z leave ridge and spine where they are; that by s1 leaves t at r = 0.
+        s1, s2, s3 = self.slopes
+        by_s1, by_s2, by_s3, x, y, z = (type(s1)(v) for v in out[4:])
+        slopes = by_s1 - s3 * by_s2, by_s2, by_s3
+        self.set_grad_in('values', (*out[:4], *slopes, x, y + s1 * x, z + s2 * x + s3 * y))
+
+    def name(self):
+        return 'voxelize'
+
+
+def _line(c, w, v, index, extent2, packets, rows):
+    """A line of voxels of a Gaussian: what is constant along it, where t is 0 (a column and a fraction), its span in
+    packets and its first packet."""
+    _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
+    rows_of_slice = dr.maximum(
+        v.z, 1
+    )  # a lane whose team is done reads 0, and an integer division by it kills the process
+    y, z = v.x + index % rows_of_slice, v.y + index // rows_of_slice
+    ny, nz = mi.Float(y - w.y), mi.Float(z - w.z)
+    dz = nz - fz
+    along, low = times(s3, s3_low, nz)
+    steps = whole(along - spine)
+    r = mi.Float(y - v.w + mi.Int32(steps)) + ((along - steps) - spine) + (low - spine_low)
+    m = dr.square(m2 * r) + dr.square(m3 * dz)
+    along_y, low_y = times(s1, s1_low, ny)
+    along_z, low_z = times(s2, s2_low, nz)
+    steps_y = whole(along_y)
+    rest, low = _sum(along_y - steps_y, -ridge)
+    steps_z = whole(along_z + rest)
+    offset = (ridge_low - low_y - low_z - low) - ((along_z - steps_z) + rest)
+    column = w.x - mi.Int32(steps_y) - mi.Int32(steps_z)
+    half = dr.sqrt(dr.maximum(extent2 - m, 0)) / m1
+    begin, end = span(-half, half, offset, column, (index >= w.w) | (m > extent2), packets)
+    return dz, r, m, column, offset, begin, end, (z * rows + y) * packets
+
+
+def _sum(a, b):
+    """a + b and what rounding took from it (Knuth)."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)
+
+
+def _fill(lane, begin, end, blocks, packed, places, extent2, packets, rows, target, base, private):
+    def draw(g, block, stop):
+        c = load(packed, g, 4)
+        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
+
+        def lines(block):
+            index = mi.Int32(block * LANES + lane % LANES)
+            _, _, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+
+            def voxels(packet):
+                u = c[1] * position(packet, column, offset)
+                value = c[0] * exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
+                deposit(target, value, base + line + packet, private)
+
+            repeat(first, last, voxels)
+
+        repeat(block, stop, lines)
+
+    return each_item(begin, end, blocks, draw)
+
+
+def _collect(lane, begin, end, blocks, packed, places, extent2, packets, rows, upstream, out):
+    def gather(g, block, stop):
+        c = load(packed, g, 4)
+        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
+
+        def lines(block, *sums):
+            index = mi.Int32(block * LANES + lane % LANES)
+            dz, r, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+
+            def voxels(packet, n0, n1, n2):
+                t = position(packet, column, offset)
+                u = c[1] * t
+                shape = exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
+                n = dr.gather(mi.Vector4f, upstream, line + packet) * shape
+                nt = n * t
+                return n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t)
+
+            return _chain(sums, c, dz, r, *repeat(first, last, voxels, *(mi.Float(0) for _ in range(3))))
+
+        sums = repeat(block, stop, lines, *(mi.Float(0) for _ in range(NUMBERS)))
+        for target, value in zip(out, sums):
+            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+
+    return each_item(begin, end, blocks, gather)
+
+
+def _chain(sums, c, dz, r, n0, n1, n2):
+    """Add a line's part to the sums, from its moments in t: d/d(exponent's square) is -rho/2 times a moment."""
+    rho, m1, m2, m3, *_ = c
+    a0, a1, a2 = -rho * n0, -rho * n1, -rho * n2
+    dt = dr.square(m1) * a1
+    d_r = dr.square(m2) * r * a0
+    parts = (
+        n0,
+        m1 * a2,
+        m2 * dr.square(r) * a0,
+        m3 * dr.square(dz) * a0,
+        r * dt,
+        dz * dt,
+        dz * d_r,
+        -dt,
+        -d_r,
+        -dr.square(m3) * dz * a0,
+    )
+    return tuple(a + b for a, b in zip(sums, parts))

@@ -1,0 +1,1 @@
+"""Volumes on voxels: filtered backprojection, iterative algorithms, and the refinement of a cloud's volume."""

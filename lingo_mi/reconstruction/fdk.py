@@ -1,0 +1,217 @@
+"""Filtered backprojection: FDK for cone and fan beams, FBP for parallel beams (NumPy and Dr.Jit).
+
+Feldkamp, Davis, Kress, "Practical cone-beam algorithm", JOSA A 1 (1984). With tau the pixel size at the axis,
+w the distance of a voxel from the source along the central ray over DSO, and h the band-limited ramp of Kak
+and Slaney ("Principles of Computerized Tomographic Imaging", 1988, section 3.3),
+
+    f(x) = sum over views  dbeta / w^2  tau (h * [cosine p])(u(x), v(x))
+
+where the view weights dbeta sum to pi (`view_weights`). A parallel beam has w = 1 and no cosine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import fft
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.camera import voxel_matrices
+from lingo_mi.reconstruction.rectify import upright
+from lingo_mi.reconstruction.views import gaps
+from lingo_mi.scan import Scan
+
+# Apodisation of the ramp over |frequency| in units of the Nyquist frequency, f in [0, 1].
+WINDOWS = {
+    'ram-lak': lambda f: np.ones_like(f),
+    'shepp-logan': lambda f: np.sinc(f / 2),
+    'cosine': lambda f: np.cos(np.pi / 2 * f),
+    'hamming': lambda f: 0.54 + 0.46 * np.cos(np.pi * f),
+    'hann': lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
+}
+
+
+BATCH = 4  # views a launch: shares the index arithmetic and the volume's memory traffic
+
+
+def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
+    """Frequency response [size // 2 + 1] of the ramp for n pixels of size tau, zero-padded to twice as many.
+
+    It is the transform of the sampled band-limited kernel h(0) = 1 / (4 tau^2), h(odd k) = -1 / (pi k tau)^2,
+    times tau: unlike a ramp sampled in frequency, it keeps the mean right.
+
+    Raises InputError for an unknown window.
+    """
+    shape = WINDOWS.get(window.replace('_', '-'))
+    if shape is None:
+        raise InputError(f'filter {window!r} is unknown: use one of {", ".join(WINDOWS)}')
+    size = fft.next_fast_len(2 * n, real=True)
+    k = np.minimum(np.arange(size), size - np.arange(size))
+    kernel = np.where(k % 2 == 1, -1 / (np.pi * np.maximum(k, 1) * tau) ** 2, 0.0)
+    kernel[0] = 1 / (4 * tau**2)
+    response = tau * fft.rfft(kernel).real
+    return response * shape(np.linspace(0, 1, len(response)))
+
+
+def view_weights(geometry: Geometry) -> np.ndarray:
+    """The angle that every view stands for, [view] radians: half the gaps to its neighbours on the circle.
+
+    Repeated views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum to
+    pi, as they do for half a turn. An open arc above half a turn is scaled to pi as a whole; `ray_weights` then tells rays
+    that were measured twice from those measured once. An arc below half a turn keeps its own angle (a limited-angle
+    scan lacks density).
+    """
+    n = len(geometry)
+    if n == 1:
+        return np.array([np.pi])
+    # A parallel beam repeats after half a turn.
+    order, gap, _ = gaps(geometry, np.pi if geometry.mode == 'parallel' else 2 * np.pi)
+    weight = np.empty(n)
+    weight[order] = (gap + np.roll(gap, 1)) / 2
+    return weight * min(1.0, np.pi / gap.sum())
+
+
+def ray_weights(geometry: Geometry) -> np.ndarray:
+    """Share of every ray among its repetitions, times their usual number: [view, u], or [1, u] where views agree.
+
+    short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
+                       short scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in
+                       place of the fan angle (Silver, Med. Phys. 27, 2000)
+    offset detector    a closed circle and a panel that reaches farther on one side: Wang, "X-ray micro-CT with a displaced
+                       detector array", Med. Phys. 29 (2002); the columns must then be `extended`
+    otherwise 1        also for an arc that exceeds half a turn by less than the fan angle
+    """
+    n_u, d_u, offset = geometry.nDetector[1], geometry.dDetector[1], geometry.offDetector[1]
+    u = (np.arange(n_u) - (n_u - 1) / 2) * d_u + offset
+    cone = geometry.mode == 'cone'
+    fan = np.arctan(u / geometry.DSD) if cone else u
+    if _lacking(geometry):
+        edge = n_u / 2 * d_u - abs(offset)
+        if edge <= 0:  # the axis is not seen: nothing is measured twice
+            return np.full((1, n_u), 2.0)
+        overlap = np.arctan(edge / geometry.DSD) if cone else edge
+        return 1 + np.sin(np.pi / 2 * np.clip(np.sign(offset) * fan / overlap, -1, 1))[None]
+    if not cone or len(geometry) == 1:
+        return np.ones((1, n_u))
+    order, gap, is_open = gaps(geometry, 2 * np.pi)
+    excess = (gap.sum() - np.pi) / 2
+    if not is_open or excess <= np.abs(fan).max():
+        return np.ones((1, n_u))
+    beta = np.empty((len(geometry), 1))
+    beta[order, 0] = np.cumsum(gap) - gap / 2
+    # The same line is seen from beta + pi - 2 fan.
+    rise, fall = beta / (excess + fan), (np.pi + 2 * excess - beta) / (excess - fan)
+    return np.sin(np.pi / 4 * np.clip(np.minimum(rise, fall), 0, 2)) ** 2 * gap.sum() / np.pi
+
+
+def _lacking(geometry: Geometry) -> int:
+    """Columns that a panel lacks on its shorter side, where the other side is seen from behind: on a closed circle."""
+    if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
+        return 0
+    return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
+
+
+def extended(scan: Scan) -> Scan:
+    """A scan of a closed circle with columns of zeros on the panel's shorter side, so that it reaches as far on both.
+
+    Filtering spreads what was measured there. Any other scan is returned as it is.
+    """
+    geometry = scan.geometry
+    lacking = _lacking(geometry)
+    if lacking == 0:
+        return scan
+    (n_v, n_u), (off_v, off_u), side = geometry.nDetector, geometry.offDetector, np.sign(geometry.offDetector[1])
+    wider = replace(
+        geometry,
+        nDetector=(n_v, n_u + lacking),
+        offDetector=(off_v, off_u - side * lacking * geometry.dDetector[1] / 2),
+    )
+    columns = (lacking, 0) if side > 0 else (0, lacking)
+    return Scan(wider, np.pad(scan.projections, ((0, 0), (0, 0), columns)))
+
+
+def filtered(projections, geometry: Geometry, window: str = 'ram-lak') -> np.ndarray:
+    """Cosine-weighted, ramp-filtered projections, float32 [view, v, u], per mm."""
+    n_v, n_u = geometry.nDetector
+    tau = geometry.dDetector[1]
+    if geometry.mode == 'cone':
+        u = (np.arange(n_u) - (n_u - 1) / 2) * geometry.dDetector[1] + geometry.offDetector[1]
+        v = (np.arange(n_v) - (n_v - 1) / 2) * geometry.dDetector[0] - geometry.offDetector[0]
+        cosine = geometry.DSD / np.sqrt(geometry.DSD**2 + u**2 + v[:, None] ** 2)
+        projections = projections * cosine.astype(np.float32)
+        tau *= geometry.DSO / geometry.DSD
+    response = ramp(n_u, tau, window).astype(np.float32)
+    size = fft.next_fast_len(2 * n_u, real=True)
+    return fft.irfft(fft.rfft(projections, size, workers=-1) * response, size, workers=-1)[..., :n_u]
+
+
+def _add_views(volume, views, geometry):
+    """Adds views, each (image, matrix, weight), to the volume: bilinear, nothing outside the panel."""
+    (n_v, n_u), (_, ny, nz) = geometry.nDetector, geometry.nVoxel
+    index = dr.arange(mi.UInt, int(np.prod(geometry.nVoxel)))
+    row = index // nz
+    i = row // ny
+    voxel = mi.Vector3f(mi.Float(i), mi.Float(row - i * ny), mi.Float(index - row * nz))
+    for image, matrix, weight in views:
+        x, y, w = (dr.fma(m[0], voxel.x, dr.fma(m[1], voxel.y, dr.fma(m[2], voxel.z, m[3]))) for m in matrix)
+        inv = dr.rcp(w)
+        x, y = dr.fma(x, inv, -0.5), dr.fma(y, inv, -0.5)
+        # The panel ends half a pixel outside the outermost pixel centres.
+        seen = (w > 0) & (x > -0.5) & (x < n_u - 0.5) & (y > -0.5) & (y < n_v - 0.5)
+        x, y = dr.clip(x, 0, n_u - 1), dr.clip(y, 0, n_v - 1)
+        x0, y0 = mi.UInt(x), mi.UInt(y)
+        x1, y1 = dr.minimum(x0 + 1, n_u - 1), dr.minimum(y0 + 1, n_v - 1)
+        # The image is stored v fastest, like the volume's z.
+        p = [dr.gather(mi.Float, image, column * n_v + line, seen) for column in (x0, x1) for line in (y0, y1)]
+        fy = y - mi.Float(y0)
+        value = dr.lerp(dr.lerp(p[0], p[1], fy), dr.lerp(p[2], p[3], fy), x - mi.Float(x0))
+        volume = dr.fma(dr.select(seen, weight * inv * inv, 0), value, volume)
+    return volume
+
+
+def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
+    """Reconstruct a volume by filtered backprojection: float32 [x, y, z], density per mm.
+
+    scan       cone (one detector row: fan) or parallel, detector offsets included; the views together must see the
+               whole width of the object, otherwise the truncated rows are filtered as they are. What a panel that is turned
+               or tilted has measured is brought to an upright one first (`upright`)
+    filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'; TIGRE's 'ram_lak' and 'shepp_logan' are known too
+    progress   called as progress(views done, views) after every few views
+
+    Short scans and offset detectors are weighted, see `ray_weights`. A voxel outside a view's panel gets nothing from that
+    view. With one detector row only the slice in the plane of the fan is meaningful. One compiled kernel serves all
+    views.
+
+    Raises InputError for an unknown filter, a source that moves on no circle about z, a panel that moves against it, or pixels
+    that are not valid.
+    """
+    ramp(scan.geometry.nDetector[1], 1.0, filter)  # an unknown name must fail before the work
+    scan = upright(scan, 'filtered backprojection')
+    rays = ray_weights(scan.geometry)[:, None].astype(np.float32)
+    scan = extended(Scan(scan.geometry, scan.projections * rays))
+    geometry = scan.geometry
+    volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    dr.make_opaque(volume)
+    matrices, weights = voxel_matrices(geometry), view_weights(geometry)
+    n = len(geometry)
+    for start in range(0, n, BATCH):
+        images = filtered(scan.projections[start : start + BATCH], geometry, filter).transpose(0, 2, 1)
+        views = []
+        for i in range(start, start + BATCH):  # the last batch is filled with views of weight zero
+            weight, i = (weights[i], i) if i < n else (0.0, start)
+            views.append(
+                (
+                    mi.Float(np.ascontiguousarray(images[i - start]).ravel()),
+                    [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
+                    dr.opaque(mi.Float, float(weight)),
+                )
+            )
+        volume = _add_views(volume, views, geometry)
+        dr.eval(volume)
+        if progress:
+            progress(min(start + BATCH, n), n)
+    return volume.numpy().reshape(geometry.nVoxel)

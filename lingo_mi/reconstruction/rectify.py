@@ -1,0 +1,158 @@
+"""Scans whose panel is turned, tilted or beside the central ray, as an upright panel behind the same source sees them.
+
+The same rays cross both planes, so that positions on one are a homography of those on the other (Hartley and Zisserman,
+"Multiple View Geometry", 2nd edition, 2004, section 2.3), and line integrals stay what they are: nothing is weighted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import SAME, Geometry
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays, scanner_rays
+from lingo_mi.reconstruction.views import gaps, require_pixels
+from lingo_mi.scan import Scan
+
+MOVES = 0.1  # of the panel's size by which its shadow may move from view to view
+
+
+def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
+    """The scan on a panel that is the same in all views: columns along z, rows along the source's circle, in its middle the
+    ray through the axis.
+
+    scan   all pixels valid; the source moves on a circle about z around the origin, the panel with it
+    what   needs such a panel, for messages
+
+    The geometry is `upright_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
+    real panel on. A scan on a circle before an upright panel is returned as it is.
+
+    Raises InputError for pixels that are not valid, and for a source or a panel that moves otherwise.
+    """
+    require_pixels(scan, what)
+    geometry, (n_v, n_u) = upright_geometry(scan.geometry, what), scan.geometry.nDetector
+    if geometry is scan.geometry:
+        return scan
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in geometry.nDetector[::-1]))
+    there = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
+    out = np.empty((len(scan), *geometry.nDetector), np.float32)
+    for view, to_real in enumerate(_homographies(geometry.rays(), scan.geometry.rays())):
+        x, y, w = to_real @ there
+        x, y = x / w, y / w
+        # Half a pixel more than there is: a single row that is turned by little lies between two new ones.
+        seen = (w > 0) & (x > -0.5) & (x < n_u + 0.5) & (y > -0.5) & (y < n_v + 0.5)
+        value = ndimage.map_coordinates(scan.projections[view], [y - 0.5, x - 0.5], order=3, mode='nearest')
+        out[view] = np.where(seen, value, 0).reshape(geometry.nDetector)
+    return Scan(geometry, out)
+
+
+def is_circular(scan: Scan) -> bool:
+    """Whether `upright` knows the scan."""
+    try:
+        require_pixels(scan, '')
+        upright_geometry(scan.geometry)
+    except InputError:
+        return False
+    return True
+
+
+def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
+    """The same rays before an upright panel that holds the real panel's shadow of all views, with pixels no coarser.
+
+    Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side
+    where the last row begins to see: `fdk.ray_weights` knows no rows. Else that of a closed circle reaches as far on both.
+
+    Raises InputError where the source leaves a circle about z, where the panel moves against it by more than a tenth of its
+    size, is turned so far that no line along the circle crosses it, or is not wholly before the source.
+    """
+    if geometry.poses is None:
+        return geometry
+    frames, (n_v, n_u) = geometry.poses, geometry.nDetector
+    DSO, DSD, angles = _circle(geometry, what)
+    # Its positions are mm from the central ray, along the circle and downwards.
+    plane = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), frames.parallel)
+    corners = np.array([[0, n_u, 0, n_u], [0, 0, n_v, n_v], [1, 1, 1, 1]], float)
+    shadow = _homographies(frames, plane) @ corners
+    if shadow[:, 2].min() <= 0:
+        raise InputError(f'{what} needs a panel behind the axis; a part of this one is beside the source')
+    shadow /= shadow[:, 2:]
+    typical = np.median(shadow, 0)
+    if np.any(np.abs(shadow - typical)[:, :2] > MOVES * np.ptp(typical[:2], 1)[:, None]):
+        raise InputError(f'{what} needs a panel that keeps its place behind the source; this scan has other poses')
+    (left, inner_left, inner_right, right), (top, inner_top, inner_bottom, bottom) = _ends(shadow)
+    if inner_top >= inner_bottom:
+        raise InputError(
+            f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in '
+            'its plane too far'
+        )
+    if len(geometry) > 1 and not gaps(geometry, 2 * np.pi)[2]:
+        if inner_right > -left:
+            left = inner_left
+        elif -inner_left > right:
+            right = inner_right
+        else:
+            right = max(right, -left)
+            left = -right
+    step_u, step_v = _steps(_homographies(plane, frames), shadow)
+    return Geometry(
+        DSO,
+        DSD,
+        tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
+        (step_v, step_u),
+        geometry.nVoxel,
+        geometry.dVoxel,
+        angles,
+        geometry.mode,
+        geometry.offOrigin,
+        (-(top + bottom) / 2, (left + right) / 2),
+    )
+
+
+def _circle(geometry: Geometry, what: str):
+    """DSO, the mean DSD and the angles [view] of the circle about z that the source moves on, InputError where it does not."""
+    frames = geometry.poses
+    out = -frames.source if frames.parallel else frames.source
+    angles = np.arctan2(out[:, 1], out[:, 0])
+    DSO = 0.0 if frames.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
+    depth = -np.sum(frames.centre(geometry.nDetector)[:, :2] * np.stack([np.cos(angles), np.sin(angles)], 1), 1)
+    DSD = DSO + max(float(depth.mean()), 0.0)
+    source = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), frames.parallel).source
+    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1.0
+    if np.abs(source - frames.source).max() * reach > SAME * min(geometry.dDetector):
+        raise InputError(f'{what} needs a source on a circle about z; this scan has other poses')
+    return DSO, DSD, angles
+
+
+def _ends(shadow):
+    """How far a shadow's edges [view, 3, corner] reach along both axes: out and in on one side, in and out on the other."""
+    across, down = np.abs(shadow[:, :2, 1:3] - shadow[:, :2, :1]).mean(0).T
+    if across[0] < down[0]:  # a panel on its side: its columns lie along the circle
+        shadow = shadow[:, :, [0, 2, 1, 3]]
+    for edges in (shadow[:, 0, [0, 2]], shadow[:, 0, [1, 3]]), (shadow[:, 1, [0, 1]], shadow[:, 1, [2, 3]]):
+        low, high = sorted(edges, key=np.mean)
+        yield low.min(), low.max(), high.min(), high.max()
+
+
+def _homographies(of: Rays, on: Rays) -> np.ndarray:
+    """Matrices [view, 3, 3] from positions (x, y, 1) on one panel to (x w, y w, w) on another that the same rays meet there.
+
+    w is positive in front of the source.
+    """
+    points = np.zeros((len(of), 4, 3))
+    points[:, :3] = np.stack([of.u, of.v, of.corner], 2)
+    points[:, 3, 2] = 1
+    return camera_matrices(on) @ points
+
+
+def _steps(to_pixels, at) -> np.ndarray:
+    """The steps along both axes of a plane, [2], none of which is longer than a pixel of any view.
+
+    to_pixels   homographies [view, 3, 3] from the plane
+    at          positions [view, 3, corner] where they are compared
+    """
+    x = to_pixels @ at
+    # d(x / w) = (dx - (x / w) dw) / w
+    slope = (to_pixels[:, :2, :2, None] - x[:, :2, None] / x[:, 2:, None] * to_pixels[:, 2:, :2, None]) / x[:, 2:, None]
+    return 1 / np.linalg.norm(slope, axis=1).max((0, 2))

@@ -1,0 +1,40 @@
+"""Memory that each algorithm takes at its peak, as tests/test_recon_memory.py measures it."""
+
+from __future__ import annotations
+
+from math import prod
+from typing import NamedTuple
+
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
+
+
+class Need(NamedTuple):
+    """volumes       at the peak of what works on volumes
+    wide_pixels   the same where rays leave voxels out
+    projections   sets of all projections at the peak of what works on these
+    """
+
+    volumes: float
+    wide_pixels: float
+    projections: float
+
+
+NEEDS = {
+    'fdk': Need(3.4, 3.4, 2.5),
+    'sart': Need(4.6, 8.7, 4.2),
+    'os-sart': Need(3.7, 7.7, 4.8),
+    'sirt': Need(3.7, 7.7, 6.3),
+    'cgls': Need(5.7, 6.7, 5.3),
+    'asd-pocs': Need(7.7, 8.7, 4.5),
+    'refined': Need(10.8, 12.6, 4.6),
+}
+
+
+def needed(algorithm: str, geometry: Geometry, views: int) -> float:
+    """Bytes that an algorithm takes at its peak: the larger of what works on volumes, beside two sets of projections, and of what
+    works on projections, beside a volume."""
+    volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
+    need = NEEDS[algorithm]
+    volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes
+    return max(volumes * volume + 2 * projections, volume + need.projections * projections)

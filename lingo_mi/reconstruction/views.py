@@ -1,0 +1,71 @@
+"""What reconstruction on voxels asks of a scan, and how its views lie around the circle."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.scan import Scan
+
+
+def on_circle(scan: Scan) -> bool:
+    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid; `upright.is_circular`
+    asks the same of a panel that is turned or tilted."""
+    return scan.geometry.poses is None and scan.valid is None
+
+
+def require_circle(scan: Scan, what: str):
+    """Raises InputError, naming what needs it, for a scan that is not `on_circle`."""
+    if scan.geometry.poses is not None:
+        raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
+    require_pixels(scan, what)
+
+
+def require_pixels(scan: Scan, what: str):
+    """Raises InputError, naming what needs them, where not all pixels are valid."""
+    if scan.valid is not None:
+        raise InputError(f'{what} needs every pixel, and some of this scan are not valid: fill them first')
+
+
+def require_rays(geometry: Geometry):
+    """Raises InputError where a source is in the volume, and where no view's rays meet it."""
+    frames, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    if not frames.parallel and (np.abs(frames.source - centre) < half).all(1).any():
+        raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
+    corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector
+    for view in range(len(geometry)):
+        x, y = frames.project(corners, view)
+        # NaN are corners behind the source, which hide how far the others' shadow goes.
+        if 0 < np.isnan(x).sum() < len(x) or x.max() > 0 and x.min() < columns and y.max() > 0 and y.min() < rows:
+            return
+    raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')
+
+
+def require_signal(scan: Scan, purpose: str = 'reconstruct'):
+    """Raises InputError for projections of nothing, which leave nothing to do for that purpose."""
+    if not scan.projections.any():
+        raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')
+    if scan.projections.max() <= 0:
+        raise InputError(f'the projections are nowhere above zero: there is nothing to {purpose}; check their sign')
+
+
+def gaps(geometry: Geometry, turn: float):
+    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
+
+    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
+    step.
+    """
+    angle = np.mod(geometry.angles, turn)
+    order = np.argsort(angle, kind='stable')
+    gap = np.diff(angle[order], append=angle[order[0]] + turn)
+    distinct = np.sort(gap[gap > 1e-6])
+    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
+    is_open = bool(distinct[-1] > 1.5 * typical)
+    if is_open:
+        widest = np.argmax(gap)
+        gap[widest] = typical
+        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
+    return order, gap, is_open

@@ -1,0 +1,1 @@
+"""The report of a result: figures, and the page that holds them."""

@@ -1,0 +1,102 @@
+"""The numbers of a fit: quality of held-out views and of the volume, IPSD, times."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi import metrics
+from lingo_mi.fit.loop import Fitted
+from lingo_mi.lingo.ipsd import ipsd, reverse_distance
+from lingo_mi.scan import Dataset
+
+
+def quick_measure(dataset: Dataset, most: int = 4):
+    """A function for `fit.loop.run` that gives 2D PSNR on a few held-out views and 3D PSNR where the truth is known."""
+    test = dataset.test
+    if test is not None and len(test) > most:
+        test = test.subset(np.arange(most) * len(test) // most)
+
+    def measure(stepper, state):
+        out = {}
+        if test is not None and len(test):
+            rendered = comparable(stepper.render(state, test.geometry), test)
+            out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
+        if dataset.volume is not None and (volume := stepper.volume(state)) is not None:
+            out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
+        return out
+
+    return measure
+
+
+def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
+    """The numbers of a finished fit; None where there is no truth to compare with."""
+    born = fitted.state.values['centre'][fitted.state.born]
+    test = dataset.test
+    truth = test.projections if rendered is not None else None
+    rendered = None if rendered is None else comparable(rendered, test)
+
+    def of(function, result, reference):
+        return None if result is None or reference is None else _number(function(result, reference))
+
+    return dict(
+        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth),
+        psnr_2d=of(metrics.psnr_2d, rendered, truth),
+        ssim_2d=of(metrics.ssim_2d, rendered, truth),
+        **compared(volume, dataset.volume),
+        ipsd=_number(ipsd(fitted.initial, born)),
+        ipsd_targets=len(born),
+        ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
+        gaussians=len(fitted.state),
+        iterations=fitted.settings.iterations,
+        seconds_init=fitted.info['seconds'],
+        seconds_fit=fitted.seconds,
+        ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
+        history=fitted.history,
+    )
+
+
+def compared(volume, truth) -> dict:
+    """PSNR and SSIM of a volume, in both of their forms; None where there is nothing to compare, or no number."""
+    names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
+    if volume is None or truth is None:
+        return dict.fromkeys(names)
+    return {name: _number(getattr(metrics, name)(volume, truth)) for name in names}
+
+
+def summary(result: dict) -> str:
+    """The main numbers of a result, one line each."""
+    return '\n'.join(
+        [
+            f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}',
+            volume_quality(result),
+            f'cloud           {result["gaussians"]:,} Gaussians after {result["iterations"]} iterations of '
+            f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
+            f'{result["seconds_fit"]:.0f} s to fit',
+        ]
+    )
+
+
+def volume_quality(result: dict) -> str:
+    """The lines of a volume's numbers (`compared`): for densities in any unit first, then R2-Gaussian's, for those up to 1."""
+    return (
+        f'volume          {_shown(result, "psnr_3d_absolute", "ssim_3d_absolute")} (full scale: the largest true density)\n'
+        f'                {_shown(result, "psnr_3d", "ssim_3d")} (full scale: 1, as in R2-Gaussian)'
+    )
+
+
+def comparable(rendered, test):
+    """Rendered views with the pixels that were not measured at zero, as in the scan."""
+    return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
+
+
+def _number(x: float):
+    """A number for JSON, which has neither NaN nor infinity, or None."""
+    return x if np.isfinite(x) else None
+
+
+def _shown(result: dict, psnr: str, ssim: str) -> str:
+    psnr, ssim = (
+        'n/a' if result[name] is None else form.format(result[name])
+        for name, form in ((psnr, '{:.2f} dB'), (ssim, '{:.4f}'))
+    )
+    return f'PSNR {psnr}, SSIM {ssim}'

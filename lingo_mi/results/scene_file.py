@@ -1,0 +1,50 @@
+"""A fitted cloud and its scanner as a Mitsuba scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from lingo_mi.effects.detector import Detector
+from lingo_mi.scene.description import describe
+
+
+def write_scene(path: Path, geometry, extent: float, effects=None):
+    """A scene that renders the fitted cloud with the scan's own scanner; needs only `import lingo_mi`.
+
+    effects   of the scan that the fit has modelled: the scene then has their tube, and a detector without noise, so that it
+              renders what the fit compared with the scan
+    """
+    lines = [
+        '<scene version="3.0.0">',
+        '    <integrator type="lingo_xray">',
+        f'        <float name="extent" value="{extent:g}"/>',
+        '    </integrator>',
+        '    <shape type="ellipsoids" id="cloud">',
+        '        <string name="filename" value="gaussians.ply"/>',
+        '    </shape>',
+        '    <sensor type="ct_scanner" id="scanner">',
+    ]
+    lines += _parameters(describe(geometry), 8)
+    if effects is not None and effects.detector:
+        given = {k: v for k, v in vars(effects.detector.expected).items() if v != Detector.DEFAULTS[k]}
+        lines += ['        <film type="ct_detector">', *_parameters(given, 12), '        </film>']
+    lines += ['    </sensor>']
+    if effects is not None and effects.tube:
+        spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
+        given = {k: v for k, v in effects.tube.given.items() if not (v is None or v == '' or k.startswith('material'))}
+        if effects.tube.hardens or effects.scatter:  # the cloud stands for all shapes
+            given['material'] = ' + '.join(effects.tube.fitted())
+        scatter = effects.scatter.within(geometry).given if effects.scatter else {}
+        lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot | scatter, 8), '    </emitter>']
+    path.write_text('\n'.join([*lines, '</scene>']) + '\n', encoding='utf-8')
+
+
+def _parameters(values: dict, indent: int) -> list[str]:
+    """Parameters of a plugin as lines of XML."""
+    kinds = {str: 'string', float: 'float', int: 'integer'}
+    return [
+        ' ' * indent + f'<{kinds[type(v)]} name="{k}" value={quoteattr(v if isinstance(v, str) else repr(v))}/>'
+        for k, v in values.items()
+        if k != 'type'
+    ]

@@ -1,0 +1,48 @@
+"""What is refused, or warned of, before a scan is made or read."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.memory import room
+
+
+def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0):
+    """Refuse, before anything is allocated, a scan that this process cannot hold.
+
+    views    of all geometries together (0: as many as they have)
+    needed   bytes that an algorithm takes at its peak (0: the least there is, the voxels as read, fitted and compared, and the
+             projections as measured and rendered)
+    """
+    known = [g for g in geometries if g is not None]
+    views = views or sum(map(len, known))
+    voxels, pixels = math.prod(known[0].nVoxel), views * math.prod(known[0].nDetector)
+    needed = needed or 4 * (3 * voxels + 2 * pixels)
+    if needed > (has := room()):
+        size = [' x '.join(map(str, counts)) for counts in (known[0].nVoxel, known[0].nDetector)]
+        raise InputError(
+            f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2**30:,.1f} GiB of '
+            f'memory, but this process may take {has / 2**30:,.1f} GiB: lower nVoxel, nDetector or the views'
+        )
+
+
+def warn_if_truncated(geometry: Geometry):
+    """Say so where the volume's midplane is wider than what the panels see of it."""
+    frames, centre = geometry.rays(), np.array(geometry.offOrigin)
+    widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]
+    cut = 0
+    for view in range(len(frames)):
+        across = frames.u[view] / np.linalg.norm(frames.u[view]) * widest / 2
+        x, _ = frames.project(np.stack([centre - across, centre + across]), view)
+        cut += not (x.min() >= -1e-4 * columns and x.max() <= columns * (1 + 1e-4))  # also where it is NaN
+    if cut:
+        warnings.warn(
+            f'the volume is {widest:g} mm wide, and the panel does not see all of it in {cut} of {len(frames)} '
+            'views: projections may be truncated',
+            stacklevel=2,
+        )

@@ -1,0 +1,30 @@
+"""Where the data files lie that a scene names."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mitsuba as mi
+
+from lingo_mi.errors import InputError
+
+
+def data_file(name: str, parameter: str) -> str:
+    """The path of a file that a scene names: beside the scene or here, else in the folder that LINGO_MI_DATA names.
+
+    parameter   the scene's `<default>` by which a user can name another file, for the message
+
+    Raises InputError, in one line, where there is no such file.
+    """
+    found = Path(str(mi.file_resolver().resolve(name)))
+    folder = os.environ.get('LINGO_MI_DATA')
+    if not found.exists() and folder:
+        found = Path(folder) / name
+    if not found.exists():
+        where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
+        raise InputError(
+            f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
+            f'that holds it, or name your file: -D {parameter}=FILE'
+        )
+    return str(found)

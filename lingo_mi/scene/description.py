@@ -1,0 +1,187 @@
+"""A scanner as the parameters of the plugin `ct_scanner`: read into a geometry, and written from one."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.files import astra
+from lingo_mi.files.poses import read_poses
+from lingo_mi.files.tigre import to_posed
+from lingo_mi.geometry.base import Geometry, circular, helix
+from lingo_mi.scene.data_files import data_file
+
+MOST_VIEWS = 100_000
+NAMES = (
+    'mode',
+    'DSO',
+    'DSD',
+    'nDetector',
+    'dDetector',
+    'offDetector',
+    'nVoxel',
+    'dVoxel',
+    'offOrigin',
+    'views',
+    'totalAngle',
+    'startAngle',
+    'angles',
+    'test_views',
+    'pitch',
+    'tilt',
+    'rotDetector',
+    'poses',
+)
+_CIRCLE = (
+    'DSO',
+    'DSD',
+    'offDetector',
+    'angles',
+    'views',
+    'totalAngle',
+    'startAngle',
+    'pitch',
+    'tilt',
+    'rotDetector',
+    'test_views',
+)
+
+
+def describe(geometry: Geometry, index: int = 0) -> dict:
+    """A `ct_scanner` as a dictionary for `mi.load_dict`."""
+
+    def join(values):
+        return ', '.join(repr(float(x)) if isinstance(x, float) else str(x) for x in values)
+
+    g = geometry
+    if g.poses is not None:
+        vectors = astra.to_vectors(g.poses, g.nDetector)
+        return dict(
+            type='ct_scanner',
+            mode=g.mode,
+            nDetector=join(g.nDetector),
+            nVoxel=join(g.nVoxel),
+            dVoxel=join(g.dVoxel),
+            offOrigin=join(g.offOrigin),
+            poses=join(vectors.ravel().tolist()),
+            view=index,
+        )
+    return dict(
+        type='ct_scanner',
+        mode=g.mode,
+        DSO=g.DSO,
+        DSD=g.DSD,
+        nDetector=join(g.nDetector),
+        dDetector=join(g.dDetector),
+        offDetector=join(g.offDetector),
+        nVoxel=join(g.nVoxel),
+        dVoxel=join(g.dVoxel),
+        offOrigin=join(g.offOrigin),
+        angles=join(np.degrees(g.angles).tolist()),
+        view=index,
+    )
+
+
+def parameter(props, name, default):
+    """A property of the kind of its default: a string, a whole number or a finite number."""
+    value = props.get(name, default)
+    kind, wanted = {str: (str, 'text'), int: (int, 'a whole number'), float: ((int, float), 'a number')}[type(default)]
+    if not isinstance(value, kind) or isinstance(value, bool) or (wanted == 'a number' and not np.isfinite(value)):
+        raise InputError(f'{name} must be {wanted}, not {value!r}')
+    return value
+
+
+def _numbers(props, name, default=None):
+    value = props.get(name, default)
+    if value is None:
+        raise InputError(f'{name} is missing')
+    try:
+        return [float(x) for x in str(value).replace(',', ' ').split()]
+    except ValueError:
+        raise InputError(f'{name} = {value!r} is not a list of numbers') from None
+
+
+def _distance(props, name, default):
+    values = _numbers(props, name, default)
+    if len(values) != 1:
+        raise InputError(f'{name} must be one number, not {values}')
+    return values[0]
+
+
+def _counts(props, name):
+    values = _numbers(props, name)
+    if any(n % 1 != 0 for n in values):  # also of NaN and infinity
+        raise InputError(f'{name} must be whole numbers, not {values}')
+    return values
+
+
+def read_scanner(props):
+    """The scan's and the held-out views' geometry from a plugin's properties."""
+    mode = parameter(props, 'mode', 'cone')
+    shared = dict(
+        mode=mode,
+        nDetector=_counts(props, 'nDetector'),
+        nVoxel=_counts(props, 'nVoxel'),
+        dVoxel=_numbers(props, 'dVoxel'),
+        offOrigin=_numbers(props, 'offOrigin', 0.0),
+    )
+    if parameter(props, 'poses', ''):
+        return _read_poses(props, shared), None
+    total, start = parameter(props, 'totalAngle', 360.0), parameter(props, 'startAngle', 0.0)
+    views, held_out = parameter(props, 'views', 50), parameter(props, 'test_views', 0)
+    if held_out < 0:
+        raise InputError(f'test_views must not be negative, but is {held_out}')
+    if max(views, held_out) > MOST_VIEWS:
+        raise InputError(f'a scan has at most {MOST_VIEWS} views, not {max(views, held_out)}')
+    angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(views, total, start)
+    far = 1.0 if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
+    shared |= dict(
+        DSO=_distance(props, 'DSO', far),
+        DSD=_distance(props, 'DSD', far),
+        dDetector=_numbers(props, 'dDetector'),
+        offDetector=_numbers(props, 'offDetector', 0.0),
+    )
+    pitch, tilt, turned = (
+        parameter(props, 'pitch', 0.0),
+        parameter(props, 'tilt', 0.0),
+        _numbers(props, 'rotDetector', '0 0 0'),
+    )
+    if len(turned) != 3:
+        raise InputError(f'rotDetector must be 3 angles (roll, pitch, yaw), not {turned}')
+
+    def geometry(at):
+        circle = Geometry(angles=at, **shared)
+        if not (pitch or tilt or any(turned)):
+            return circle
+        plain = {f.name: getattr(circle, f.name) for f in fields(circle) if f.name != 'poses'}
+        return Geometry.per_view(
+            **plain, height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned)
+        )
+
+    if not held_out:
+        return geometry(angles), None
+    drawn = np.sort(total * np.random.default_rng(0).uniform(0, 1, held_out)) + start
+    return geometry(angles), geometry(np.radians(drawn))
+
+
+def _read_poses(props, shared):
+    """A scan with a pose for every view."""
+    given = [name for name in _CIRCLE if name in props]
+    if given:
+        raise InputError(f'{given[0]} and poses both say which views there are; leave one of them out')
+    known = {k: v for k, v in shared.items() if k != 'mode'}
+    known |= {'dDetector': _numbers(props, 'dDetector')} if 'dDetector' in props else {}
+
+    def frames(n_detector, step, parallel, origin):
+        poses = props['poses']
+        try:
+            numbers = [float(x) for x in poses.replace(',', ' ').split()]
+        except ValueError:
+            return read_poses(data_file(poses, 'poses'), n_detector, step, parallel, origin)
+        if len(numbers) % 12:
+            raise InputError(f'poses must be 12 numbers for every view, not {len(numbers)}')
+        return astra.from_vectors(np.reshape(numbers, (-1, 12)), n_detector, parallel)
+
+    return to_posed(known | {'mode': shared['mode']}, frames, 'poses')

@@ -1,0 +1,127 @@
+"""From a scene to a scan: every view of its objects rendered, or its measured projections, chosen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lingo_mi.effects.forward import Effects, find_effects
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import spread
+from lingo_mi.progress import Progress
+from lingo_mi.projectors import grid
+from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors.objects import GridInCube, find_objects
+from lingo_mi.projectors.sampling import grid_values
+from lingo_mi.projectors.view import View
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.checks import check_memory, warn_if_truncated
+from lingo_mi.scene.load import LoadedScene
+from lingo_mi.scene.truth import ScannedVolume, fills_grid, true_volume
+
+
+def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -> Dataset:
+    """The scan of a scene: measured projections if the scanner has them, else every view rendered, with a progress bar.
+
+    views    how many to fit, evenly spaced among the scanner's (0: all of them)
+    volume   `files.volumes.Volume` to scan instead of the scene's objects
+    seed     of the detector's noise, where the scene has one with noise
+
+    The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given
+    where it is known on the scanner's grid.
+    """
+    scanner = loaded.scanner
+    if volume is None and scanner.dataset is not None:
+        dataset = choose_views(with_effects(scanner.dataset, loaded), views)
+        warn_if_truncated(dataset.train.geometry)
+        return dataset
+    geometry, test = scanner.geometry, scanner.test_geometry
+    if views:  # before the work, not after
+        spread(len(geometry), views)
+    effects = find_effects(loaded.scene, scanner)
+    if volume is not None:
+        geometry = geometry.with_volume(volume.data.shape, volume.spacing)
+        check_memory(geometry, test)
+        test = test and test.with_volume(volume.data.shape, volume.spacing)
+        objects = [ScannedVolume(volume.data, geometry)]
+    else:
+        try:
+            objects = find_objects(loaded.scene)
+        except InputError as error:
+            raise InputError(f'{loaded.path}: {error}') from None
+    warn_if_truncated(geometry)
+    keys = np.arange(len(geometry) + (len(test) if test is not None else 0))
+    if views and test is not None:  # unused views are needed only where nothing else is held out
+        chosen = spread(len(geometry), views)
+        keys = np.concatenate([chosen, keys[len(geometry) :]])
+        geometry = geometry.subset(chosen)
+    every = geometry if test is None else geometry.joined(test)
+    if effects is None:
+        everything = Scan(every, render_objects(objects, every))
+    else:
+        try:
+            everything = Scan(every, render_with(effects, objects, every, keys, seed), effects=effects)
+        except InputError as error:
+            raise InputError(f'{loaded.path}: {error}') from None
+    train = everything.subset(slice(0, len(geometry)))
+    held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
+    return choose_views(Dataset(train, held_out, true_volume(objects, geometry)), 0 if test is not None else views)
+
+
+def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
+    """Measured projections as the tube and the detector of a scene saw them."""
+    effects = find_effects(loaded.scene, loaded.scanner)
+    return replace(
+        dataset,
+        train=replace(dataset.train, effects=effects),
+        test=dataset.test and replace(dataset.test, effects=effects),
+    )
+
+
+def choose_views(dataset: Dataset, views: int) -> Dataset:
+    """A data set with `views` evenly spaced views to fit (0: all); those left over are held out if none were before."""
+    train, test, volume = dataset.train, dataset.test, dataset.volume
+    if not views or views == len(train):
+        return dataset
+    chosen = spread(len(train), views)
+    rest = np.setdiff1d(np.arange(len(train)), chosen)
+    return Dataset(train.subset(chosen), test if test is not None else train.subset(rest), volume)
+
+
+def render_objects(objects, geometry, extent: float = 8.0) -> np.ndarray:
+    """Line integrals of all objects in all views, float32 [view, v, u]; Gaussians end at `extent` standard deviations."""
+    total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
+    with Progress('Scan', len(geometry) * len(objects)) as bar:
+        for k, thing in enumerate(objects):
+
+            def report(done, _):
+                bar.update(k * len(geometry) + done)
+
+            same_box = isinstance(thing, GridInCube) and fills_grid(thing, geometry)
+            if isinstance(thing, ScannedVolume):
+                total += thing.project(geometry, report)
+            elif same_box:  # skips empty margins, which rendering through the scene may not
+                total += grid.project(grid_values(thing), geometry, report)
+            else:
+                frames = geometry.rays()
+                for i in range(len(geometry)):
+                    view = View.of(frames, i, *geometry.nDetector)
+                    total[i] += thing.line_integrals(view, extent, True).numpy().reshape(geometry.nDetector)
+                    report(i + 1, None)
+    return total
+
+
+def render_with(effects: Effects, objects, geometry, keys, seed, extent: float = 8.0) -> np.ndarray:
+    """`render_objects` as a detector measures it; keys are those of the views' noise."""
+    objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
+    out = np.empty((len(geometry), *geometry.nDetector), np.float32)
+    frames = geometry.rays()
+    with Progress('Scan', len(geometry)) as bar:
+        for i in range(len(geometry)):
+            view = View.of(frames, i, *geometry.nDetector)
+            one = replace(effects, index=int(keys[i]))
+            expected = one.line_integrals(objects, view, Quality(extent))
+            out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])
+            bar.update(i + 1)
+    return out

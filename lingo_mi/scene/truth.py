@@ -1,0 +1,58 @@
+"""The density of objects on the voxels of a scanner's grid: the truth that volumes are compared with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors import grid
+from lingo_mi.projectors.objects import Ellipsoids, GridInCube
+from lingo_mi.projectors.sampling import on_grid
+
+
+def true_volume(objects, geometry) -> np.ndarray | None:
+    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it."""
+    total = np.zeros(geometry.nVoxel, np.float32)
+    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+    for thing in objects:
+        if isinstance(thing, ScannedVolume):
+            total += thing.data
+        elif not isinstance(thing, GridInCube) or fills_grid(thing, geometry):
+            total += on_grid(thing, corner, geometry.dVoxel, geometry.nVoxel)
+        else:
+            return None
+    return total
+
+
+def fills_grid(thing: GridInCube, geometry: Geometry) -> bool:
+    """Whether a grid is the scanner's own."""
+    centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    return (
+        tuple(thing.size) == geometry.nVoxel
+        and np.allclose(thing.low, centre - half, atol=1e-4 * half.max())
+        and np.allclose(thing.high, centre + half, atol=1e-4 * half.max())
+    )
+
+
+class ScannedVolume:
+    """A volume on the scan's own grid, to be scanned."""
+
+    def __init__(self, data, geometry):
+        self.data, self.box = data, geometry
+
+    def project(self, geometry, progress):
+        return grid.project(self.data, geometry, progress)
+
+    def in_box(self) -> GridInCube:
+        """The same as an object of a scene."""
+        centre, half = np.array(self.box.offOrigin), np.array(self.box.sVoxel) / 2
+        return GridInCube.of(self.data, centre - half, centre + half, 'volume')
+
+
+def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.ndarray:
+    """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm.
+
+    extent   cut-off in standard deviations
+    """
+    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+    return on_grid(cloud, corner, geometry.dVoxel, geometry.nVoxel, extent)

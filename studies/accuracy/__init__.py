@@ -1,0 +1,51 @@
+"""What accuracy costs: error, time and memory of every way to compute the same projections, and of fits.
+
+`measure` runs it all on fixed seeds in this process and gives plain numbers; `report` makes tables and plots of them.
+"""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.studies.accuracy import fits, images, scaling
+from lingo_mi.studies.accuracy.sizes import FULL, QUICK, Sizes
+from lingo_mi.studies.accuracy.workload import Workload
+
+__all__ = ['FULL', 'QUICK', 'Sizes', 'measure']
+
+
+def measure(sizes: Sizes, progress=None) -> dict:
+    """All measurements, as numbers and strings for JSON.
+
+    progress   called as progress(what) before each part
+    """
+    work, few = (Workload(n, sizes.pixels, sizes.box) for n in (sizes.gaussians, sizes.few))
+    parts = dict(
+        cutoff=lambda: images.cutoff(work, sizes),
+        footprint=lambda: images.footprint(work, sizes),
+        methods=lambda: images.methods(few, sizes),
+        marching=lambda: images.marching(few, sizes),
+        pixel=lambda: images.pixel(sizes),
+        teams=lambda: images.teams(work, sizes),
+        scaling=lambda: scaling.sweeps(sizes),
+        initialisations=lambda: fits.initialisations(sizes),
+        fits=lambda: fits.curves(sizes),
+    )
+    out = dict(conditions=dict(variant=mi.variant(), threads=dr.thread_count(), machine=machine(), sizes=asdict(sizes)))
+    for name, part in parts.items():
+        if progress:
+            progress(name)
+        out[name] = part()
+    return out
+
+
+def machine() -> str:
+    """The processor's name, as far as the system tells."""
+    try:
+        return next(line.split(':')[1].strip() for line in open('/proc/cpuinfo') if line.startswith('model name'))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

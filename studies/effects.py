@@ -1,0 +1,240 @@
+"""What modelling an effect is worth: scans with it, reconstructed by fits that ignore it and that model it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lingo_mi.errors import InputError
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fit.loop import run
+from lingo_mi.fit.settings import FAST
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.metrics import psnr_3d_absolute
+from lingo_mi.projectors.objects import find_objects
+from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
+from lingo_mi.scan import Scan
+from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.simulate import render_objects, take_scan
+from lingo_mi.studies.accuracy.report import insert, table
+
+SCENES = Path(__file__).resolve().parents[1] / 'scenes' / 'effects'
+# Small, so that a fit takes about a minute.
+SETTINGS = FAST.changed(iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
+FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An effect, how to simulate it and how to fit what it leaves.
+
+    title   in tables and pictures
+    model   settings of the fit that models it, besides those of the others
+    ignore  the same of the fit that ignores it
+    scene   parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have
+    turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
+                  not told
+    """
+
+    title: str
+    model: dict = field(default_factory=dict)
+    ignore: dict = field(default_factory=dict)
+    scene: dict = field(default_factory=dict)
+    turn: float = 0.0
+    shift: float = 0.0
+
+
+EXPERIMENTS = dict(
+    hardening=Experiment('beam hardening, 120 kVp, aluminium'),
+    focal_spot=Experiment('focal spot of 2 mm, magnified 6 times'),
+    psf=Experiment('point spread of 3 pixels'),
+    aperture=Experiment('whole area of pixels of 6 mm'),
+    gain=Experiment('gains that differ by 5 %', scene=dict(ignore=dict(corrected='false'))),
+    saturation=Experiment('saturation at .6 of the open beam'),
+    bits=Experiment('converter of 6 bits', dict(weights='noise')),
+    dead_pixels=Experiment('every tenth pixel dead'),
+    misalignment=Experiment(
+        'views turned by .5 degrees, shifted by 1 mm', dict(rate_pose=(2e-3, 2e-4)), turn=0.5, shift=1.0
+    ),
+    scatter=Experiment('scatter and hardening of a chest, 120 kVp'),
+    noise=Experiment('noise of 3000 photons a pixel', dict(weights='noise')),
+    truncation=Experiment(
+        'panel of half the width',
+        dict(outside='ignore'),
+        dict(outside='invalid'),
+        dict(clean=dict(across='64', columns='96'), model=dict(across='64')),
+    ),
+)
+
+
+def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: int = 0) -> dict:
+    """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
+
+    parameters   of the scene file (`<default>` names)
+
+    Returns title, the largest line integral of the clean scan, and for each of FITS: psnr_3d (the truth's maximum is full
+    scale), psnr_3d_gain (after the factor that fits the truth best, so that a wrong scale alone costs nothing),
+    ms_per_iteration (over the second half of the steps, when all is compiled), seconds (of start and steps), volume; also
+    truth [x, y, z], 1/mm, and spacing, mm. Raises InputError for an unknown name.
+    """
+    if name not in EXPERIMENTS:
+        raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
+    experiment = EXPERIMENTS[name]
+    scenes, found = {}, {}
+    for kind, changes in dict(
+        clean={}, ignore=dict(effects='ignore') | experiment.ignore, model=experiment.model
+    ).items():
+        given = (parameters or {}) | experiment.scene.get(kind, {})
+        key = tuple(sorted(given.items()))
+        if key not in scenes:
+            scenes[key] = scans(name, given, seed)
+        what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], settings.changed(**changes)
+        fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
+        found[kind] = (
+            fitted.stepper.volume(DeviceState(fitted.state)),
+            dict(ms_per_iteration=pace(fitted.history), seconds=fitted.info['seconds'] + fitted.seconds),
+        )
+    first = next(iter(scenes.values()))  # of the clean scan
+    shape = np.min([volume.shape for volume, _ in found.values()], 0)
+    truth = middle(first['truth'], shape)
+    fits = {
+        kind: quality(middle(volume, shape), truth) | times | dict(volume=middle(volume, shape))
+        for kind, (volume, times) in found.items()
+    }
+    return dict(
+        title=experiment.title,
+        largest=float(first['clean'].projections.max()),
+        truth=truth,
+        spacing=list(first['clean'].geometry.dVoxel),
+        **fits,
+    )
+
+
+def scans(name: str, parameters: dict, seed: int) -> dict:
+    """A clean scan of an experiment's scene, a scan with its effect, and the truth [x, y, z], None where the grid is not the
+    object's own."""
+    experiment, loaded = EXPERIMENTS[name], load_scene(SCENES / f'{name}.xml', parameters)
+    dataset = take_scan(loaded, seed=seed)
+    scan, objects = dataset.train, find_objects(loaded.scene)
+    clean = Scan(scan.geometry, render_objects(objects, scan.geometry))
+    if experiment.turn or experiment.shift:
+        moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
+        scan = Scan(scan.geometry, render_objects(objects, moved))
+    if scan.effects and scan.effects.scatter:  # a fit must not know the random numbers of its data, and may be quicker
+        scatter = scan.effects.scatter
+        scan = replace(
+            scan,
+            effects=replace(
+                scan.effects, scatter=replace(scatter, paths=-(-scatter.paths // 4), seed=scatter.seed + 1)
+            ),
+        )
+    return dict(clean=clean, scan=scan, truth=dataset.volume)
+
+
+def middle(volume, shape):
+    """The middle of a volume [x, y, z] of at least a shape."""
+    first = [(n - m) // 2 for n, m in zip(volume.shape, shape)]
+    return volume[tuple(slice(a, a + m) for a, m in zip(first, shape))]
+
+
+def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geometry:
+    """The geometry with every view turned about the volume's centre and shifted at random: standard deviations about and
+    along each axis, degrees and mm. The mean motion, which no projection tells from the object's, is taken off."""
+    turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
+    turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
+    frames = geometry.rays().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
+    return Geometry.posed(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+
+
+def quality(volume, truth) -> dict:
+    """PSNR in dB of a volume [x, y, z] against the truth, whose maximum is full scale: as it is, and after the factor that
+    makes the error least."""
+    gain = np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
+    return dict(psnr_3d=psnr_3d_absolute(volume, truth), psnr_3d_gain=psnr_3d_absolute(gain * volume, truth))
+
+
+def pace(history) -> float:
+    """Milliseconds a step, over about the second half of a fit's steps."""
+    last = history[-1]
+    first = next(h for h in history if 2 * h['iteration'] >= last['iteration'] or h is history[-2])
+    return 1e3 * (last['seconds'] - first['seconds']) / (last['iteration'] - first['iteration'])
+
+
+def write(found: dict, folder: Path, figures: Path, document: Path | None = None) -> dict:
+    """Write effects.json into `folder`, a picture of every experiment into `figures`, and the table into `document`.
+
+    found   what `measure` gave, by the experiments' names; effects.json keeps what it holds of others
+
+    Returns what effects.json holds.
+    """
+    for path in (folder, figures):
+        path.mkdir(parents=True, exist_ok=True)
+    for name, result in found.items():
+        draw(result, figures / f'{name}.png')
+    numbers = {
+        name: {k: v for k, v in result.items() if k not in ('truth', *FITS)}
+        | {kind: {k: v for k, v in result[kind].items() if k != 'volume'} for kind in FITS}
+        for name, result in found.items()
+    }
+    path = folder / 'effects.json'
+    known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
+    numbers = {name: known[name] for name in EXPERIMENTS if name in known}
+    path.write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
+    if document:
+        text = document.read_text(encoding='utf-8')
+        document.write_text(insert(text, dict(worth=make_table(numbers)), document), encoding='utf-8')
+    return numbers
+
+
+def make_table(numbers: dict) -> str:
+    """The Markdown table of effects.json."""
+
+    def cell(kind):
+        return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
+
+    columns = [
+        ('effect', lambda r: r['title']),
+        ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
+        *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
+        ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
+        ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
+        ('extra, s', lambda r: f'{r["model"]["seconds"] - r["ignore"]["seconds"]:+.0f}'),
+    ]
+    return table(columns, numbers.values())
+
+
+def draw(result: dict, path: Path):
+    """A picture of what `measure` gave: axial slices of the truth and of both fits on one grey scale, 1/mm, and the errors
+    of all three fits below on one scale of their own."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    truth, spacing = result['truth'], np.array(result['spacing'])
+    index, extent = richest(truth, 2), plane_extent(truth.shape, spacing, np.zeros(3), 2)
+    wanted = plane(truth, 2, index)
+    slices = {kind: plane(result[kind]['volume'], 2, index) for kind in FITS}
+    limit = max(np.percentile(np.abs(slices[kind] - wanted), 99) for kind in FITS)
+    with matplotlib.rc_context(STYLE):
+        fig = Figure(figsize=(10, 6.6), layout='constrained')
+        fig.get_layout_engine().set(**PADS)
+        fig.suptitle(f'{result["title"]}: slice at z = {(index + 0.5 - truth.shape[2] / 2) * spacing[2]:.3g} mm')
+        grid = fig.subplots(2, 3, sharex=True, sharey=True)
+        above = [('truth', wanted), *((FITS[kind], slices[kind]) for kind in ('ignore', 'model'))]
+        for ax, (title, image) in zip(grid[0], above):
+            grey = ax.imshow(image, origin='lower', extent=extent, cmap='gray', vmin=0, vmax=1.1 * wanted.max())
+            ax.set_title(title)
+        for ax, (kind, title) in zip(grid[1], FITS.items()):
+            error = ax.imshow(
+                slices[kind] - wanted, origin='lower', extent=extent, cmap='RdBu_r', vmin=-limit, vmax=limit
+            )
+            ax.set(title=f'error, {title}: {result[kind]["psnr_3d"]:.2f} dB', xlabel='x [mm]')
+        for ax in grid[:, 0]:
+            ax.set_ylabel('y [mm]')
+        fig.colorbar(grey, ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
+        fig.colorbar(error, ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
+        fig.savefig(path, dpi=90)

@@ -1,0 +1,336 @@
+"""The paper's tables as cells: fits of sparse scans and reconstructions from completed ones, each stored when it is done.
+
+A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written in one piece, below a
+folder that names its recipe and a hash of every setting: a cell that is whole is not computed again, one of other settings is
+another cell. A fit keeps its checkpoint beside it, from which it goes on after an interruption, from which the next longer fit
+of the same recipe begins, and from which the views missing to a CT volume are rendered.
+
+Every object is scanned as in X3D's scenes (`phantoms.scanning`): 50 views over half a turn, of which a fit sees a few evenly
+spaced ones, and 50 others held out. For a CT volume, the fitted views are completed to 100.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import sys
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from skimage.transform import resize_local_mean
+
+from lingo_mi import metrics, phantoms
+from lingo_mi.completion.two_stage import filled
+from lingo_mi.errors import InputError
+from lingo_mi.files.paths import replacing
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.fit import checkpoint
+from lingo_mi.fit.checkpoint import CHECKPOINT
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fit.loop import extensible, run
+from lingo_mi.fit.settings import Settings, settings_of
+from lingo_mi.interrupts import between_steps
+from lingo_mi.phantoms.x3d_scan import scan
+from lingo_mi.progress import Progress
+from lingo_mi.reconstruction.asd_pocs import asd_pocs
+from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.refined import refined
+from lingo_mi.reconstruction.sart import sart
+from lingo_mi.reconstruction.system import options_of
+from lingo_mi.results.measure import measure
+from lingo_mi.results.save import versions
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.simulate import choose_views
+
+PHANTOMS = 'foot', 'chest'
+VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
+SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
+NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # numbers of a fit's views; of a volume
+
+# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
+ALGORITHMS = {
+    'fdk': (fdk, {}),
+    'sart': (sart, dict(niter=20)),
+    'asd-pocs': (asd_pocs, dict(niter=10)),
+    'refined': (refined, {}),
+    'finer': (refined, dict(finer=2, completed_niter=0, niter=4)),
+}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large everything is.
+
+    size         voxels along an object's longest side, at most; larger volumes are averaged down
+    pixels       along a side of the panel
+    n_points     Gaussians that a fit starts with
+    iterations   of the fits, where the user names none
+    objects      where the user names none
+    finer        how many times as many voxels are scanned along each side, where the object has them: the projections then
+                 hold structure that the reconstructed voxels cannot
+    """
+
+    size: int
+    pixels: int
+    n_points: int
+    iterations: tuple[int, ...]
+    objects: tuple[str, ...]
+    finer: int = 1
+
+
+# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
+SCALES = {
+    'small': Scale(96, 192, 7000, (5000,), ('foot', 'chest', 'engine', 'aneurism')),
+    'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000), (*PHANTOMS, *VOLUMES)),
+}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A cell: a cloud fitted to some views of an object.
+
+    method       a name of METHODS, or `name:setting=value,...`
+    iterations   Adam steps; None: the recipe's own
+    """
+
+    object: str
+    views: int
+    method: str
+    iterations: int | None = None
+
+    def __str__(self):
+        return f'{self.object}, {self.views} views, {self.method}'
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
+
+    Where the fit's method is 'none', from these views alone; 'refined' and 'finer' start from the cloud's own volume.
+    """
+
+    fit: Fit
+    algorithm: str
+
+    def __str__(self):
+        return f'{self.fit}, {self.algorithm}'
+
+
+def recipe(fit: Fit, scale: Scale) -> Settings:
+    """The settings of a fit."""
+    settings = settings_of(fit.method, n_points=scale.n_points)
+    return settings if fit.iterations is None else settings.changed(iterations=fit.iterations)
+
+
+def available(names, say) -> list[str]:
+    """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
+
+    say   called with a line for each of VOLUMES that is missing
+
+    Raises InputError for a name that is neither, and where no object is left.
+    """
+    found = []
+    for name in names:
+        if name in PHANTOMS or (path := _file(name)) is not None and path.is_file():
+            found.append(name)
+        elif name in VOLUMES:
+            say(f'{name}: skipped, since there is no {name}.nii.gz in the folder that LINGO_MI_DATA names')
+        else:
+            raise InputError(
+                f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
+                'in the folder that LINGO_MI_DATA names'
+            )
+    if not found:
+        raise InputError(
+            f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}'
+        )
+    return found
+
+
+def _file(name: str) -> Path | None:
+    folder = os.environ.get('LINGO_MI_DATA')
+    return Path(folder) / f'{name}.nii.gz' if folder else None
+
+
+def load_object(name: str, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
+    if name in PHANTOMS:
+        return phantoms.make(name, size)
+    volume = read_volume(_file(name))
+    return averaged(phantoms.Phantom(volume.data, volume.spacing, name), size)
+
+
+def averaged(thing: phantoms.Phantom, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
+    shape = thing.data.shape
+    if max(shape) <= size:
+        return thing
+    smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
+    spacing = tuple(d * n / m for d, n, m in zip(thing.spacing, shape, smaller))
+    return phantoms.Phantom(resize_local_mean(thing.data, smaller).astype(np.float32), spacing, thing.name)
+
+
+class Cells:
+    """The cells of one scale and seed below a folder."""
+
+    def __init__(self, folder: Path, scale: Scale, seed: int = 0):
+        self.folder, self.scale, self.seed = Path(folder), scale, seed
+        self.dataset = functools.lru_cache(1)(self._dataset)
+        self._cloud = functools.lru_cache(1)(self._cloud)
+        self._completed = functools.lru_cache(1)(self._completed)
+
+    def path(self, cell: Fit | Volume) -> Path:
+        """Where a cell is stored."""
+        fit = cell.fit if isinstance(cell, Volume) else cell
+        of_scan = dict(
+            size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed
+        )
+        where = self.folder / fit.object / f'{fit.views}_views'
+        if isinstance(cell, Volume):
+            options = dict(algorithm=_options(cell.algorithm), completed=COMPLETED)
+            if fit.method == 'none':
+                return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
+            return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
+        settings = asdict(recipe(fit, self.scale))
+        del settings['checkpoint_seconds']
+        iterations = settings.pop('iterations')
+        return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
+
+    def get(self, cell: Fit | Volume) -> dict | None:
+        """The numbers of a cell, or None where it has not been computed, or its file is damaged or lacks a number."""
+        try:
+            found = json.loads(self.path(cell).read_text(encoding='utf-8'))
+        except (FileNotFoundError, ValueError):
+            return None
+        needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
+        return found if isinstance(found, dict) and found.keys() >= set(needed) else None
+
+    def compute(self, cell: Fit | Volume, label: str) -> dict:
+        """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
+
+        Raises InputError where it cannot be computed, and KeyboardInterrupt, after which a fit goes on where it was.
+        """
+        path = self.path(cell)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        found = (self._fit if isinstance(cell, Fit) else self._volume)(cell, path, label)
+        fit = cell if isinstance(cell, Fit) else cell.fit
+        found |= dict(
+            object=fit.object,
+            views=fit.views,
+            seed=self.seed,
+            scale=asdict(self.scale),
+            variant=mi.variant(),
+            versions=versions(),
+        )
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
+        return found
+
+    def _dataset(self, name: str) -> Dataset:
+        scanned = load_object(name, self.scale.size * self.scale.finer)
+        with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
+            found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
+        truth = averaged(scanned, self.scale.size)
+        views = (
+            replace(s, geometry=replace(s.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
+            for s in (found.train, found.test)
+        )
+        return Dataset(*views, truth.data)
+
+    def _measured(self, fit: Fit) -> Dataset:
+        return choose_views(self.dataset(fit.object), fit.views)
+
+    def _fit(self, cell: Fit, path: Path, label: str) -> dict:
+        dataset, settings, saved = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
+        if (path.exists() or saved.exists()) and _iterations(saved) is None:
+            print(f'{saved}: is missing or damaged, so {cell} is fitted again', file=sys.stderr)
+        self._begin(settings, saved)
+        cloud = initial_cloud(dataset.train, settings, self.seed) if _iterations(saved) is None else None
+        with Progress(label, settings.iterations) as bar, between_steps() as check:
+
+            def progress(iteration, **fields):
+                bar.update(iteration, **fields)
+                check()
+
+            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved, cloud is None)
+        state = DeviceState(fitted.state)
+        rendered = fitted.stepper.render(state, dataset.test.geometry)
+        found = measure(fitted, dataset, fitted.stepper.volume(state), rendered)
+        return found | dict(method=cell.method, settings=asdict(settings), initial=fitted.info)
+
+    def _begin(self, settings, saved: Path):
+        """Without a whole checkpoint, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
+        if not extensible(settings) or _iterations(saved) is not None:
+            return
+        done = sorted(int(path.parent.name) for path in saved.parents[1].glob('*/fit.json'))
+        shorter = [saved.parents[1] / str(n) / CHECKPOINT for n in done if n < settings.iterations]
+        whole = next((path for path in reversed(shorter) if _iterations(path) is not None), None)
+        if whole is not None:
+            with replacing(saved) as temporary:
+                temporary.write_bytes(whole.read_bytes())
+
+    def _cloud(self, fit: Fit):
+        """A stored fit's stepper, and its state on the device; without its whole checkpoint, it is fitted again."""
+        settings, saved = recipe(fit, self.scale), self.path(fit).with_name(CHECKPOINT)
+        if _iterations(saved) != settings.iterations:  # fewer where fitting it again was interrupted
+            self.compute(fit, f'{fit}, again')
+        fitted = run(self._measured(fit).train, settings, None, self.seed, path=saved, resume=True)
+        return fitted.stepper, DeviceState(fitted.state)
+
+    def _completed(self, fit: Fit) -> Scan:
+        """The fitted views, completed from the cloud."""
+        stepper, state = self._cloud(fit)
+        return filled(self._measured(fit).train, COMPLETED, lambda geometry: stepper.render(state, geometry))
+
+    def _volume(self, cell: Volume, path: Path, label: str) -> dict:
+        function, options = ALGORITHMS[cell.algorithm]
+        if cell.fit.method != 'none' and self.get(cell.fit) is None:
+            raise InputError('there is no fit to complete the views from')
+        dataset = self._measured(cell.fit)
+        views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
+        total = sum(n for name, n in _options(cell.algorithm).items() if name.endswith('niter')) or len(views)
+        if function is refined:
+            stepper, state = self._cloud(cell.fit)
+            options = options | dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
+            views = dataset.train
+        with Progress(label, total) as bar:
+
+            def progress(done, _, residual=None):
+                bar.update(done, residual=residual)
+
+            begun = time.perf_counter()
+            result = function(views, **options, progress=progress)
+        seconds = time.perf_counter() - begun
+        volume = result if isinstance(result, np.ndarray) else result.volume
+        return dict(
+            algorithm=cell.algorithm,
+            options=_options(cell.algorithm),
+            method=cell.fit.method,
+            seconds=seconds,
+            psnr_3d=metrics.psnr_3d(volume, dataset.volume),
+            ssim_3d=metrics.ssim_3d(volume, dataset.volume),
+        )
+
+
+def _iterations(path: Path) -> int | None:
+    """How far the fit of a checkpoint has come, or None where the file is missing or damaged."""
+    try:
+        return checkpoint.load(path)[1].get('iteration')
+    except InputError:
+        return None
+
+
+def _options(algorithm: str) -> dict:
+    """All parameters of an algorithm that have a value, those left at their defaults too."""
+    function, options = ALGORITHMS[algorithm]
+    return options_of(function) | options
+
+
+def _hash(values: dict) -> str:
+    return hashlib.sha1(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]

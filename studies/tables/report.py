@@ -1,0 +1,311 @@
+"""Which cells the paper's tables are made of, and the tables as Markdown and JSON, with the paper's numbers beside ours.
+
+The paper's numbers are means over the 15 scenes of X3D, of which the objects here are a part at most: they are to be compared
+with the means, and rather in their order than in their size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lingo_mi.files.paths import replacing
+from lingo_mi.fit.settings import settings_of
+from lingo_mi.studies.tables.cells import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume
+
+TITLES = dict(
+    views='New views (Table 1 of the paper)',
+    ct='CT reconstruction in two stages (Table 2 of the paper)',
+    ablation='Parts of LINGO (Table 3 of the paper)',
+)
+LABELS = dict(
+    psnr_2d_r2=('PSNR', '{:.2f}'),
+    ssim_2d=('SSIM', '{:.4f}'),
+    ipsd=('IPSD', '{:.4f}'),
+    psnr_3d=('PSNR', '{:.2f}'),
+    ssim_3d=('SSIM', '{:.4f}'),
+    seconds_init=('start, s', '{:.2f}'),
+)
+_PAPER_IS = "The rows `paper` hold the paper's means over the 15 scenes of X3D."
+NOTES = dict(
+    views=f'PSNR in dB and SSIM of the 50 views held out, each view divided by its own maximum; IPSD with the longest side as '
+    f'2. A recipe whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
+    ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
+    f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts there, with a pass over all views '
+    f'and then passes over the measured ones (`finer`: the latter alone, on voxels of half the size, whose means it gives); all '
+    f'need densities, which `3dgs` and `xgaussian` do not have. {_PAPER_IS}',
+    ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
+    f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}',
+)
+SECOND = dict(views='iterations', ct='algorithm', ablation='scale, start, voxels')
+
+# Gradient scaling, latent initialisation and voxel scaling, each with (+) or without (-).
+ABLATION = {
+    '- - -': 'r2',
+    '+ - -': 'r2:loss_scale=dynamic',
+    '- + -': 'lingo:loss_scale=none,V_S=1',
+    '+ + -': 'lingo:V_S=1',
+    '- + +': 'lingo:loss_scale=none',
+    '+ + +': 'lingo',
+}
+
+# PSNR, SSIM, IPSD by views, iterations and method.
+_PAPER_VIEWS = {
+    (5, 5000): {
+        '3dgs': (28.74, 0.8871, 0.1241),
+        'xgaussian': (28.88, 0.8899, 0.1236),
+        'r2': (32.90, 0.9449, 0.1228),
+        'lingo': (33.33, 0.9506, 0.0282),
+    },
+    (5, 15_000): {
+        '3dgs': (28.55, 0.8887, 0.1202),
+        'xgaussian': (29.05, 0.8933, 0.1192),
+        'r2': (33.23, 0.9466, 0.1184),
+        'lingo': (33.60, 0.9520, 0.0264),
+    },
+    (5, 30_000): {
+        '3dgs': (28.24, 0.8820, 0.1199),
+        'xgaussian': (28.73, 0.8877, 0.1190),
+        'r2': (33.41, 0.9466, 0.1182),
+        'lingo': (33.67, 0.9524, 0.0264),
+    },
+    (10, 5000): {
+        '3dgs': (33.64, 0.9387, 0.1251),
+        'xgaussian': (33.64, 0.9391, 0.1244),
+        'r2': (37.87, 0.9699, 0.1182),
+        'lingo': (38.85, 0.9747, 0.0275),
+    },
+    (10, 15_000): {
+        '3dgs': (34.12, 0.9425, 0.1211),
+        'xgaussian': (34.17, 0.9431, 0.1187),
+        'r2': (38.40, 0.9710, 0.1190),
+        'lingo': (39.37, 0.9755, 0.0259),
+    },
+    (10, 30_000): {
+        '3dgs': (34.28, 0.9418, 0.1208),
+        'xgaussian': (34.35, 0.9422, 0.1184),
+        'r2': (38.61, 0.9710, 0.1188),
+        'lingo': (39.55, 0.9756, 0.0258),
+    },
+    (25, 5000): {
+        '3dgs': (37.35, 0.9740, 0.1273),
+        'xgaussian': (39.38, 0.9740, 0.1303),
+        'r2': (43.82, 0.9883, 0.1152),
+        'lingo': (44.55, 0.9895, 0.0242),
+    },
+    (25, 15_000): {
+        '3dgs': (40.95, 0.9781, 0.1205),
+        'xgaussian': (40.99, 0.9781, 0.1246),
+        'r2': (45.49, 0.9897, 0.1130),
+        'lingo': (46.25, 0.9909, 0.0233),
+    },
+    (25, 30_000): {
+        '3dgs': (41.36, 0.9777, 0.1203),
+        'xgaussian': (41.26, 0.9777, 0.1242),
+        'r2': (46.09, 0.9899, 0.1129),
+        'lingo': (47.04, 0.9911, 0.0233),
+    },
+}
+
+# PSNR, SSIM by views, algorithm and what completed the views.
+_ORDER = 'none', '3dgs', 'xgaussian', 'r2', 'lingo'
+_PAPER_CT = {
+    key: dict(zip(_ORDER, values))
+    for key, values in {
+        (5, 'fdk'): ((12.63, 0.1183), (20.05, 0.2600), (20.11, 0.2621), (22.98, 0.3986), (23.29, 0.4139)),
+        (5, 'sart'): ((23.89, 0.6614), (21.38, 0.5602), (21.35, 0.5633), (24.61, 0.7025), (24.94, 0.7202)),
+        (5, 'asd-pocs'): ((23.38, 0.6486), (22.05, 0.6113), (22.18, 0.6194), (25.46, 0.7488), (25.78, 0.7643)),
+        (10, 'fdk'): ((16.13, 0.1745), (21.94, 0.3075), (21.98, 0.3101), (24.12, 0.4153), (24.37, 0.4246)),
+        (10, 'sart'): ((26.22, 0.7163), (24.53, 0.6480), (24.55, 0.6536), (27.28, 0.7614), (27.76, 0.7798)),
+        (10, 'asd-pocs'): ((25.64, 0.7215), (25.98, 0.7189), (26.04, 0.7214), (28.45, 0.8066), (28.90, 0.8252)),
+        (25, 'fdk'): ((20.81, 0.2973), (23.92, 0.3828), (23.91, 0.3825), (25.18, 0.4489), (25.21, 0.4503)),
+        (25, 'sart'): ((30.22, 0.8015), (28.90, 0.7717), (28.91, 0.7715), (31.45, 0.8467), (31.75, 0.8526)),
+        (25, 'asd-pocs'): ((29.43, 0.8233), (30.98, 0.8425), (31.00, 0.8422), (32.61, 0.8864), (32.91, 0.8924)),
+    }.items()
+}
+
+# Seconds to start, PSNR, SSIM, IPSD of new views; PSNR, SSIM of ASD-POCS; 25 views, 30 000 iterations.
+_PAPER_ABLATION = {
+    '- - -': ((1.42, 46.09, 0.9899, 0.1129), (32.61, 0.8864)),
+    '+ - -': ((1.42, 46.77, 0.9907, 0.0906), (32.78, 0.8883)),
+    '- + -': ((5.76, 46.28, 0.9899, 0.0526), (32.81, 0.8911)),
+    '+ + -': ((5.76, 46.74, 0.9907, 0.0321), (32.75, 0.8905)),
+    '- + +': ((0.47, 46.49, 0.9902, 0.0472), (32.67, 0.8894)),
+    '+ + +': ((0.47, 47.04, 0.9911, 0.0289), (32.91, 0.8924)),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a group of rows shows of one cell an object."""
+
+    title: str
+    cell: Callable[[str], Fit | Volume | None]
+    fields: tuple[str, ...]
+    paper: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """The rows, one an object, of a number of views and of what `SECOND` names."""
+
+    views: int
+    second: object
+    columns: tuple[Column, ...]
+
+
+def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'voxelize')) -> list[Group]:
+    """The groups of a table, by rows.
+
+    iterations   of the fits; the last one counts for `ct` and `ablation`
+    methods      columns of `views` and `ct`
+    algorithms   rows of `ct`
+    """
+    last = iterations[-1]
+    if table == 'views':
+        return [
+            Group(
+                n, i, tuple(Column(m, _fit(n, m, i), NEW_VIEWS, _PAPER_VIEWS.get((n, i), {}).get(m)) for m in methods)
+            )
+            for n in views
+            for i in iterations
+        ]
+    if table == 'ct':
+        return [
+            Group(
+                n,
+                a,
+                tuple(
+                    Column(m, _volume(n, m, last, a), CT, _PAPER_CT.get((n, a), {}).get(m)) for m in ('none', *methods)
+                ),
+            )
+            for n in views
+            for a in algorithms
+        ]
+    out = []
+    for n in views:
+        for parts, method in ABLATION.items():
+            paper = _PAPER_ABLATION[parts] if (n, last) == (25, 30_000) else (None, None)
+            out.append(
+                Group(
+                    n,
+                    parts,
+                    (
+                        Column('fit', _fit(n, method, last), ('seconds_init', *NEW_VIEWS), paper[0]),
+                        Column('asd-pocs', _volume(n, method, last, 'asd-pocs'), CT, paper[1]),
+                    ),
+                )
+            )
+    return out
+
+
+def _fit(views, method, iterations):
+    """The cell of an object; a recipe whose rates fall over the run keeps its own iterations."""
+    if settings_of(method).decay_steps == 0:
+        iterations = None
+    return lambda name: Fit(name, views, method, iterations)
+
+
+def _volume(views, method, iterations, algorithm):
+    """The cell of an object; of the volume that a fit samples itself, the fit."""
+    if algorithm in ('voxelize', 'refined', 'finer') and (method == 'none' or settings_of(method).render == 'alpha'):
+        return lambda name: None  # neither measured views nor opacities are a volume to begin with
+    if method == 'none':
+        return lambda name: Volume(Fit(name, views, 'none'), algorithm)
+    fit = _fit(views, method, iterations)
+    return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
+
+
+def plan(table_groups: list[Group], objects) -> list[Fit | Volume]:
+    """All cells of a table in the order to compute them: object by object, fits before what is made of them."""
+    cells = {}
+    for name in objects:
+        found = [cell for group in table_groups for column in group.columns if (cell := column.cell(name)) is not None]
+        fits = [cell.fit if isinstance(cell, Volume) else cell for cell in found]
+        # Shorter fits first, since longer ones go on from them; then one fit's volumes together, since they share its views.
+        order = sorted(dict.fromkeys(fits), key=lambda fit: (fit.views, fit.method, fit.iterations or 0))
+        for fit in order:
+            own = dict.fromkeys(cell for cell in found if isinstance(cell, Volume) and cell.fit == fit)
+            cells |= dict.fromkeys([*([] if fit.method == 'none' else [fit]), *own])
+    return list(cells)
+
+
+def results(table_groups: list[Group], objects, cells: Cells) -> list[dict]:
+    """One dictionary a row: views, second, object and, by column, the numbers or None.
+
+    Below the objects of a group stand 'mean', over those that have all of the group's cells (None where there are none), and
+    'paper' where the paper has such a row.
+    """
+    rows = []
+    for group in table_groups:
+
+        def row(name, values, group=group):
+            rows.append(dict(views=group.views, second=group.second, object=name, columns=values))
+
+        complete = []
+        for name in objects:
+            values = {}
+            for column in group.columns:
+                found = (cell := column.cell(name)) and cells.get(cell)
+                values[column.title] = found and {field: found[field] for field in column.fields}
+            row(name, values)
+            planned = [c.title for c in group.columns if c.cell(name) is not None]
+            if planned and all(values[title] for title in planned):
+                complete.append(values)
+        if complete:
+            row(
+                f'mean of {len(complete)}',
+                {
+                    c.title: complete[0][c.title]
+                    and {field: _mean(values[c.title][field] for values in complete) for field in c.fields}
+                    for c in group.columns
+                },
+            )
+        if any(c.paper for c in group.columns):
+            row('paper', {c.title: c.paper and dict(zip(c.fields, c.paper)) for c in group.columns})
+    return rows
+
+
+def _mean(values):
+    values = list(values)
+    return None if None in values else float(np.mean(values))
+
+
+def markdown(table: str, table_groups: list[Group], rows: list[dict]) -> str:
+    """The rows as a Markdown table."""
+    columns = table_groups[0].columns
+    titles = [f'{c.title} {LABELS[field][0]}' for c in columns for field in c.fields]
+    lines = [
+        '| ' + ' | '.join(['views', SECOND[table], 'object', *titles]) + ' |',
+        '|---:|---|---|' + '---:|' * len(titles),
+    ]
+    for row in rows:
+        numbers = [(field, (row['columns'][c.title] or {}).get(field)) for c in columns for field in c.fields]
+        shown = ['–' if x is None else LABELS[field][1].format(x) for field, x in numbers]
+        lines.append('| ' + ' | '.join([str(row['views']), str(row['second']), row['object'], *shown]) + ' |')
+    return '\n'.join(lines)
+
+
+def write(table: str, table_groups: list[Group], objects, cells: Cells, name: str) -> str:
+    """Write TABLE.json and TABLE.md, of the cells that there are, into their folder; returns the Markdown.
+
+    name   of the scale
+    """
+    rows = results(table_groups, objects, cells)
+    planned = plan(table_groups, objects)
+    done = sum(cells.get(cell) is not None for cell in planned)
+    scale = cells.scale
+    finer = f' (scanned on {scale.finer} times as many)' if scale.finer > 1 else ''
+    text = (
+        f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side{finer}, '
+        f'{scale.pixels} x {scale.pixels} pixels, {scale.n_points:,} Gaussians to start with; seed {cells.seed}; {done} of '
+        f'{len(planned)} cells.\n\n{markdown(table, table_groups, rows)}\n'
+    )
+    cells.folder.mkdir(parents=True, exist_ok=True)
+    for kind, content in (('json', json.dumps(rows, indent=1) + '\n'), ('md', text)):
+        with replacing(cells.folder / f'{table}.{kind}') as temporary:
+            temporary.write_text(content, encoding='utf-8')
+    return text

@@ -1,0 +1,280 @@
+"""The command line from end to end, on a scene that fits in a second."""
+
+import json
+import runpy
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import nibabel
+import numpy as np
+import pytest
+
+from helpers.script import FIT, fit, fit_process
+from lingo_mi.files.images import read_exr
+from lingo_mi.files.ply import read_ply
+from lingo_mi.files.scans import write_scan
+from lingo_mi.files.volumes import write_volume
+from lingo_mi.geometry.base import spread
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.projectors import grid
+from lingo_mi.scene.load import defaults, load_scene
+from lingo_mi.scene.simulate import take_scan
+
+SCENES = Path(__file__).parents[2] / 'scenes'
+SMALL = '-D', 'n_points=300', '-D', 'densify_from=10', '-D', 'densify_every=10', '-D', 'densify_threshold=1e-4'
+QUICK = '--iterations', '2', '-D', 'n_points=100'
+KEYS = (
+    'psnr_2d_r2 psnr_2d ssim_2d psnr_3d ssim_3d psnr_3d_absolute ssim_3d_absolute ipsd ipsd_targets gaussians '
+    'iterations seconds_init seconds_fit '
+    'ms_per_iteration variant method seed views versions history'
+).split()
+
+
+@pytest.fixture(scope='module')
+def result(scene):
+    """The folder, the metrics and the printed text of a fit of 60 iterations."""
+    folder = scene.parent / 'made' / 'result'
+    code, out, err = fit(scene, '--iterations', '60', '--out', folder, *SMALL, report=True)
+    assert code == 0, err
+    return folder, json.loads((folder / 'metrics.json').read_text()), out
+
+
+@pytest.fixture(scope='module')
+def dataset(scene):
+    """The scan of the scene."""
+    return take_scan(load_scene(scene))
+
+
+def metrics_of(folder):
+    return json.loads((folder / 'metrics.json').read_text())
+
+
+def test_everything_is_written(result):
+    folder, _, out = result
+    assert sorted(p.name for p in folder.iterdir()) == [
+        'checkpoint.npz',
+        'gaussians.ply',
+        'metrics.json',
+        'report.html',
+        'report.png',
+        'result.xml',
+        'views',
+        'volume.nii.gz',
+    ]
+    assert sorted(p.name for p in (folder / 'views').iterdir()) == ['0000.exr', '0001.exr', '0002.exr']
+    assert (folder / 'report.png').read_bytes().startswith(b'\x89PNG')
+    assert '<html' in (folder / 'report.html').read_text()
+    assert 'PSNR' in out and str(folder) in out
+
+
+def test_metrics(result):
+    _, metrics, _ = result
+    assert set(KEYS) <= metrics.keys()
+    assert metrics['iterations'] == 60 and metrics['views'] == 8
+    assert metrics['method'] == 'fast' and metrics['seed'] == 0
+    assert metrics['psnr_2d'] > 32 and metrics['psnr_3d'] > 26  # far beyond the initial cloud's 25 and 22 dB
+    assert metrics['ipsd_targets'] > 0 and metrics['ipsd'] > 0
+    assert metrics['history'][-1]['iteration'] == 60
+    assert np.all(np.diff([h['seconds'] for h in metrics['history']]) > 0)
+    assert metrics['variant'] == mi.variant() and metrics['versions']['mitsuba'].startswith('3.')
+
+
+def test_volume_has_units_and_place(result, dataset):
+    folder, metrics, _ = result
+    image = nibabel.load(folder / 'volume.nii.gz')
+    assert image.shape == (24, 24, 24) and image.header.get_xyzt_units()[0] == 'mm'
+    assert np.allclose(image.affine, [[1, 0, 0, -11.5], [0, 1, 0, -11.5], [0, 0, 1, -11.5], [0, 0, 0, 1]])
+    assert abs(psnr_3d(image.get_fdata(dtype=np.float32), dataset.volume) - metrics['psnr_3d']) < 1e-4
+
+
+def test_cloud_loads_in_mitsuba(result):
+    folder, metrics, _ = result
+    centres, scales, _, density = read_ply(folder / 'gaussians.ply')
+    assert len(density) == metrics['gaussians'] and np.abs(centres).max() <= 12 and scales.max() < 12
+    params = mi.traverse(mi.load_dict(dict(type='ellipsoids', filename=str(folder / 'gaussians.ply'))))
+    assert np.allclose(np.array(params['data']).reshape(-1, 10)[:, :3], centres, atol=1e-6)
+    assert np.allclose(np.array(params['density']).ravel(), density)
+
+
+def test_result_scene_renders_the_views(result):
+    folder, metrics, _ = result
+    program = textwrap.dedent(f"""
+        from dataclasses import replace
+        import mitsuba as mi
+        import numpy as np
+        import lingo_mi
+        mi.set_variant({mi.variant()!r})
+        scene = mi.load_file({str(folder / 'result.xml')!r})
+        scanner = scene.sensors()[0]
+        test = replace(scanner.geometry, angles=np.radians({metrics['test_angles']!r}))
+        np.save({str(folder.parent / 'again.npy')!r},
+                [mi.render(scene, sensor=scanner.view(i, test)).numpy()[..., 0] for i in range(len(test))])
+    """)
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    again = np.load(folder.parent / 'again.npy')
+    views = np.stack([read_exr(folder / 'views' / f'{i:04d}.exr') for i in range(3)])
+    assert np.abs(again - views).max() < 1e-4 * views.max()
+
+
+def test_refuses_to_overwrite(result, scene):
+    folder, _, _ = result
+    before = {p: p.stat().st_mtime_ns for p in folder.iterdir()}
+    code, _, err = fit(scene, *QUICK, '--out', folder)
+    assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and '--force' in err
+    assert before == {p: p.stat().st_mtime_ns for p in folder.iterdir()}
+
+
+def test_options(scene, tmp_path):
+    out = tmp_path / 'a'
+    out.mkdir()
+    (out / 'old').touch()
+    code, _, err = fit(
+        scene,
+        *QUICK,
+        '--out',
+        out,
+        '--force',
+        '--views',
+        '3',
+        '--seed',
+        '5',
+        '--method',
+        'lingo',
+        '--init',
+        'r2',
+        '-D',
+        'views=6',
+        '-D',
+        'rate_scale=0.1,0.2',
+        '-D',
+        'normalise=true',
+    )
+    assert code == 0, err
+    metrics = metrics_of(out)
+    assert metrics['views'] == 3 and metrics['seed'] == 5 and metrics['method'] == 'lingo'
+    assert np.allclose(metrics['angles'], [0, 120, 240])
+    settings = metrics['settings']
+    assert settings['rate_scale'] == [0.1, 0.2] and settings['normalise'] is True and settings['init'] == 'r2'
+
+
+def test_scans_a_volume(scene, dataset, tmp_path):
+    write_volume(tmp_path / 'ct.nii.gz', dataset.volume[:, 2:20, 4:], (0.75, 1, 1))
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--volume', tmp_path / 'ct.nii.gz')
+    assert code == 0, err
+    image = nibabel.load(tmp_path / 'a' / 'volume.nii.gz')
+    assert image.shape == (24, 18, 20) and np.allclose(image.header.get_zooms(), (0.75, 1, 1))
+    assert metrics_of(tmp_path / 'a')['psnr_3d'] is not None
+
+
+@pytest.mark.parametrize('kind, name, held_out', [('naf', 'scan.pickle', 3), ('r2', 'scan', 3), ('npy', 'scan.npy', 0)])
+def test_measured_projections(scene, dataset, tmp_path, kind, name, held_out):
+    given = dataset if held_out else replace(dataset, test=None, volume=None)
+    write_scan(tmp_path / name, given, kind)
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--projections', tmp_path / name)
+    assert code == 0, err
+    metrics = metrics_of(tmp_path / 'a')
+    assert metrics['views'] == 8 and np.allclose(metrics['angles'], np.arange(8) * 45)
+    assert len(metrics['test_angles']) == held_out
+    assert (metrics['psnr_2d'] is None) == (metrics['psnr_3d'] is None) == (not held_out)
+    assert len(list((tmp_path / 'a').glob('views/*'))) == held_out
+
+
+def test_unused_views_are_held_out(scene, dataset, tmp_path):
+    write_scan(tmp_path / 'scan.npy', dataset.train, 'npy')
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--projections', tmp_path / 'scan.npy', '--views', '5')
+    assert code == 0, err
+    metrics = metrics_of(tmp_path / 'a')
+    chosen = spread(8, 5)
+    assert np.allclose(metrics['angles'], chosen * 45)
+    assert np.allclose(metrics['test_angles'], np.setdiff1d(np.arange(8), chosen) * 45)
+
+
+# ---- interruptions ---------------------------------------------------------------------------------------------------
+
+
+def wait_for(process, condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_resume_after_kill(result, scene, tmp_path):
+    """`kill -9` in the middle, then --resume: the same numbers as without the interruption."""
+    _, whole, _ = result
+    out = tmp_path / 'a'
+    arguments = scene, '--iterations', '60', '--out', out, *SMALL
+    process = fit_process(*arguments, '-D', 'checkpoint_seconds=0')
+    wait_for(process, (out / 'checkpoint.npz').exists)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL and not (out / 'metrics.json').exists()
+    with np.load(out / 'checkpoint.npz') as file:
+        assert 0 < json.loads(str(file['extra']))['iteration'] < 60
+    code, _, err = fit(*arguments, '--resume')
+    assert code == 0, err
+    resumed = metrics_of(out)
+    for key in 'psnr_2d_r2', 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians', 'ipsd_targets':
+        assert whole[key] is not None and resumed[key] == pytest.approx(whole[key], rel=1e-4), key
+    assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in whole['history']]
+
+
+def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
+    out = tmp_path / 'a'
+    # Long enough never to end by itself; no checkpoint but the one that Ctrl-C leaves.
+    process = fit_process(scene, '--iterations', '1000000', '--out', out, *SMALL, '-D', 'checkpoint_seconds=1e9')
+    line = ''
+    while not line.startswith('Fit: '):
+        line = process.stderr.readline()
+        assert line or process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and '--resume' in err and 'Traceback' not in err
+    assert [p.name for p in out.iterdir()] == ['checkpoint.npz']
+
+
+# ---- the scenes that come with the project ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('path', sorted(SCENES.glob('*.xml')), ids=lambda path: path.stem)
+def test_scene_loads(path, request):
+    if {'volume', 'projections'} & defaults(path) and path.stem != 'x3d_foot':
+        request.getfixturevalue('data')
+    loaded = load_scene(path, {'size': '16'} if 'size' in defaults(path) else {})
+    assert len(loaded.scanner.geometry) > 1
+    text = path.read_text()
+    assert text.startswith('<!-- ') and f'python scripts/fit.py scenes/{path.name}' in text
+
+
+@pytest.mark.parametrize(
+    'name, files', [('gaussians', ['gaussians.ply']), ('mesh', ['flange.ply', 'flange_bolts.ply'])]
+)
+def test_scene_files_are_the_phantoms(monkeypatch, tmp_path, name, files):
+    """`phantom.py` writes again what the scenes read, and does not overwrite it unasked."""
+    monkeypatch.setattr(sys, 'argv', ['phantom.py', name, '--size', '8', '--out', str(tmp_path / files[0])])
+    for code in 0, 2:
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(FIT.with_name('phantom.py')), run_name='__main__')
+        assert stop.value.code == code
+    for file in files:
+        assert (tmp_path / file).read_bytes() == (SCENES / 'meshes' / file).read_bytes()
+
+
+def test_metal_part_has_a_truth():
+    """The voxels of a mesh scene are its metal: their exact projections match those of the meshes."""
+    loaded = load_scene(SCENES / 'metal_part.xml')
+    scanner = loaded.scanner
+    scanner.geometry = replace(scanner.geometry, nDetector=(48, 48), dDetector=(10, 10), angles=np.array([0.3]))
+    scanner.test_geometry = None
+    scan = take_scan(loaded)
+    again = grid.project(scan.volume, scan.train.geometry)
+    assert again.sum() == pytest.approx(scan.train.projections.sum(), rel=2e-3)
+    assert np.abs(again - scan.train.projections).mean() < 0.04 * scan.train.projections.mean()  # blurred edges

@@ -1,0 +1,456 @@
+"""CT volumes: every format with asymmetric data, the rules from values to density, and bad input."""
+
+import ast
+import builtins
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.files import paths, volumes
+from lingo_mi.files.volumes import centred_affine, first_voxel, git_blob_sha1, read_volume, write_volume
+from lingo_mi.geometry.base import Geometry
+
+SHAPE, SPACING = (4, 5, 6), (0.5, 1.0, 2.5)
+COUNTS = np.arange(120, dtype=np.uint8).reshape(SHAPE)
+HU = COUNTS.astype(np.int16) * 25 - 1000
+
+
+def refused(path, match, **options):
+    with pytest.raises(InputError, match=match) as caught:
+        read_volume(path, **options)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+def needs(module):
+    return pytest.importorskip(module, reason=f'{module} (the `formats` extra) is not installed')
+
+
+# ---- values ------------------------------------------------------------------------------------------------
+
+
+def read_array(tmp_path, array, **options):
+    np.save(tmp_path / 'v.npy', array)
+    return read_volume(tmp_path / 'v.npy', **options)
+
+
+def test_counts_are_divided_by_their_maximum(tmp_path):
+    v = read_array(tmp_path, COUNTS)
+    assert v.data.dtype == np.float32 and v.unit == 'normalised'
+    np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
+
+
+def test_hounsfield_units_by_the_clip_rule(tmp_path):
+    hu = HU.copy()
+    hu[0, 0, :4] = -3000, 0, 500, 3071
+    v = read_array(tmp_path, hu)
+    np.testing.assert_allclose(v.data[0, 0, :4], [0, 1 / 3, 0.5, 1], rtol=1e-6)
+    assert v.unit == 'normalised' and v.data.min() == 0 and v.data.max() == 1
+
+
+def test_hounsfield_units_with_mu_water(tmp_path):
+    hu = HU.copy()
+    hu[0, 0, :4] = -3000, -1000, 0, 1000
+    v = read_array(tmp_path, hu, mu_water=0.02)
+    np.testing.assert_allclose(v.data[0, 0, :4], [0, 0, 0.02, 0.04], rtol=1e-6)
+    assert v.unit == '1/mm'
+
+
+def test_density_within_0_and_1_is_kept(tmp_path):
+    density = (COUNTS / 300).astype(np.float64)
+    np.testing.assert_array_equal(read_array(tmp_path, density).data, density.astype(np.float32))
+
+
+def test_noise_below_zero_becomes_zero_and_large_floats_are_scaled(tmp_path):
+    density = COUNTS / 60 - 0.05
+    v = read_array(tmp_path, density)
+    assert v.data.min() == 0 and v.data.max() == 1
+    assert v.data[2, 3, 4] == pytest.approx(density[2, 3, 4] / density.max())
+
+
+def test_ambiguous_negative_values_ask_for_hu(tmp_path):
+    for crop in (COUNTS.astype(int) - 20, COUNTS - 20.0, COUNTS / 60 - 0.5):
+        np.save(tmp_path / 'v.npy', crop)
+        refused(tmp_path / 'v.npy', 'give --mu-water .*hu=True.*hu=False')
+    np.save(tmp_path / 'v.npy', COUNTS.astype(int) - 20)
+    np.testing.assert_allclose(read_volume(tmp_path / 'v.npy', hu=True).data, (COUNTS - 20.0 + 1000) / 3000, rtol=1e-6)
+    assert read_volume(tmp_path / 'v.npy', hu=False).data.min() == 0
+    # As --mu-water says.
+    np.testing.assert_allclose(
+        read_volume(tmp_path / 'v.npy', mu_water=0.02).data, 0.02 * (COUNTS - 20.0 + 1000) / 1000, rtol=1e-6
+    )
+    np.save(tmp_path / 'v.npy', HU)
+    np.testing.assert_allclose(read_volume(tmp_path / 'v.npy', hu=False).data, np.maximum(HU, 0) / HU.max(), rtol=1e-6)
+
+
+def test_bad_values(tmp_path):
+    for array, match, options in (
+        (COUNTS * 0, 'empty', {}),
+        (COUNTS[0], '3 dimensions', {}),
+        (COUNTS[:0], 'filled', {}),
+        (np.full(SHAPE, np.nan), 'NaN', {}),
+        (np.full(SHAPE, 1j), 'real numbers', {}),
+        (COUNTS, 'do not look like Hounsfield', {'mu_water': 0.02}),
+        (HU, 'mu_water must be', {'mu_water': -1}),
+        (COUNTS, 'spacing must be', {'spacing': (1, 2)}),
+        (COUNTS, 'spacing must be', {'spacing': 0}),
+    ):
+        np.save(tmp_path / 'v.npy', array)
+        refused(tmp_path / 'v.npy', match, **options)
+
+
+# ---- NIfTI -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('suffix', ['.nii', '.nii.gz'])
+@pytest.mark.parametrize('scale', [1, 700])
+def test_our_nifti_round_trips_unchanged(tmp_path, suffix, scale):
+    """Also with values that a stranger's file would have divided by their maximum or clipped."""
+    path = tmp_path / f'v{suffix}'
+    data = ((COUNTS / 100 - 0.9) * scale).astype(np.float32)
+    write_volume(path, data, SPACING, origin=(1, 2, 3), description='1/mm')
+    v = read_volume(path)
+    np.testing.assert_array_equal(v.data, data)
+    assert v.spacing == pytest.approx(SPACING) and v.unit == '1/mm'
+    np.testing.assert_allclose(v.affine[:3, 3], [1, 2, 3])
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_nifti_header_and_place(tmp_path):
+    import nibabel
+
+    g = Geometry(900, 1400, (4, 6), 1, SHAPE, SPACING, [0.0], offOrigin=(10, 20, 30))
+    path = tmp_path / 'v.nii'
+    write_volume(path, COUNTS, SPACING, first_voxel(g), 'normalised')
+    image = nibabel.load(path)
+    assert image.header.get_xyzt_units()[0] == 'mm' and b'normalised' in image.header['descrip'].item()
+    assert image.get_data_dtype() == np.float32
+    # the middle of the volume, between voxels in x and z, is offOrigin
+    np.testing.assert_allclose(image.affine @ [1.5, 2, 2.5, 1], [10, 20, 30, 1])
+    write_volume(path, COUNTS, SPACING)
+    np.testing.assert_allclose(nibabel.load(path).affine @ [1.5, 2, 2.5, 1], [0, 0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize('unit, mm', [('mm', 1), ('meter', 1000), ('micron', 1e-3), ('unknown', 1)])
+def test_foreign_nifti(tmp_path, unit, mm):
+    import nibabel
+
+    affine = np.array([[-0.5, 0, 0, 7], [0, 0, 2.5, 8], [0, 1, 0, 9], [0, 0, 0, 1.0]])
+    image = nibabel.Nifti1Image(HU[..., None], affine)
+    image.header.set_xyzt_units(unit)
+    nibabel.save(image, tmp_path / 'v.nii.gz')
+    v = read_volume(tmp_path / 'v.nii.gz', mu_water=0.02)
+    np.testing.assert_allclose(v.data, 0.02 * (1 + HU / 1000.0), rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(v.spacing, np.array([0.5, 1, 2.5]) * mm, rtol=1e-6)
+    np.testing.assert_allclose(v.affine[:3], affine[:3] * mm, rtol=1e-6)
+
+
+def test_bad_nifti(tmp_path):
+    path = tmp_path / 'v.nii'
+    refused(path, 'no such file')
+    write_volume(path, COUNTS, SPACING)
+    raw = path.read_bytes()
+    for content in (b'', b'hello', raw[:200], raw[:-9]):
+        path.write_bytes(content)
+        assert str(path) in refused(path, 'damaged')
+    zipped = tmp_path / 'v.nii.gz'
+    write_volume(zipped, COUNTS, SPACING)
+    raw = zipped.read_bytes()
+    for content in (b'', b'hello', raw[:100], raw[:-9]):
+        zipped.write_bytes(content)
+        assert str(zipped) in refused(zipped, 'damaged')
+    write_volume(zipped, np.random.default_rng(0).uniform(0, 1, (40, 40, 40)), SPACING)
+    raw = zipped.read_bytes()
+    zipped.write_bytes(raw[:-8] + bytes([raw[-8] ^ 1]) + raw[-7:])  # the check sum, which nibabel does not reach
+    refused(zipped, 'CRC')
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Image(np.ones((2, 3, 4, 5), np.float32), np.eye(4)), path)
+    refused(path, '3 dimensions')
+    write_volume(path, COUNTS, SPACING)
+    refused(path, 'its own voxel size', spacing=1)
+
+
+def test_write_refuses(tmp_path):
+    for args, match in (
+        ((tmp_path / 'v.mha', COUNTS, 1), 'as NIfTI'),
+        ((tmp_path / 'v.nii', COUNTS[0], 1), '3 dimensions'),
+        ((tmp_path / 'v.nii', COUNTS * np.nan, 1), 'NaN'),
+        ((tmp_path / 'v.nii', COUNTS, (1, 0, 1)), 'voxel size'),
+        ((tmp_path / 'v.nii', COUNTS, 1, None, 'x' * 80), 'room for 79'),
+        ((tmp_path / 'none' / 'v.nii', COUNTS, 1), 'cannot be written'),
+    ):
+        with pytest.raises(InputError, match=match):
+            write_volume(*args)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / 'v.nii'
+    write_volume(path, COUNTS, SPACING)
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(os, 'replace', full)
+    with pytest.raises(InputError, match='No space left'):
+        write_volume(path, COUNTS * 2, SPACING)
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_permissions(tmp_path, monkeypatch):
+    path = tmp_path / 'v.npy'
+    np.save(path, COUNTS)
+
+    def denied(name, *args, **kwargs):
+        raise PermissionError(13, 'Permission denied', str(name))
+
+    monkeypatch.setattr(builtins, 'open', denied)
+    refused(path, 'Permission denied')
+    with pytest.raises(InputError, match='Permission denied'), paths.replacing(tmp_path / 'w') as temporary:
+        open(temporary)
+
+
+# ---- NumPy and raw -----------------------------------------------------------------------------------------
+
+
+def test_npy_and_npz(tmp_path):
+    v = read_array(tmp_path, COUNTS, spacing=SPACING)
+    assert v.spacing == SPACING
+    np.testing.assert_allclose(v.affine, centred_affine(SHAPE, SPACING))
+    np.testing.assert_allclose(v.affine[:3, 3], [-0.75, -2, -6.25])
+    assert read_array(tmp_path, COUNTS).spacing == (1, 1, 1)
+    np.savez(tmp_path / 'v.npz', volume=COUNTS, spacing=SPACING)
+    np.testing.assert_allclose(read_volume(tmp_path / 'v.npz').data, COUNTS / 119, rtol=1e-6)
+
+
+def test_bad_npy_and_npz(tmp_path):
+    path = tmp_path / 'v.npz'
+    refused(path, 'no such file')
+    np.savez(path, a=COUNTS, b=COUNTS)
+    refused(path, 'exactly one')
+    raw = path.read_bytes()
+    path.write_bytes(raw[:-20])
+    refused(path, 'damaged')
+    np.savez(path, a=np.array([{}]))
+    refused(path, 'damaged')
+    np.save(tmp_path / 'v.npy', COUNTS)
+    os.replace(tmp_path / 'v.npy', path)
+    refused(path, 'suffix')
+    np.save(tmp_path / 'v.npy', np.array([[[{}]]]), allow_pickle=True)
+    refused(tmp_path / 'v.npy', 'damaged')
+
+
+@pytest.mark.parametrize('dtype', ['uint8', '>u2', '<f4'])
+def test_raw_has_x_fastest(tmp_path, dtype):
+    path = tmp_path / 'v.raw'
+    path.write_bytes(
+        b''.join(COUNTS[x, y, z].astype(dtype).tobytes() for z in range(6) for y in range(5) for x in range(4))
+    )
+    v = read_volume(path, shape=SHAPE, dtype=dtype, spacing=SPACING)
+    np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
+    assert v.spacing == SPACING
+    other = tmp_path / 'v.dat'
+    os.replace(path, other)
+    np.testing.assert_array_equal(read_volume(other, shape=SHAPE, dtype=dtype).data, v.data)
+
+
+def test_known_raw_files_need_no_shape(tmp_path, monkeypatch):
+    assert git_blob_sha1(b'hello\n') == 'ce013625030ba8dba906f756967f9e9ca394464a'
+    assert volumes._KNOWN_RAW['2888630277536561269f9632164e4b21088ab00d'] == ((256, 256, 256), 'uint8')
+    path = tmp_path / 'known.raw'
+    path.write_bytes(COUNTS.transpose(2, 1, 0).tobytes())
+    refused(path, 'give the shape')
+    monkeypatch.setitem(volumes._KNOWN_RAW, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint8'))
+    np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
+
+
+def test_bad_raw(tmp_path):
+    path = tmp_path / 'v.raw'
+    refused(path, 'no such file')
+    path.write_bytes(COUNTS.tobytes())
+    for shape, dtype, match in (
+        (SHAPE, 'uint16', '120 bytes'),
+        ((4, 5), 'uint8', '3 positive'),
+        ((0, 5, 6), 'uint8', '3 positive'),
+        (SHAPE, 'no type', 'not understood'),
+        (('a', 5, 6), 'uint8', 'not understood'),
+        (SHAPE, None, 'give the shape'),
+        (SHAPE, object, 'bytes'),
+    ):
+        refused(path, match, shape=shape, dtype=dtype)
+
+
+# ---- NRRD, MetaImage, TIFF, DICOM --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('suffix', ['.nrrd', '.mha', '.mhd', '.nhdr'])
+def test_itk_formats_agree_with_nifti(tmp_path, suffix):
+    sitk = needs('SimpleITK')
+    image = sitk.GetImageFromArray(HU.transpose(2, 1, 0))
+    image.SetSpacing(SPACING)
+    image.SetOrigin((7, 8, 9))
+    image.SetDirection((0, -1, 0, 1, 0, 0, 0, 0, 1))
+    sitk.WriteImage(image, str(tmp_path / f'v{suffix}'))
+    sitk.WriteImage(image, str(tmp_path / 'v.nii'))
+    a, b = read_volume(tmp_path / f'v{suffix}'), read_volume(tmp_path / 'v.nii')
+    np.testing.assert_allclose(a.data, (HU + 1000) / 3000.0, rtol=1e-6)
+    np.testing.assert_array_equal(a.data, b.data)
+    np.testing.assert_allclose(a.affine, b.affine, atol=1e-5)
+    assert a.spacing == pytest.approx(SPACING)
+
+
+def test_bad_itk(tmp_path):
+    sitk = needs('SimpleITK')
+    refused(tmp_path / 'v.mha', 'no such file')
+    (tmp_path / 'v.mha').write_bytes(b'hello')
+    refused(tmp_path / 'v.mha', 'cannot be read by SimpleITK')
+    sitk.WriteImage(sitk.GetImageFromArray(COUNTS), str(tmp_path / 'v.mhd'))
+    (tmp_path / 'v.raw').unlink()
+    refused(tmp_path / 'v.mhd', 'cannot be read by SimpleITK')
+    sitk.WriteImage(sitk.GetImageFromArray(COUNTS[0]), str(tmp_path / 'v.nrrd'))
+    refused(tmp_path / 'v.nrrd', '2 dimensions')
+
+
+def test_tiff_stack_and_folder(tmp_path):
+    tifffile = needs('tifffile')
+    tifffile.imwrite(tmp_path / 'v.tif', COUNTS.transpose(2, 1, 0), photometric='minisblack')
+    a = read_volume(tmp_path / 'v.tif', spacing=SPACING)
+    (tmp_path / 'slices').mkdir()
+    for z in range(6):  # 8, 9, 10, …: names that sort wrongly as text
+        tifffile.imwrite(tmp_path / 'slices' / f's{z + 8}.tiff', COUNTS[:, :, z].T)
+    b = read_volume(tmp_path / 'slices')
+    for v in (a, b):
+        np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
+    assert a.spacing == SPACING
+    tifffile.imwrite(tmp_path / 'slices' / 's20.tiff', COUNTS[:, :, 0])
+    refused(tmp_path / 'slices', 'one size')
+    (tmp_path / 'slices' / 's20.tiff').write_bytes(b'hello')
+    assert 's20.tiff' in refused(tmp_path / 'slices', 'damaged')
+    refused(tmp_path / 'none.tif', 'no such file')
+
+
+def dicom_slice(path, z, pixels, **changes):
+    pydicom = needs('pydicom')
+    data = pydicom.Dataset()
+    data.file_meta = pydicom.dataset.FileMetaDataset()
+    data.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
+    data.file_meta.MediaStorageSOPClassUID = pydicom.uid.CTImageStorage
+    data.file_meta.MediaStorageSOPInstanceUID = data.SOPInstanceUID = pydicom.uid.generate_uid()
+    data.SOPClassUID = pydicom.uid.CTImageStorage
+    data.SeriesInstanceUID = '1.2.3'
+    data.Rows, data.Columns = pixels.shape
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, 'MONOCHROME2'
+    data.BitsAllocated = data.BitsStored = 16
+    data.HighBit, data.PixelRepresentation = 15, 1
+    data.PixelSpacing, data.SliceThickness = [1.0, 0.5], 9.0
+    data.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
+    data.ImagePositionPatient = [7, 8, z]
+    data.RescaleSlope, data.RescaleIntercept = 2, -1000
+    data.PixelData = np.ascontiguousarray(pixels, '<i2').tobytes()
+    for key, value in changes.items():
+        if value is None:
+            delattr(data, key)
+        else:
+            setattr(data, key, value)
+    data.save_as(path, enforce_file_format=True)
+
+
+def dicom_folder(folder, shuffle=(3, 0, 5, 1, 4, 2)):
+    folder.mkdir(exist_ok=True)
+    for name, k in enumerate(shuffle):
+        dicom_slice(folder / f'{name}.dcm', -20 + 2.5 * k, COUNTS[:, :, k].T)
+    (folder / 'notes.txt').write_text('hello')
+    return folder
+
+
+def test_dicom_folder(tmp_path):
+    v = read_volume(dicom_folder(tmp_path / 'ct'))
+    np.testing.assert_allclose(v.data, COUNTS * 2 / 3000.0, rtol=1e-6)
+    assert v.spacing == pytest.approx(SPACING)  # columns are x, rows y
+    np.testing.assert_allclose(v.affine[:3, 3], [-7, -8, -20])
+    assert np.diag(v.affine)[:3] == pytest.approx([-0.5, -1, 2.5])
+    np.testing.assert_allclose(read_volume(tmp_path / 'ct', mu_water=0.02).data, 0.02 * COUNTS * 2 / 1000.0, rtol=1e-5)
+
+
+def test_one_dicom_slice_takes_its_thickness(tmp_path):
+    (tmp_path / 'ct').mkdir()
+    dicom_slice(tmp_path / 'ct' / 'a', 0, COUNTS[:, :, 0].T)
+    assert read_volume(tmp_path / 'ct').spacing == (0.5, 1, 9)
+
+
+@pytest.mark.parametrize(
+    'changes, match',
+    [
+        ({'ImagePositionPatient': [7, 8, -3.0]}, 'not evenly spaced'),
+        ({'ImagePositionPatient': [7, 8, -10]}, 'not evenly spaced'),
+        ({'SeriesInstanceUID': '9'}, '2 DICOM series'),
+        ({'PixelSpacing': [1.0, 0.6]}, 'differs'),
+        ({'Rows': 2}, 'differs'),
+        ({'ImageOrientationPatient': [0, 1, 0, 1, 0, 0]}, 'differs'),
+        ({'ImagePositionPatient': None}, 'lacks geometry'),
+        ({'BitsAllocated': 7}, 'unreadable pixels'),
+        ({'PixelData': b'12'}, 'unreadable pixels'),
+    ],
+)
+def test_bad_dicom(tmp_path, changes, match):
+    folder = dicom_folder(tmp_path / 'ct')
+    dicom_slice(folder / 'extra', -5, COUNTS[:, :, 0].T, **changes)
+    refused(folder, match)
+
+
+def test_folders_and_names_without_a_volume(tmp_path):
+    refused(tmp_path, 'neither DICOM nor TIFF')
+    refused(tmp_path / 'a.dcm', 'folder of the series')
+    refused(tmp_path / 'a.xyz', 'no such file')
+    (tmp_path / 'a.xyz').touch()
+    refused(tmp_path / 'a.xyz', 'no known volume format')
+
+
+@pytest.mark.parametrize('module, name', [('SimpleITK', 'v.mha'), ('tifffile', 'v.tif'), ('pydicom', '')])
+def test_missing_package_names_the_extra(tmp_path, monkeypatch, module, name):
+    if name:
+        (tmp_path / name).touch()
+    monkeypatch.setitem(sys.modules, module, None)
+    refused(tmp_path / name, r"pip install 'lingo_mi\[formats\]'")
+
+
+def test_readers_load_without_the_optional_packages():
+    code = (
+        'import sys;'
+        "sys.modules.update(dict.fromkeys(['SimpleITK', 'pydicom', 'tifffile']));"
+        'import lingo_mi.files.scans, lingo_mi.files.volumes, lingo_mi.files.ply'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True)
+
+
+def test_no_reader_imports_mitsuba():
+    for file in Path(volumes.__file__).parent.glob('*.py'):
+        for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or '']
+                if isinstance(node, ast.ImportFrom)
+                else []
+            )
+            assert not {'mitsuba', 'drjit'} & {name.split('.')[0] for name in names}, file.name
+
+
+# ---- real data ---------------------------------------------------------------------------------------------
+
+
+def test_real_chest():
+    folder = os.environ.get('LINGO_MI_DATA')
+    if not folder or not (Path(folder) / 'chest_lidc0314.nii.gz').exists():
+        pytest.skip('LINGO_MI_DATA names no folder with chest_lidc0314.nii.gz')
+    v = read_volume(Path(folder) / 'chest_lidc0314.nii.gz')
+    assert v.data.shape == (256, 256, 275) and v.spacing == (1.5625, 1.5625, 1)
+    assert v.data.min() == 0 and v.data.max() == pytest.approx((1876 + 1000) / 3000)
+    assert v.unit == 'normalised'

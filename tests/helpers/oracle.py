@@ -1,0 +1,185 @@
+"""Float64 oracle of clouds of Gaussians: NumPy, written to be obviously right rather than fast.
+
+    sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2)
+
+Along a ray o + t D every term is a Gaussian in t. With w = W(p - o), d = W D and m = w.d / |d|^2 it is
+rho exp(-1/2 |w - m d|^2) exp(-1/2 |d|^2 (t - m)^2), which integrates to the error function.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import erf
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N], at the centre."""
+
+    centre: np.ndarray
+    scale: np.ndarray
+    rotation: np.ndarray
+    density: np.ndarray
+
+    def __post_init__(self):
+        for f in fields(self):  # what a test says is what float32 holds of it: rounding the input is no error
+            object.__setattr__(self, f.name, np.array(getattr(self, f.name), np.float32).astype(float))
+
+    def __len__(self):
+        return len(self.density)
+
+    def __getitem__(self, index):
+        return Cloud(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def __add__(self, other):
+        return Cloud(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
+
+    def changed(self, **columns):
+        return replace(self, **columns)
+
+
+def random_cloud(rng, n, spread=0.6, size=0.08, centre=(0.0, 0.0, 0.0)):
+    """n Gaussians with centres in a cube of half side `spread`, scales around `size`, any rotation and length of it."""
+    return Cloud(
+        np.array(centre) + rng.uniform(-spread, spread, (n, 3)),
+        size * np.exp(rng.normal(0, 0.4, (n, 3))),
+        rng.normal(size=(n, 4)),
+        rng.uniform(0.2, 1, n),
+    )
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One view as in `lingo_mi.geometry.base.Rays`: `source` is a point, or the beam's unit direction where parallel."""
+
+    source: np.ndarray
+    corner: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    height: int
+    width: int
+    parallel: bool = False
+
+    @staticmethod
+    def of(frames, index, height, width):
+        return Pose(
+            *(np.array(a[index], float) for a in (frames.source, frames.corner, frames.u, frames.v)),
+            height,
+            width,
+            frames.parallel,
+        )
+
+    def rays(self):
+        """Starts and directions [height * width, 3] through the pixel centres, row by row; t = 1 is on the panel."""
+        y, x = np.divmod(np.arange(self.height * self.width), self.width)
+        on_panel = self.corner + (x + 0.5)[:, None] * self.u + (y + 0.5)[:, None] * self.v
+        if self.parallel:
+            return on_panel, np.broadcast_to(self.source, on_panel.shape)
+        return np.broadcast_to(self.source, on_panel.shape), on_panel - self.source
+
+
+def whiten(scale, rotation, vectors):
+    """diag(1/s) R^T v for one Gaussian."""
+    return vectors @ Rotation.from_quat(rotation).as_matrix() / scale
+
+
+def one_integral(centre, scale, rotation, density, start, direction, t0=-np.inf, t1=np.inf):
+    """Line integrals [rays] of one Gaussian for t in [t0, t1]."""
+    w, d = whiten(scale, rotation, centre - start), whiten(scale, rotation, direction)
+    dd = (d * d).sum(1)
+    m = (w * d).sum(1) / dd
+    nearest = w - m[:, None] * d
+    step = np.sqrt(dd / 2)
+    share = 0.5 * (erf((t1 - m) * step) - erf((t0 - m) * step))
+    length = np.linalg.norm(direction, axis=1)
+    return density * np.sqrt(2 * np.pi / dd) * length * np.exp(-0.5 * (nearest**2).sum(1)) * share
+
+
+def line_integrals(cloud, pose, t0=-np.inf, t1=np.inf):
+    """The image of a cloud, [height * width], row by row."""
+    rays = pose.rays()
+    return sum(one_integral(*row, *rays, t0, t1) for row in rows(cloud))
+
+
+def rows(cloud):
+    return zip(cloud.centre, cloud.scale, cloud.rotation, cloud.density)
+
+
+def derivative(function, step):
+    """f'(0) by the five-point stencil, exact to the fourth power of the step."""
+    a, b, c, d = (function(k * step) for k in (-2, -1, 1, 2))
+    return (a - 8 * b + 8 * c - d) / (12 * step)
+
+
+def gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
+    """Derivatives of sum(weights * image) by all parameters: a dict of arrays shaped like the cloud's."""
+    rays = pose.rays()
+    return _gradients(cloud, lambda *row: (weights * one_integral(*row, *rays, t0, t1)).sum())
+
+
+def values_at(cloud, points):
+    """sigma at points [M, 3]."""
+    return sum(_value(*row, points) for row in rows(cloud))
+
+
+def value_gradients(cloud, points, weights):
+    """Derivatives of sum(weights * sigma(points)), like `gradients`."""
+    return _gradients(cloud, lambda *row: (weights * _value(*row, points)).sum())
+
+
+def _value(centre, scale, rotation, density, points):
+    return density * np.exp(-0.5 * (whiten(scale, rotation, points - centre) ** 2).sum(-1))
+
+
+def _gradients(cloud, loss, step=1e-3):
+    names = 'centre', 'scale', 'rotation', 'density'
+    out = {name: np.zeros_like(getattr(cloud, name)) for name in names}
+    for i, row in enumerate(rows(cloud)):
+        # A step is small against the Gaussian, whatever its size.
+        lengths = dict(
+            centre=row[1].min(),
+            scale=row[1],
+            rotation=np.linalg.norm(row[2]) * row[1].min() / row[1].max(),
+            density=row[3],
+        )
+        for k, name in enumerate(names):
+            for index in np.ndindex(np.shape(row[k])):
+                h = step * np.broadcast_to(lengths[name], np.shape(row[k]))[index]
+
+                def moved(by, k=k, index=index):
+                    changed = [np.array(x) for x in row]
+                    changed[k][index] += by
+                    return loss(*changed)
+
+                out[name][(i, *index)] = derivative(moved, h) if h else loss(*row[:3], 1.0)
+    return out
+
+
+def pose_gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
+    """Derivatives of sum(weights * image) by the view's four vectors."""
+    smallest = cloud.scale.min()
+    reach = dict(source=1, corner=1, u=pose.width, v=pose.height)
+    if pose.parallel:
+        reach['source'] = np.linalg.norm(cloud.centre - pose.corner, axis=1).max()
+    out = {}
+    for name, times in reach.items():
+        out[name] = np.array(
+            [
+                derivative(
+                    lambda by: (
+                        weights
+                        * line_integrals(cloud, replace(pose, **{name: getattr(pose, name) + by * axis}), t0, t1)
+                    ).sum(),
+                    1e-3 * smallest / times,
+                )
+                for axis in np.eye(3)
+            ]
+        )
+    return out
+
+
+def relative(found, expected):
+    """Root mean square deviation over that of the expected values."""
+    found, expected = np.ravel(found), np.ravel(expected)
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)

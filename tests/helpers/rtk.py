@@ -1,0 +1,95 @@
+"""Runs RTK on scans of this package (needs the `reference` extra).
+
+RTK rotates about y: (x, y, z) there is (y, z, x) here, its gantry angle is ours. ITK arrays are indexed backwards.
+"""
+
+import numpy as np
+
+
+def gantry(geometry, itk):
+    """RTK's geometry object."""
+    out = itk.RTK.ThreeDCircularProjectionGeometry.New()
+    for angle in np.degrees(geometry.angles):
+        out.AddProjection(geometry.DSO, geometry.DSD, float(angle), geometry.offDetector[1], geometry.offDetector[0])
+    return out
+
+
+def volume_image(volume, geometry, itk):
+    """A volume [x, y, z] as an ITK image (y, z, x)."""
+    image = itk.image_from_array(np.ascontiguousarray(volume.transpose(0, 2, 1), np.float32))
+    order = [1, 2, 0]
+    first = np.array(geometry.offOrigin) - (np.array(geometry.sVoxel) - geometry.dVoxel) / 2
+    image.SetSpacing([geometry.dVoxel[i] for i in order])
+    image.SetOrigin([float(first[i]) for i in order])
+    return image
+
+
+def projection_image(projections, geometry, itk):
+    """Projections [view, v, u] as an ITK stack; rows upwards."""
+    image = itk.image_from_array(np.ascontiguousarray(projections[:, ::-1], np.float32))
+    (dv, du), (nv, nu) = geometry.dDetector, geometry.nDetector
+    image.SetSpacing([du, dv, 1.0])
+    image.SetOrigin([-(nu - 1) / 2 * du, -(nv - 1) / 2 * dv, 0.0])
+    return image
+
+
+def array(image, itk):
+    """A volume image as [x, y, z]."""
+    return itk.array_from_image(image).transpose(0, 2, 1)
+
+
+def reconstruct(kind, scan, itk, **settings):
+    """Volume [x, y, z] of one of RTK's filters, set up by its Set... methods.
+
+    kind   'FDK', 'SART' or 'ConjugateGradient'
+    """
+    image = itk.Image[itk.F, 3]
+    geometry = scan.geometry
+    cls = getattr(itk.RTK, kind + 'ConeBeamReconstructionFilter')
+    reconstruction = cls[image].New() if kind != 'SART' else cls[image, image].New()
+    inputs = [volume_image(np.zeros(geometry.nVoxel), geometry, itk), projection_image(scan.projections, geometry, itk)]
+    if kind == 'ConjugateGradient':
+        inputs.append(projection_image(np.ones_like(scan.projections), geometry, itk))
+    for i, x in enumerate(inputs):
+        reconstruction.SetInput(i, x)
+    reconstruction.SetGeometry(gantry(geometry, itk))
+    for name, value in settings.items():
+        getattr(reconstruction, 'Set' + name)(value)
+    reconstruction.Update()
+    return array(reconstruction.GetOutput(), itk).copy()
+
+
+def project(volume, geometry, itk):
+    """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
+    zeros = np.zeros((len(geometry), *geometry.nDetector))
+    found = _filter(
+        'JosephForwardProjectionImageFilter',
+        geometry,
+        itk,
+        projection_image(zeros, geometry, itk),
+        volume_image(volume, geometry, itk),
+    )
+    return itk.array_from_image(found)[:, ::-1]
+
+
+def backproject(scan, itk):
+    """Volume [x, y, z] of a scan by the transpose of that projector."""
+    geometry = scan.geometry
+    found = _filter(
+        'JosephBackProjectionImageFilter',
+        geometry,
+        itk,
+        volume_image(np.zeros(geometry.nVoxel), geometry, itk),
+        projection_image(scan.projections, geometry, itk),
+    )
+    return array(found, itk)
+
+
+def _filter(name, geometry, itk, *inputs):
+    image = itk.Image[itk.F, 3]
+    run = getattr(itk.RTK, name)[image, image].New()
+    for i, x in enumerate(inputs):
+        run.SetInput(i, x)
+    run.SetGeometry(gantry(geometry, itk))
+    run.Update()
+    return run.GetOutput()

@@ -1,0 +1,100 @@
+"""Joseph's projector against a literal transcription, its transpose, and the analytic ball."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from helpers.grids import scan
+from helpers.matrices import matrix
+from lingo_mi.errors import InputError
+from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.joseph import Joseph
+
+
+def device_images(y):
+    return mi.Float(np.ascontiguousarray(y.transpose(0, 2, 1), np.float32).ravel())
+
+
+GEOMETRIES = [
+    dict(),
+    dict(mode='parallel'),
+    dict(nVoxel=(9, 11, 1)),
+    dict(mode='parallel', nVoxel=(1, 8, 7)),
+    dict(nDetector=(1, 21)),
+    dict(DSO=400.0, DSD=400.0),
+    dict(dDetector=(9.0, 8.0)),
+    dict(dDetector=(1.0, 1.1)),
+]
+
+
+@pytest.mark.parametrize('changes', GEOMETRIES)
+def test_against_the_transcription(changes):
+    geometry = scan(n=3, **changes)
+    A, J, rng = matrix(geometry), Joseph(geometry), np.random.default_rng(0)
+    x, y = rng.normal(size=geometry.nVoxel), rng.normal(size=(3, *geometry.nDetector))
+    views = [2, 0]
+    rows = A.reshape(3, -1, A.shape[1])[views].reshape(-1, A.shape[1])
+    ax, paths = J.forward(mi.Float(np.float32(x).ravel()), views)
+    shape = (2, *geometry.nDetector[::-1])
+    result = ax.numpy().reshape(shape).transpose(0, 2, 1).ravel()
+    expected = rows @ x.ravel()
+    assert np.count_nonzero(expected) > 20
+    np.testing.assert_allclose(result, expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(paths.numpy().reshape(shape).transpose(0, 2, 1).ravel(), rows.sum(1), atol=1e-3)
+    images = device_images(y[views])
+    aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
+    expected = rows.T @ y[views].ravel()
+    np.testing.assert_allclose(aty.numpy(), expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(sums.numpy(), rows.sum(0), atol=2e-5 * rows.sum(0).max())
+
+
+@pytest.mark.parametrize('changes', [*GEOMETRIES, dict(offOrigin=(0.0, 0.0, 0.0), offDetector=(0.0, 0.0), n=8)])
+def test_transpose(changes):
+    geometry = scan(**changes)
+    J, rng = Joseph(geometry), np.random.default_rng(1)
+    n = len(geometry)
+    x = rng.normal(size=geometry.nVoxel).astype(np.float32)
+    y = rng.normal(size=(n, *geometry.nDetector)).astype(np.float32)
+    ax = J.forward(mi.Float(x.ravel()), range(n))[0].numpy().astype(float)
+    aty = J.adjoint(device_images(y), range(n)).numpy().astype(float)
+    scale = np.linalg.norm(ax) * np.linalg.norm(y)
+    assert abs(ax @ y.transpose(0, 2, 1).ravel() - aty @ x.ravel()) < 1e-5 * scale and scale > 0
+
+
+def test_smooth_ball_against_the_exact_projector():
+    """Joseph samples once a slice, which is nearly exact where the volume is smooth."""
+    geometry = scan(n=6, nVoxel=(40, 44, 36), dVoxel=(2.0, 1.8, 2.2), nDetector=(30, 34), dDetector=(4.0, 4.0))
+    grid = [
+        (np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+    ]
+    x = np.stack(np.meshgrid(*grid, indexing='ij'), -1)
+    volume = 0.02 / (1 + np.exp((np.linalg.norm(x - [6.0, -5.0, 4.0], axis=-1) - 25) / 0.8))
+    result = Joseph(geometry).forward(mi.Float(np.float32(volume).ravel()), range(6))[0].numpy()
+    result = result.reshape(6, 34, 30).transpose(0, 2, 1)
+    exact = project(volume, geometry)
+    assert np.linalg.norm(result - exact) < 0.004 * np.linalg.norm(exact)
+
+
+def test_kernels_serve_any_views():
+    """One kernel projects; two go back, the first weights the images."""
+    geometry = scan(n=7)
+    J, x = Joseph(geometry), dr.opaque(mi.Float, 1.0, 9 * 11 * 7)
+
+    def both(views):
+        images = J.forward(x, views)[0]
+        dr.eval(images)
+        dr.eval(J.adjoint(images, views))
+
+    both([0, 1])
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        both([3])
+        both([2, 6, 4])
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) == 6 and len({k['hash'] for k in history}) == 3 and all(k['cache_hit'] for k in history)
+
+
+def test_source_inside_the_volume_is_refused():
+    with pytest.raises(InputError, match='inside'):
+        Joseph(scan(DSO=15.0, DSD=300.0))

@@ -1,0 +1,117 @@
+"""The exact projector pair of iterative algorithms: scans off the circle, and pixels left out."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from helpers.algorithms import ALGORITHMS
+from helpers.balls import BALL, assert_ball, ellipsoids, geometry
+from helpers.grids import scan
+from lingo_mi.geometry.base import Geometry, circular, helix
+from lingo_mi.projectors.exact import ExactPair
+from lingo_mi.projectors.grid import backproject, project
+from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.reconstruction.sart import sart
+from lingo_mi.reconstruction.system import System
+from lingo_mi.scan import Scan
+
+
+def moved(geo, shift=0.0, turn=(0.0, 0.0, 0.0)):
+    """The geometry with source and panel turned (rotation vector, radians) and shifted along z (mm, one or one a view)."""
+    n = len(geo)
+    turns = Rotation.from_rotvec(np.tile(turn, (n, 1))).as_matrix()
+    shifts = np.broadcast_to(np.reshape(shift, (-1, 1)) * [0, 0, 1.0], (n, 3))
+    return Geometry.posed(geo.rays().moved(turns, shifts), geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
+
+
+def laminography(geo):
+    return moved(geo, turn=(0.3, 0, 0))
+
+
+def spiral(geo, pitch):
+    return moved(geo, helix(geo.angles - np.pi, pitch))
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('masked', [False, True])
+def test_a_matrix_and_its_transpose(mode, masked):
+    """`forward` and `adjoint` of any views are those of `grid`, with pixels left out."""
+    geo = laminography(scan(mode, n=3))
+    rng, n = np.random.default_rng(0), geo.nDetector
+    valid = rng.random((3, *n)) < 0.7 if masked else np.ones((3, *n), bool)
+    A, chosen = ExactPair(geo, valid if masked else None), [2, 0]
+    x, y = rng.random(geo.nVoxel), rng.normal(size=(2, *n)) * valid[chosen]
+
+    def images(projections):
+        return projections.transpose(0, 2, 1).ravel()
+
+    found, paths = A.forward(mi.Float(np.float32(x).ravel()), chosen)
+    expected, boxes = ((project(v, geo) * valid)[chosen] for v in (x, np.ones_like(x)))
+    np.testing.assert_allclose(found.numpy(), images(expected), atol=2e-6 * expected.max())
+    np.testing.assert_allclose(paths.numpy(), images(boxes), atol=2e-6 * boxes.max())
+    anything = y if not masked else np.where(valid[chosen], y, 7.0)  # what stands in pixels left out counts for nothing
+    found = A.adjoint(A.images(anything), chosen)
+    expected = backproject(y, geo.subset(chosen))
+    np.testing.assert_allclose(found.numpy(), expected.ravel(), atol=2e-6 * np.abs(expected).max())
+    voxel, total, ones = A.adjoint(A.images(anything), chosen, lambda *values: values)
+    np.testing.assert_array_equal(voxel.numpy(), np.arange(x.size))
+    np.testing.assert_allclose(total.numpy(), found.numpy(), atol=2e-6 * np.abs(expected).max())
+    expected = backproject(valid[chosen].astype(float), geo.subset(chosen))
+    np.testing.assert_allclose(ones.numpy(), expected.ravel(), atol=2e-6 * expected.max())
+    product = np.vdot(A.forward(mi.Float(np.float32(x).ravel()), chosen)[0].numpy().astype(float), images(y))
+    assert abs(product - np.vdot(x, backproject(y, geo.subset(chosen)))) < 1e-5 * np.linalg.norm(x) * np.linalg.norm(
+        expected
+    )
+
+
+def test_which_projector_a_scan_gets():
+    geo = scan(n=3)
+    ones = np.ones((3, *geo.nDetector), np.float32)
+    assert isinstance(System(Scan(geo, ones)).A, Joseph)
+    assert isinstance(System(Scan(geo, ones, np.arange(ones.size).reshape(ones.shape) > 0)).A, ExactPair)
+    assert isinstance(System(Scan(laminography(geo), ones)).A, ExactPair)
+
+
+@pytest.mark.parametrize(
+    'name, views, options',
+    [
+        ('sart', 40, dict(niter=3)),
+        ('os_sart', 60, dict(niter=4, blocksize=6)),
+        ('cgls', 120, dict(niter=12)),
+        ('asd_pocs', 40, dict(niter=3)),
+    ],
+)
+def test_helix(name, views, options):
+    """Two turns that climb by 20 mm each."""
+    geo = spiral(geometry(angles=4 * np.pi * np.arange(views) / views), 20.0)
+    assert_ball(ALGORITHMS[name](ellipsoids(geo, BALL), **options).volume, geo)
+
+
+def test_pixels_left_out_count_for_nothing():
+    """A quarter of the pixels dead, whatever stands in them; taken for zero they spoil the volume."""
+    geo = geometry(angles=circular(40, start=3))
+    whole = ellipsoids(geo, BALL)
+    valid = np.random.default_rng(0).random(whole.projections.shape) < 0.75
+    dead = replace(whole, projections=np.where(valid, whole.projections, np.nan), valid=valid)
+    result = sart(dead, 3)
+    assert_ball(result.volume, geo)
+    assert result.residuals[-1] < 0.1
+    with pytest.raises(AssertionError):
+        assert_ball(sart(replace(whole, projections=np.where(valid, whole.projections, 0)), 3).volume, geo)
+
+
+def test_kernels_serve_any_views():
+    """Once an algorithm has run, longer runs and other views compile nothing."""
+    geo = laminography(scan(n=5))
+    measured = Scan(geo, np.random.default_rng(0).random((5, *geo.nDetector)).astype(np.float32))
+    for algorithm in ('sart', 'cgls'):
+        run = ALGORITHMS[algorithm]
+        run(measured, niter=2)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            run(measured, niter=3)
+            assert all(k['cache_hit'] for k in dr.kernel_history([dr.KernelType.JIT]))

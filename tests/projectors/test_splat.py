@@ -1,0 +1,331 @@
+"""Line integrals of clouds of Gaussians against the float64 oracle: images, gradients, tangents, hard places."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from helpers import oracle
+from helpers.hard_cases import PARAMETERS, host, on_device
+from helpers.oracle import Cloud, Pose, random_cloud, relative
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.exponential import exp2_of_negative
+from lingo_mi.projectors.footprint import NAMES, project
+from lingo_mi.projectors.splat import splat
+from lingo_mi.projectors.view import View
+
+EXTENT = 6.0
+POSE = 'source', 'corner', 'u', 'v'
+
+
+def scanner(mode='cone', shape=(33, 46), angle=33.0, size=(3.2, 3.0), **changes):
+    """Rays of one view of a scanner around [-1, 1]^3, and the panel's shape."""
+    pixel = [s / n for s, n in zip(size, shape)]
+    settings = dict(
+        DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, nVoxel=8, dVoxel=0.25, angles=np.radians([angle])
+    )
+    return Geometry(**{**settings, 'mode': mode, **changes}).rays(), shape
+
+
+def tilted(parallel):
+    """A panel that is neither square to the beam nor rectangular, rows from bottom to top."""
+    forward, u, v = np.array([-1.0, 0.2, 0.1]), np.array([0.2, 0.9, -0.1]), np.array([0.15, -0.2, 1.1])
+    shape, centre = (29, 34), 1.7 * forward
+    u, v = u * 3 / shape[1], v * 3 / shape[0]
+    source = forward / np.linalg.norm(forward) if parallel else -4 * forward
+    return Rays(source[None], (centre - u * shape[1] / 2 - v * shape[0] / 2)[None], u[None], v[None], parallel), shape
+
+
+VIEWS = {
+    'cone': scanner(),
+    'parallel': scanner('parallel'),
+    'cone, offset': scanner(offDetector=(0.31, -0.42), angle=-71.0),
+    'parallel, offset': scanner('parallel', offDetector=(0.31, -0.42), angle=-71.0),
+    'cone, tall pixels': scanner(shape=(19, 62)),
+    'parallel, wide pixels': scanner('parallel', shape=(61, 18)),
+    'cone, close': scanner(DSO=2.2, DSD=3.6),
+    'cone, tilted': tilted(False),
+    'parallel, tilted': tilted(True),
+}
+SIZES = [(1, 1), (1, 37), (37, 1), (8, 4), (5, 3), (17, 65)]
+
+
+def run(cloud, frames, shape, weights, panel=True, pose=False):
+    """Image, and derivatives of sum(weights * image) by the cloud and, if asked, by the pose."""
+    view, gaussians = View.of(frames, 0, *shape, panel), on_device(cloud)
+    dr.enable_grad(gaussians)
+    if pose:
+        dr.enable_grad([getattr(view, name) for name in POSE])
+    image = line_integrals(*gaussians, view, EXTENT)
+    dr.backward(dr.sum(image * mi.Float(weights.tolist())))
+    return (
+        image.numpy().astype(float),
+        {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)},
+        {n: host(dr.grad(getattr(view, n))).ravel() for n in POSE},
+    )
+
+
+def check(cloud, frames, shape, t0=-np.inf, t1=np.inf, panel=True, pose_too=True):
+    """Assert the image to 2e-6 and all derivatives to 1e-5."""
+    weights = np.float32(np.random.default_rng(0).normal(size=shape[0] * shape[1])).astype(float)
+    pose = Pose.of(frames, 0, *shape)
+    image, grads, pose_grads = run(cloud, frames, shape, weights, panel, pose_too)
+    expected = oracle.line_integrals(cloud, pose, t0, t1)
+    assert relative(image, expected) < 2e-6
+    assert np.abs(image - expected).max() < 2e-6 * np.abs(expected).max()
+    for name, value in oracle.gradients(cloud, pose, weights, t0, t1).items():
+        assert grads[name].shape == value.shape
+        assert relative(grads[name], value) < 1e-5, name
+    if not pose_too:
+        return
+    for name, value in oracle.pose_gradients(cloud, pose, weights, t0, t1).items():
+        found = pose_grads[name]
+        if pose.parallel and name == 'source':  # a unit vector can only turn
+            found, value = (x - x @ pose.source * pose.source for x in (found, value))
+        assert relative(found, value) < 1e-5, name
+
+
+@pytest.mark.parametrize('name', VIEWS)
+def test_exact(name):
+    frames, shape = VIEWS[name]
+    check(random_cloud(np.random.default_rng(1), 12), frames, shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', VIEWS)
+def test_exact_at_full_size(name):
+    frames, _ = VIEWS[name]
+    shape = 151, 178
+    frames = replace(frames, u=frames.u * 34 / shape[1], v=frames.v * 29 / shape[0])
+    check(random_cloud(np.random.default_rng(1), 40), frames, shape, pose_too=False)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('shape', SIZES)
+def test_detectors_of_any_size(mode, shape):
+    size = (3.2 if shape[0] > 1 else 0.05, 3.0 if shape[1] > 1 else 0.05)
+    frames, _ = scanner(mode, shape, size=size)
+    check(random_cloud(np.random.default_rng(2), 8, spread=0.3), frames, shape, pose_too=False)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_single_gaussian(mode):
+    frames, shape = scanner(mode)
+    check(random_cloud(np.random.default_rng(4), 1), frames, shape)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_gaussians_partly_outside_the_image(mode):
+    frames, shape = scanner(mode, size=(1.2, 1.1))
+    check(random_cloud(np.random.default_rng(5), 20, spread=0.9, size=0.15), frames, shape, pose_too=False)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_gaussians_outside_the_image_add_nothing(mode):
+    frames, shape = scanner(mode)
+    rng = np.random.default_rng(6)
+    seen, weights = random_cloud(rng, 4), rng.normal(size=shape[0] * shape[1])
+    # To the sides and far above the fan, but not behind the source.
+    beside = random_cloud(rng, 6, spread=0.1, centre=5.5 * frames.u[0] / np.linalg.norm(frames.u[0]))
+    above = random_cloud(rng, 6, spread=0.1, centre=(0, 0, 1e3))
+    image, grads, _ = run(seen + beside + above, frames, shape, weights)
+    alone, grads_alone, _ = run(seen, frames, shape, weights)
+    np.testing.assert_allclose(image, alone, rtol=1e-6)
+    for name in PARAMETERS:
+        largest = np.abs(grads_alone[name]).max()
+        np.testing.assert_allclose(grads[name][:4], grads_alone[name], rtol=1e-5, atol=1e-6 * largest)
+        assert not grads[name][4:].any()
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_scene_sized_gaussian_among_small_ones(mode):
+    frames, shape = scanner(mode)
+    large = Cloud([[0.1, -0.2, 0.05]], [[0.5, 0.45, 0.52]], [[0.1, 0.2, -0.3, 1.0]], [0.4])
+    check(large + random_cloud(np.random.default_rng(7), 10, size=0.03), frames, shape, pose_too=False)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_quaternions_need_no_unit_length(mode):
+    frames, shape = scanner(mode)
+    cloud = random_cloud(np.random.default_rng(8), 6)
+    weights = np.ones(shape[0] * shape[1])
+    image, grads, _ = run(cloud, frames, shape, weights)
+    long, long_grads, _ = run(cloud.changed(rotation=64 * cloud.rotation), frames, shape, weights)
+    np.testing.assert_array_equal(image, long)
+    np.testing.assert_allclose(64 * long_grads['rotation'], grads['rotation'], rtol=1e-6)
+
+
+def test_cut_off_bounds_the_error():
+    """A smaller extent loses what lies beyond it, no more: the price list in the integrator's docstring."""
+    frames, shape = scanner()
+    cloud = random_cloud(np.random.default_rng(9), 30)
+    exact = oracle.line_integrals(cloud, Pose.of(frames, 0, *shape))
+    view, gaussians = View.of(frames, 0, *shape), on_device(cloud)
+    errors = [relative(line_integrals(*gaussians, view, extent).numpy(), exact) for extent in (3.0, 4.0, 5.0, 6.0)]
+    assert all(error < bound for error, bound in zip(errors, (1.2e-2, 4e-4, 8e-6, 1e-6)))
+    assert errors == sorted(errors, reverse=True)
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Where the footprint is no ellipse
+# ------------------------------------------------------------------------------------------------------------
+
+AHEAD = -np.array([np.cos(np.radians(33)), np.sin(np.radians(33)), 0])  # from the source to the panel's middle
+STRADDLING = {
+    'source inside': (5 * -AHEAD + 0.05, 0.2),
+    'source at the centre': (np.float32(5 * -AHEAD), 0.3),
+    'behind the source, reaching ahead': (5.4 * -AHEAD, 0.2),
+    'just ahead of the source': (4.6 * -AHEAD, 0.12),
+    'through the panel': (2.4 * AHEAD, 0.15),
+    'behind the panel, reaching through': (2.9 * AHEAD, 0.15),
+    'from source to panel': (0 * AHEAD, 1.2),
+}
+
+
+POSE_TOO = 'source inside', 'from source to panel'
+
+
+@pytest.mark.parametrize('panel', [True, False])
+@pytest.mark.parametrize('name', STRADDLING)
+def test_straddling(name, panel):
+    """The integral runs from the source to the panel, or to infinity for a camera, whatever lies in between."""
+    middle, size = STRADDLING[name]
+    frames, shape = scanner(shape=(21, 26))
+    cloud = Cloud([middle], [size * np.array([1, 0.8, 1.3])], [[0.1, 0.4, -0.3, 0.8]], [0.7])
+    cloud += random_cloud(np.random.default_rng(1), 3)
+    check(cloud, frames, shape, 0, 1 if panel else np.inf, panel, pose_too=name in POSE_TOO)
+
+
+@pytest.mark.parametrize('centre, panel', [(6.5 * -AHEAD, True), (6.5 * -AHEAD, False), (3.5 * AHEAD, True)])
+def test_behind_the_source_or_the_panel_adds_nothing(centre, panel):
+    frames, shape = scanner()
+    cloud = Cloud([centre], [[0.1, 0.1, 0.1]], [[0, 0, 0, 1]], [1.0])
+    image, grads, pose = run(cloud, frames, shape, np.ones(shape[0] * shape[1]), panel, pose=True)
+    assert not image.any() and not any(g.any() for g in (*grads.values(), *pose.values()))
+
+
+def test_a_camera_sees_what_lies_behind_its_image_plane():
+    frames, shape = scanner()
+    cloud = Cloud([3.5 * AHEAD], [[0.1, 0.12, 0.15]], [[0.1, 0.4, -0.3, 0.8]], [1.0])
+    check(cloud, frames, shape, 0, np.inf, panel=False)
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Forward mode
+# ------------------------------------------------------------------------------------------------------------
+
+
+def columns(values):
+    """The components of nested Dr.Jit arrays, Float each."""
+    return [c for v in values for c in (v if dr.depth_v(v) > 1 else [v])]
+
+
+def adjoint(function, inputs, directions, rng):
+    """Assert <J dx, y> = <dx, J^T y> to 1e-5, for y near J dx, so that neither side cancels."""
+    dr.enable_grad(inputs)
+    for column, direction in zip(columns(inputs), directions):
+        dr.set_grad(column, direction)
+    tangent = dr.forward_to(function(inputs)).numpy().astype(float)
+    weights = np.float32(tangent + 0.2 * np.std(tangent) * rng.normal(size=len(tangent))).astype(float)
+    dr.disable_grad(inputs)
+    dr.enable_grad(inputs)
+    dr.backward(dr.sum(function(inputs) * mi.Float(weights.tolist())))
+    back = sum(
+        float((np.array(dr.grad(c), float) * np.array(d, float)).sum()) for c, d in zip(columns(inputs), directions)
+    )
+    ahead = tangent @ weights
+    assert ahead > 0 and abs(ahead - back) < 1e-5 * ahead
+    return tangent
+
+
+@pytest.mark.parametrize('name', VIEWS)
+def test_tangent_of_the_splat_is_the_adjoint_of_its_gradient(name):
+    frames, shape = VIEWS[name]
+    rng = np.random.default_rng(10)
+    footprints = project(*on_device(random_cloud(rng, 15)), View.of(frames, 0, *shape), EXTENT)
+    columns = [np.broadcast_to(v.numpy(), 15) for v in footprints.values]  # a parallel beam's zeros are scalars
+    assert len(columns) == len(NAMES)
+    values = [mi.Float(c.tolist()) for c in columns]
+    # In proportion to each number, whose sizes differ by powers of ten.
+    directions = [mi.Float((0.1 * np.abs(c) * rng.normal(size=15)).tolist()) for c in columns]
+    adjoint(lambda x: splat(replace(footprints, values=tuple(x)), *shape, EXTENT), values, directions, rng)
+
+
+@pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, tilted', 'cone, close'])
+def test_tangent_of_line_integrals(name):
+    """Against the gradient, and against the oracle; with one Gaussian around a cone beam's source."""
+    frames, shape = VIEWS[name]
+    rng = np.random.default_rng(11)
+    cloud = random_cloud(rng, 9)
+    if name == 'cone':
+        cloud += Cloud([frames.source[0]], [[0.2, 0.3, 0.25]], [[0.1, 0.2, 0.3, 0.4]], [0.3])
+    n = len(cloud)
+    by = dict(
+        centre=0.01 * rng.normal(size=(n, 3)),
+        scale=0.01 * rng.normal(size=(n, 3)),
+        rotation=0.1 * rng.normal(size=(n, 4)),
+        density=0.1 * rng.normal(size=n),
+    )
+    by = {k: np.float32(v).astype(float) for k, v in by.items()}
+    directions = [mi.Float(c.tolist()) for v in by.values() for c in (v.T if v.ndim > 1 else [v])]
+    view = View.of(frames, 0, *shape)
+    tangent = adjoint(lambda x: line_integrals(*x, view, EXTENT), list(on_device(cloud)), directions, rng)
+    pose, ends = Pose.of(frames, 0, *shape), (-np.inf, np.inf) if frames.parallel else (0, 1)
+    rays = pose.rays()
+    expected = sum(
+        oracle.derivative(
+            lambda t: oracle.one_integral(*(getattr(cloud, k)[i] + t * by[k][i] for k in PARAMETERS), *rays, *ends),
+            1e-2,
+        )
+        for i in range(n)
+    )
+    assert relative(tangent, expected) < 1e-5
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_derivatives_without_the_image(mode):
+    frames, shape = scanner(mode)
+    cloud, view = random_cloud(np.random.default_rng(12), 6), View.of(frames, 0, *shape)
+    weights = mi.Float(np.random.default_rng(0).normal(size=shape[0] * shape[1]).tolist())
+    grads = []
+    for primal in (True, False):
+        gaussians = on_device(cloud)
+        dr.enable_grad(gaussians)
+        image = line_integrals(*gaussians, view, EXTENT, primal)
+        assert bool(dr.any(image != 0)) == primal
+        dr.backward(dr.sum(image * weights))
+        grads.append([host(dr.grad(x)) for x in gaussians])
+    for a, b in zip(*grads):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_same_bits_every_time(mode, variant):
+    if not variant.startswith('llvm'):
+        pytest.skip('a GPU adds atomically, in any order')
+    frames, shape = scanner(mode, (64, 63))
+    cloud = Cloud([[0.1, -0.2, 0.05]], [[0.5, 0.45, 0.52]], [[0.1, 0.2, -0.3, 1.0]], [0.4]) + random_cloud(
+        np.random.default_rng(13), 300
+    )
+    weights = np.random.default_rng(0).normal(size=shape[0] * shape[1])
+    image, grads, _ = run(cloud, frames, shape, weights)
+    for _ in range(4):
+        again, grads_again, _ = run(cloud, frames, shape, weights)
+        np.testing.assert_array_equal(image, again)
+        for name in PARAMETERS:
+            np.testing.assert_array_equal(grads[name], grads_again[name])
+
+
+def test_powers_of_two():
+    """To float32's rounding, exact for whole numbers, and nothing but small where float32 ends."""
+    x = np.concatenate([np.linspace(-125.9, 0, 100_001), -np.logspace(-40, 0, 1000), np.arange(-125, 1)]).astype(
+        np.float32
+    )
+    found = exp2_of_negative(mi.Float(x)).numpy()
+    np.testing.assert_allclose(found, np.exp2(x.astype(float)), rtol=1.2e-7)
+    np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
+    assert np.all(exp2_of_negative(mi.Float([-126, -127, -200, -1e30, -np.inf])).numpy() <= 2.0**-126)

@@ -1,0 +1,169 @@
+"""Filtered backprojection: densities, positions, spans, filters, and a measured fan-beam scan."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from helpers.balls import BALL, centres, ellipsoids, geometry
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.camera import voxel_matrices
+from lingo_mi.reconstruction.fdk import WINDOWS, fdk, ramp, ray_weights, view_weights
+from lingo_mi.scan import Scan
+
+
+def test_asymmetric_phantom_axis_by_axis():
+    geo = geometry(angles=circular(120))
+    axes = np.array([12.0, 12.0, 12.0])
+    bodies = [
+        (np.array([30.0, 0.0, 0.0]), axes, 0.01),
+        (np.array([0.0, 30.0, 0.0]), axes, 0.02),
+        (np.array([0.0, 0.0, 30.0]), axes, 0.03),
+        (np.array([0.0, -30.0, 0.0]), axes, 0.04),
+    ]
+    volume, x = fdk(ellipsoids(geo, *bodies)), centres(geo)
+    for centre, _, density in bodies:
+        inside = np.linalg.norm(x - centre, axis=-1) < 7
+        assert abs(volume[inside].mean() / density - 1) < 0.06  # a cone misses data off the central plane
+        opposite = np.linalg.norm(x + centre * [1, 0, 1], axis=-1) < 7
+        if centre[1] == 0:
+            assert abs(volume[opposite].mean()) < 0.2 * density
+
+
+@pytest.mark.parametrize('span', [215, 230, 280])
+def test_parker_weights_on_a_short_scan(span):
+    """A panel that spans 31 degrees of fan needs 211; rays measured twice must not count twice."""
+    geo = geometry(angles=circular(span, span, start=40)[::-1])
+    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    assert np.sqrt(np.mean((volume[near < 20] / 0.02 - 1) ** 2)) < 0.005  # unweighted: 0.02 to 0.04
+    assert np.sqrt(np.mean((volume[(near > 30) & (near < 60)] / 0.02) ** 2)) < 0.025  # unweighted: above 0.05
+
+
+@pytest.mark.parametrize('span', [211, 240, 300])
+def test_parker_weights_of_opposite_rays_sum_to_one(span):
+    n, u = 4 * span, (np.arange(72) - 35.5) * 3 - 6  # so that -u is a column too
+    geo = geometry(angles=circular(n, span), offDetector=(4.0, -6.0))
+    weights = ray_weights(geo) * np.pi / np.radians(span)
+    fan = np.arctan(u / 450)
+    for column in (4, 30, 36, 60):
+        other = np.interp(-fan[column], fan, np.arange(72))
+        partner = geo.angles + np.pi - 2 * fan[column]
+        pairs = np.interp(partner, geo.angles, weights[:, round(other)], left=0, right=0)
+        seen = (partner > geo.angles[2]) & (partner < geo.angles[-3])
+        if abs(other - round(other)) < 1e-6:
+            np.testing.assert_allclose(weights[seen, column] + pairs[seen], 1, atol=0.01)
+            assert seen.sum() > 10
+    np.testing.assert_allclose(ray_weights(geometry(angles=circular(190, 190))), 1)  # less than the fan needs
+    np.testing.assert_allclose(ray_weights(geometry(angles=[0.3])), 1)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('offset', [50.0, -50.0])
+def test_offset_detector_that_sees_little_more_than_half(mode, offset):
+    geo = geometry(mode, nDetector=(64, 40), offDetector=(4.0, offset))  # from -10 to 110 mm
+    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005  # unweighted: 0.36
+    assert np.sqrt(np.mean((volume[near < 20] / 0.02 - 1) ** 2)) < 0.02
+    weights = ray_weights(geo)[0]
+    u = (np.arange(40) - 19.5) * 3 + offset
+    overlap = np.abs(u) < 10
+    np.testing.assert_allclose(weights[~overlap], 2)
+    np.testing.assert_allclose(weights[overlap] + np.interp(-u[overlap], *zip(*sorted(zip(u, weights)))), 2, atol=0.05)
+
+
+@pytest.mark.parametrize('values', [0.0, 1.0, -1.0])
+def test_constant_projections(values):
+    geo = geometry(angles=circular(6))
+    volume = fdk(Scan(geo, np.full((6, *geo.nDetector), values)))
+    assert np.isfinite(volume).all() and (volume.any() == bool(values))
+
+
+@pytest.mark.parametrize('mode, span', [('cone', 180), ('cone', 230), ('parallel', 180), ('parallel', 230)])
+def test_shorter_spans_keep_the_density(mode, span):
+    geo = geometry(mode, circular(span // 2, span))
+    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.06
+
+
+def test_filters_keep_the_density():
+    scan = ellipsoids(geometry(angles=circular(60)), BALL)
+    near = np.linalg.norm(centres(scan.geometry) - BALL[0], axis=-1)
+    for name in WINDOWS:
+        assert abs(fdk(scan, name)[near < 10].mean() / 0.02 - 1) < 0.02, name
+        assert ramp(64, 1.0, name)[-1] <= ramp(64, 1.0)[-1] + 1e-12
+    with pytest.raises(InputError, match='ram-lak'):
+        fdk(scan, 'ramlak')
+
+
+def test_view_weights():
+    full = view_weights(geometry(angles=circular(8)))
+    np.testing.assert_allclose(full, np.pi / 8)
+    np.testing.assert_allclose(view_weights(geometry(angles=circular(8, 180))), np.pi / 8)
+    np.testing.assert_allclose(view_weights(geometry('parallel', circular(8))), np.pi / 8)
+    limited = view_weights(geometry(angles=circular(9, 90)))
+    np.testing.assert_allclose(limited, np.radians(10))
+    np.testing.assert_allclose(view_weights(geometry(angles=[1.0])), np.pi)
+    doubled = view_weights(geometry(angles=np.append(circular(8), 2 * np.pi)))  # the first view twice
+    np.testing.assert_allclose(doubled.sum(), np.pi)
+    np.testing.assert_allclose(doubled[0] + doubled[-1], np.pi / 8)
+    shuffled = np.random.default_rng(0).permutation(8)
+    np.testing.assert_allclose(view_weights(geometry(angles=circular(8)[shuffled])), full)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_matrices_agree_with_the_frames(mode):
+    geo = geometry(mode, circular(5, start=20))
+    ijk = np.random.default_rng(0).integers(0, 28, (20, 3))
+    points = (ijk + 0.5) * geo.dVoxel - np.array(geo.sVoxel) / 2 + geo.offOrigin
+    for view, matrix in enumerate(voxel_matrices(geo)):
+        x, y, w = matrix @ np.c_[ijk, np.ones(20)].T
+        expected = geo.rays().project(points, view)
+        np.testing.assert_allclose((x / w, y / w), expected, rtol=1e-10)
+        out = [np.cos(geo.angles[view]), np.sin(geo.angles[view]), 0]
+        np.testing.assert_allclose(w, 1 - points @ out / 300 if mode == 'cone' else 1, rtol=1e-10)
+
+
+def test_filters_by_tigres_names():
+    for name in 'ram_lak', 'shepp_logan':
+        np.testing.assert_array_equal(ramp(9, 1.0, name), ramp(9, 1.0, name.replace('_', '-')))
+    with pytest.raises(InputError, match='unknown'):
+        ramp(9, 1.0, 'box_car')
+
+
+def test_one_kernel_for_all_views():
+    scan = ellipsoids(geometry(angles=circular(10)), BALL)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        fdk(scan)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len({kernel['hash'] for kernel in history}) == 1 and len(history) == 3
+
+
+def test_fan_beam_of_one_row():
+    geo = geometry(
+        nDetector=(1, 72),
+        nVoxel=(36, 36, 1),
+        dVoxel=(4.0, 4.0, 2.0),
+        offOrigin=(0.0, 0.0, 0.0),
+        offDetector=(0.0, -7.0),
+    )
+    volume = fdk(ellipsoids(geo, (np.array([12.0, -9.0, 0.0]), np.array([25.0, 25.0, 25.0]), 0.02)))
+    near = np.linalg.norm(centres(geo) - [12.0, -9.0, 0.0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.01
+
+
+def test_measured_fan_beam(data):
+    file = data / 'htc2022_fan.npz'
+    if not file.exists():
+        pytest.skip(f'LINGO_MI_DATA holds no {file.name}')
+    data = np.load(file)
+    voxel = 0.1483
+    angles = np.radians(data['angles_deg'][:-1])  # the last view repeats the first
+    geo = Geometry(
+        float(data['DSO']), float(data['DSD']), (1, 560), float(data['dDetector']), (512, 512, 1), voxel, angles
+    )
+    volume = fdk(Scan(geo, data['sinogram_ta'][:-1, None]))[..., 0]
+    reference = data['fbp_ta']
+    assert np.corrcoef(volume.ravel(), reference.ravel())[0, 1] > 0.99
+    disc = reference > 0.7 * reference.max()
+    assert abs(volume[disc].mean() * voxel / reference[disc].mean() - 1) < 0.02

@@ -1,0 +1,87 @@
+"""Peak memory of reconstructions: some volumes and sets of projections, never a matrix or a view's whole history."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.reconstruction.requirements import NEEDS, needed
+
+# Not `resource`, whose maximum begins with that of the process which started this one.
+pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
+
+PROGRAM = """
+import sys
+import numpy as np
+from lingo_mi.runtime import use_variant
+use_variant('llvm_ad_mono')
+import mitsuba as mi
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.reconstruction.asd_pocs import asd_pocs
+from lingo_mi.reconstruction.cgls import cgls
+from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.refined import refined
+from lingo_mi.reconstruction.sart import os_sart, sart, sirt
+from lingo_mi.scan import Scan
+from lingo_mi.projectors.joseph import Joseph
+
+def run(size, pixels, views):
+    geometry = Geometry(1000., 1500., (pixels, pixels), 512 / pixels, (size,) * 3, 256 / size, circular(views))
+    project = Joseph(geometry).forward(mi.Float(np.ones(size ** 3, np.float32)), np.arange(views))[0]
+    scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
+    del project
+    few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
+    {'fdk': lambda: fdk(scan), 'sart': lambda: sart(scan, niter=1), 'os-sart': lambda: os_sart(scan, niter=1),
+     'sirt': lambda: sirt(scan, niter=1), 'cgls': lambda: cgls(scan, niter=1),
+     'asd-pocs': lambda: asd_pocs(scan, niter=1, tviter=2),
+     'refined': lambda: refined(few, 1, 1, 2, completed=scan, sample=lambda _: ramp)}[sys.argv[1]]()
+
+def peak():
+    return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))
+
+run(16, 24, 8)  # libraries and kernels
+before = peak()
+run(*map(int, sys.argv[2:]))
+print(before, peak())
+"""
+
+
+def scanned(size, pixels, views):
+    """The geometry that `PROGRAM` runs."""
+    return Geometry(1000.0, 1500.0, (pixels, pixels), 512 / pixels, (size,) * 3, 256 / size, circular(views))
+
+
+def taken(algorithm, *sizes):
+    """The peak: what libraries and small kernels do not take, over what is expected, and all of it in bytes."""
+    out = subprocess.run(
+        [sys.executable, '-c', PROGRAM, algorithm, *map(str, sizes)], capture_output=True, text=True, check=True
+    ).stdout
+    before, peak = (1024 * int(word) for word in out.split())
+    expected = needed(algorithm, scanned(*sizes), sizes[-1])
+    print(f'{algorithm} {sizes}: {peak / 1e9:.2f} GB, {(peak - before) / expected:.2f} of what is expected')
+    return (peak - before) / expected, peak
+
+
+@pytest.mark.parametrize('algorithm', NEEDS)
+def test_peak_memory_of_small_scans(algorithm):
+    """What `reconstruct.py` goes by. Small ones take up to twice that share, since Dr.Jit keeps some of what is freed."""
+    assert 0.7 < taken(algorithm, 192, 288, 48)[0] < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('algorithm', NEEDS)
+@pytest.mark.parametrize(
+    'sizes', [(400, 576, 12), (400, 128, 12), (96, 1024, 100)], ids=['voxels', 'wide pixels', 'pixels']
+)
+def test_peak_memory_of_one_kind(algorithm, sizes):
+    assert 0.8 < taken(algorithm, *sizes)[0] < 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('algorithm', ['fdk', 'sart', 'cgls', 'asd-pocs', 'refined'])
+def test_peak_memory_of_large_scans(algorithm):
+    """512^3 voxels and 100 views of 1024^2 pixels within 8 GB."""
+    share, peak = taken(algorithm, 512, 1024, 100)
+    assert 0.8 < share < 1.3 and peak < 8e9

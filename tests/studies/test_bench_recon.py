@@ -1,0 +1,50 @@
+"""scripts/bench_recon.py at a few voxels; against RTK where it is installed."""
+
+import json
+import runpy
+import sys
+
+import numpy as np
+import pytest
+
+from helpers.script import FIT
+
+BENCH = FIT.with_name('bench_recon.py')
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch, capsys):
+    def run(*args, missing=()):
+        for name in missing:
+            monkeypatch.setitem(sys.modules, name, None)
+        monkeypatch.setattr(sys, 'argv', [str(BENCH), *args, '--json', str(tmp_path / 'a.json')])
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(BENCH), run_name='__main__')
+        return stop.value.code, capsys.readouterr(), tmp_path / 'a.json'
+
+    return run
+
+
+def test_without_peers(bench):
+    code, said, path = bench('--size', '16', '--views', '6', '--repeats', '2', missing=('itk', 'diffct'))
+    assert code == 0 and 'RTK: not installed' in said.out and 'diffct: not installed' in said.out
+    found = json.loads(path.read_text())['operations']
+    assert list(found) == ['projector', 'transpose', 'FDK', 'SART']
+    assert all(list(x) == ['ours'] and x['ours']['seconds'] > 0 for x in found.values())
+
+
+def test_against_rtk(bench):
+    itk = pytest.importorskip('itk', reason="RTK is not installed: pip install -e '.[reference]'")
+    if not hasattr(itk, 'RTK'):
+        pytest.skip("ITK has no RTK: pip install -e '.[reference]'")
+    code, said, path = bench('--size', '48', '--views', '24', '--repeats', '1', missing=('diffct',))
+    assert code == 0, said.err
+    for operation, tolerance in dict(projector=1e-5, transpose=0.005, FDK=0.005, SART=0.3).items():
+        theirs = json.loads(path.read_text())['operations'][operation]['RTK']
+        assert 0 < theirs['deviation'] < tolerance and np.isfinite(theirs['ratio'])
+
+
+@pytest.mark.parametrize('args', [('--size', '4'), ('--views', '0'), ('--repeats', '0')])
+def test_bad_input(bench, args):
+    code, said, path = bench(*args)
+    assert code == 2 and said.err.startswith('error: ') and said.err.count('\n') == 1 and not path.exists()

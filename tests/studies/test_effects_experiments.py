@@ -1,0 +1,40 @@
+"""The experiments of what modelling an effect is worth: one of them, tiny, and what is written about it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.studies.effects import EXPERIMENTS, FITS, SCENES, SETTINGS, measure, quality, write
+
+TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12')
+
+
+def test_every_experiment_has_its_scene():
+    assert set(EXPERIMENTS) == {path.stem for path in SCENES.glob('*.xml')}
+    with pytest.raises(InputError, match='no experiment'):
+        measure('rain')
+
+
+def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
+    truth = np.random.default_rng(0).random((4, 5, 6))
+    found = quality(0.9 * truth, truth)
+    assert found['psnr_3d_gain'] > 200
+    np.testing.assert_allclose(found['psnr_3d'], 10 * np.log10(truth.max() ** 2 / (0.01 * (truth**2).mean())))
+
+
+def test_an_experiment(tmp_path):
+    """Of the blur: three fits that differ, and the table and picture of them."""
+    result = measure('psf', TINY, SETTINGS.changed(iterations=12))
+    volumes = [result[kind]['volume'] for kind in FITS]
+    assert all(v.shape == (16, 16, 16) and np.isfinite(v).all() for v in volumes)
+    assert not np.allclose(volumes[0], volumes[1]) and not np.allclose(volumes[1], volumes[2])
+    document = tmp_path / 'effects.md'
+    document.write_text('<!-- table worth -->\n<!-- end worth -->\n')
+    write({'psf': result}, tmp_path, tmp_path / 'figures', document)
+    assert f'{result["model"]["psnr_3d"]:.2f}' in document.read_text()
+    assert (
+        json.loads((tmp_path / 'effects.json').read_text())['psf']['ignore']['psnr_3d'] == result['ignore']['psnr_3d']
+    )
+    assert (tmp_path / 'figures' / 'psf.png').stat().st_size > 10_000

@@ -1,0 +1,328 @@
+"""Hard cases: line integrals and voxels where float32 is pressed, any cloud in any geometry, and fits on bad data."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from helpers import hard_cases, oracle
+from helpers.hard_cases import adversarial, check, errors, fit_to, host, on_device, run, scanner, weights_of
+from helpers.oracle import Cloud, Pose, random_cloud, relative
+from lingo_mi.errors import AccuracyWarning
+from lingo_mi.fit.densify import clone, densify, halve, split
+from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.loss_scale import loss_scale, otsu
+from lingo_mi.fit.losses import combined, ssim
+from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.state import activate, inverse_scale, inverse_softplus, softplus, start
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.lingo.masks import Masks, masks
+from lingo_mi.lingo.otsu import otsu as otsu_of_paper
+from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
+from lingo_mi.metrics import ssim_map
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.view import View, vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+
+CASES = hard_cases.cases()
+
+
+@pytest.mark.parametrize('case', CASES, ids=lambda case: case.name)
+def test_case(case):
+    check(case)
+
+
+def test_table():
+    named = {case.name: case for case in CASES}
+    assert len(named) == len(CASES)
+    chosen = [named[name] for name in ('density 0, cone', 'zero quaternion', 'needle 1:5e6')]
+    text = hard_cases.markdown([(case, hard_cases.measure(case)) for case in chosen])
+    lines = [line for line in text.splitlines() if line.startswith('|')]
+    assert len(lines) == 5 and len({line.count('|') for line in lines}) == 1
+    assert 'refused: Gaussian 0' in lines[3] and 'warned: the scales' in lines[4]
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize(
+    'name, value',
+    [
+        ('centre', [0, np.nan, 0]),
+        ('scale', [0.1, 0, 0.1]),
+        ('scale', [0.1, np.nan, 0.1]),
+        ('rotation', [0, 0, 0, 0]),
+        ('rotation', [0, 0, np.nan, 1]),
+        ('density', np.nan),
+        ('density', np.inf),
+    ],
+)
+def test_a_gaussian_that_is_no_number_is_never_skipped(mode, name, value):
+    """Who calls the projector directly gets an image that is none; scenes are refused by name (above)."""
+    frames, shape = scanner(mode)
+    cloud = random_cloud(np.random.default_rng(0), 5)
+    values = getattr(cloud, name).copy()
+    values[2] = value
+    cloud = cloud.changed(**{name: values})
+    image, _ = run(cloud, frames, shape, weights_of(shape))
+    assert not np.isfinite(image).any()
+    grid = Grid(vector64([-1, -1, -1]), vector64([0.2] * 3), (10, 10, 10))
+    assert not np.isfinite(voxelize(*on_device(cloud), grid, 3.0).numpy()).any()
+
+
+@pytest.mark.parametrize('model', ['affine', 'area'])
+def test_models_that_do_not_reach_a_gaussian_on_the_panel(model):
+    frames, shape = scanner()
+    on_panel = Cloud(-0.5 * frames.source, [[0.02] * 3], [[0, 0, 0, 1]], [1.0])
+    with pytest.warns(AccuracyWarning, match='1 Gaussians reach to the source or the panel'):
+        line_integrals(*on_device(on_panel), View.of(frames, 0, *shape), **{model: True})
+
+
+@pytest.mark.parametrize('side, sigma', [(33, 1.0), (513, 0.1)])
+def test_a_pile_of_gaussians_is_summed_as_accurately_as_one(side, sigma):
+    """However small, and wherever in the order of the cloud."""
+    count = 20_000
+    frames, shape = scanner(shape=(side, side), size=(3.2, 3.2))
+    one = Cloud([[0, 0, 0]], [[sigma * 3.2 / side / 1.5] * 3], [[0.1, 0.2, 0.3, 0.9]], [0.7])
+    away = one.changed(centre=np.array([[0, 0, 0.3]]))
+    view = View.of(frames, 0, *shape)
+
+    def image(copies):
+        parts = [[x[np.zeros(copies, int)] for x in (c.centre, c.scale, c.rotation, c.density)] for c in (one, away)]
+        cloud = Cloud(*(np.stack(pair, 1).reshape(-1, *pair[0].shape[1:]) for pair in zip(*parts)))
+        return line_integrals(*on_device(cloud), view).numpy().astype(float)
+
+    assert relative(image(count), count * image(1)) < 3e-6
+
+
+def test_a_pile_of_gaussians_in_voxels():
+    count, grid = 20_000, Grid(vector64([-1, -1, -1]), vector64([0.1] * 3), (20, 20, 20))
+    one = Cloud([[0.03, 0.02, -0.01]], [[0.03, 0.05, 0.04]], [[0.1, 0.2, 0.3, 0.9]], [0.7])
+    found, expected = (voxelize(*on_device(one[np.zeros(n, int)]), grid, 4.0, deep=True).numpy() for n in (count, 1))
+    assert relative(found, count * expected.astype(float)) < 3e-6
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Any cloud in any geometry
+# ------------------------------------------------------------------------------------------------------------
+
+
+def number(low, high):
+    return st.floats(low, high)
+
+
+def vectors(low, high, size):
+    return st.lists(number(low, high), min_size=size, max_size=size)
+
+
+@st.composite
+def clouds(draw):
+    """One to four Gaussians in and around [-1, 1]^3, scales from 1e-4 to 2, aspects up to 2e4, densities of either sign;
+    or the first of them, as often."""
+    n = draw(st.integers(1, 4))
+    rows = [
+        (
+            draw(vectors(-1.5, 1.5, 3)),
+            draw(vectors(-4, 0.3, 3)),
+            draw(vectors(-1, 1, 4)),
+            draw(number(-3, 3)),
+            draw(number(-6, 3)),
+        )
+        for _ in range(n)
+    ]
+    centre, scale, rotation, length, density = (np.array(column, float) for column in zip(*rows))
+    norm = np.linalg.norm(rotation, axis=1, keepdims=True)
+    assume(norm.min() > 1e-2)
+    sign = draw(st.sampled_from([1, -1]))  # one for all: where they cancel, there is nothing to compare with
+    cloud = Cloud(centre, 10**scale, rotation / norm * 10 ** length[:, None], sign * 10**density)
+    return cloud[np.zeros(n, int)] if draw(st.booleans()) else cloud
+
+
+@st.composite
+def views(draw):
+    """A view of a cone or a parallel beam with offsets, tilted and turned, pixels up to 100 times as long as wide."""
+    shape = draw(st.sampled_from([(7, 10), (12, 5), (1, 16), (9, 1)]))
+    height, width = draw(number(0.05, 3)), draw(number(0.05, 3))
+    mode, DSO = draw(st.sampled_from(['cone', 'parallel'])), draw(number(2, 50))
+    geometry = Geometry.per_view(
+        DSO=DSO,
+        DSD=DSO * draw(number(1, 2)),
+        nDetector=shape,
+        dDetector=(height / shape[0], width / shape[1]),
+        nVoxel=8,
+        dVoxel=0.25,
+        angles=np.radians([draw(number(0, 360))]),
+        mode=mode,
+        offDetector=draw(vectors(-0.7, 0.7, 2)),
+        tilt=draw(number(-0.5, 0.5)),
+        rotDetector=draw(vectors(-0.3, 0.3, 3)),
+    )
+    return geometry.rays(), shape, draw(st.booleans()), draw(number(8, 12))
+
+
+def compare(cloud, view):
+    frames, shape, panel, extent = view
+    weights, pose = weights_of(shape), Pose.of(frames, 0, *shape)
+    ends = (-np.inf, np.inf) if pose.parallel else (0.0, 1.0 if panel else np.inf)
+    image, gradients = run(cloud, frames, shape, weights, panel, extent)
+    result = errors(
+        cloud,
+        image,
+        gradients,
+        oracle.line_integrals(cloud, pose, *ends),
+        oracle.gradients(cloud, pose, weights, *ends),
+    )
+    # Of a far tail float32 knows the exponent, 25 or more, to its last digit only; its derivatives magnify that.
+    assert result.image <= 1e-5 and max(result.gradients.values()) <= 2e-4, result
+
+
+COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None)
+settings.register_profile('ci', max_examples=200, **COMMON)
+settings.register_profile('nightly', max_examples=10_000, **COMMON)
+
+
+@settings(settings.get_profile('ci'))
+@given(clouds(), views())
+def test_any_cloud_in_any_view(cloud, view):
+    compare(cloud, view)
+
+
+@pytest.mark.slow
+@settings(settings.get_profile('nightly'))
+@given(clouds(), views())
+def test_any_cloud_in_any_view_at_length(cloud, view):
+    compare(cloud, view)
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Fits
+# ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_long_fit_of_bad_data_ends_finite():
+    fit_to(adversarial(), 10_000)
+
+
+SETTINGS = Settings(densify_threshold=1e-3, split_size=0.15)
+
+
+def coincident(n=8):
+    state = start(np.zeros((n, 3)), np.where(np.arange(n) % 2, 0.1, 0.3), np.full(n, 0.5), SETTINGS)
+    state.gradient[:], state.seen[:] = 1, 1
+    return state
+
+
+def mass(state):
+    _, scale, _, density = activate(state, SETTINGS)
+    return (density * scale.prod(1)).sum()
+
+
+def test_coincident_gaussians_densify():
+    state = coincident()
+    after = densify(state, SETTINGS, np.ones(3), np.random.default_rng(0))
+    assert len(after) == 16 and all(np.isfinite(v).all() for v in after.values.values())
+    everyone = np.ones(8, bool)
+    assert abs(mass(clone(state, everyone)) / mass(state) - 1) < 1e-5
+    assert abs(mass(halve(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
+    halves = split(state, everyone, SETTINGS, np.random.default_rng(0))
+    assert len(np.unique(halves.values['centre'], axis=0)) == 16  # drawn from their parents, so no longer at one place
+
+
+@pytest.mark.parametrize('value', [0.0, 0.004, 0.02, 0.9])
+def test_dynamic_scale_at_its_corner(value):
+    """T_g + 1 / (4 T_g) with T_g = max(0.01, Otsu) is a constant to the derivative, on either side of the corner."""
+    image, truth = mi.Float([value, value * 0.5, value, value * 0.5]), mi.Float([0.1, 0.2, 0.3, 0.4])
+    dr.enable_grad(image)
+    factor = loss_scale(image)
+    threshold = max(0.01, otsu(image)[0])
+    assert abs(factor[0] - (threshold + 0.25 / threshold)) < 1e-5 * factor[0] and not dr.grad_enabled(factor)
+    assert factor[0] <= 25.01 * (1 + 1e-6)
+    dr.backward(dr.sum(dr.abs(image - truth)) * factor)
+    np.testing.assert_allclose(dr.grad(image).numpy(), factor[0] * np.sign(image.numpy() - truth.numpy()), rtol=1e-6)
+
+
+@pytest.mark.parametrize('a, b', [(0, 0), (0.5, 0.5), (0, 0.5), (0.3, 0.5), (1e4, 1e4), (1e4, 0), (0, 1e-20)])
+def test_ssim_of_constant_images(a, b):
+    shape = 20, 25
+    image, truth = (dr.full(mi.Float, x, shape[0] * shape[1]) for x in (a, b))
+    dr.make_opaque(image, truth)
+    dr.enable_grad(image)
+    value = ssim(image, truth, *shape)
+    assert abs(value[0] - ssim_map(np.full(shape, float(a)), np.full(shape, float(b))).mean()) < 1e-5
+    dr.backward(value + combined(image, truth, *shape))
+    assert np.isfinite(dr.grad(image).numpy()).all()
+    if a == b:
+        assert abs(value[0] - 1) < 1e-6 and np.abs(dr.grad(image).numpy()).max() < 1e-6
+
+
+def raw_state(scale=0.0, density=0.0, rotation=(0, 0, 0, 1)):
+    state = start(np.zeros((2, 3)), np.full(2, 0.1), np.ones(2), SETTINGS)
+    state.values['scale'][:], state.values['density'][:], state.values['rotation'][:] = scale, density, rotation
+    return state
+
+
+@pytest.mark.parametrize('raw', [-1e30, -1e4, -90, -20, 0, 20, 90, 1e4, 1e30])
+def test_activations_at_both_ends(raw):
+    """Finite values within their bounds and finite derivatives, the same on the host and on the device."""
+    state = raw_state(scale=raw, density=raw)
+    with np.errstate(over='ignore'):
+        _, scale, _, density = activate(state, SETTINGS)
+    device = DeviceState(state)
+    dr.enable_grad(list(device.values.values()))
+    _, scale_there, _, density_there = device.gaussians(SETTINGS)
+    assert np.all((scale >= SETTINGS.scale_min) & (scale <= SETTINGS.scale_max)) and np.isfinite(density).all()
+    np.testing.assert_allclose(np.array(scale_there).T, scale, rtol=2e-6)
+    np.testing.assert_allclose(density_there.numpy(), density, rtol=2e-6, atol=1e-7)
+    dr.backward(dr.sum(scale_there.x) + dr.sum(density_there))
+    slopes = [host(dr.grad(device.values[k])) for k in ('scale', 'density')]
+    assert all(np.isfinite(s).all() and (s >= 0).all() for s in slopes)
+
+
+def test_inverses_at_both_ends():
+    y = np.array([0, 1e-300, 1e-30, 1e-7, 1, 700, 1e8])
+    np.testing.assert_allclose(softplus(inverse_softplus(y)), np.maximum(y, 1e-30), rtol=1e-12)
+    low, high = SETTINGS.scale_min, SETTINGS.scale_max
+    inner = np.array([low * (1 + 1e-6), low * 1.5, 0.5, high * (1 - 1e-6)])
+    raw = inverse_scale(inner, low, high)
+    np.testing.assert_allclose(low + (high - low) / (1 + np.exp(-raw)), inner, rtol=1e-9)
+
+
+@pytest.mark.parametrize('length', [1e-14, 1e-7, 1e7, 1e14])
+def test_length_of_a_quaternion_does_not_matter(length):
+    """Only its own derivative is the other way round, so that a step of Adam is no danger near zero."""
+    frames, shape = scanner()
+    cloud, weights = random_cloud(np.random.default_rng(1), 4), weights_of(shape)
+    cloud = cloud.changed(rotation=cloud.rotation / np.linalg.norm(cloud.rotation, axis=1, keepdims=True))
+    image, gradients = run(cloud, frames, shape, weights)
+    scaled, scaled_gradients = run(cloud.changed(rotation=length * cloud.rotation), frames, shape, weights)
+    np.testing.assert_allclose(scaled, image, rtol=1e-4, atol=1e-6 * image.max())
+    size = np.abs(gradients['rotation']).max()
+    np.testing.assert_allclose(length * scaled_gradients['rotation'], gradients['rotation'], atol=1e-5 * size)
+
+
+@pytest.mark.parametrize('value', [-1.0, 0.0, 1e-30, 0.3, 1e30])
+def test_otsu_of_flat_images(value):
+    image = np.full((6, 7), value, np.float32)
+    assert otsu_of_paper(image) == image[0, 0] == otsu(mi.Float(image.ravel()))[0]
+    if value >= 0:
+        found = masks(image[None])
+        assert not found.high.any()
+
+
+@pytest.mark.parametrize('full, expected', [(False, 0.0), (True, 1.0)])
+def test_voxel_scaling_at_the_ends_of_occupancy(full, expected):
+    geometry = Geometry(
+        DSO=5.0, DSD=7.0, nDetector=(40, 40), dDetector=0.2, nVoxel=32, dVoxel=0.0625, angles=circular(4)
+    )
+    everywhere = np.full((4, 40, 40), full)
+    P = occupancy(
+        geometry.normalised_rays(),
+        Masks(everywhere, everywhere, np.zeros(4), np.zeros(4)),
+        geometry.half,
+        geometry.nVoxel,
+    )
+    assert P == expected
+    S = scale_factor(P)
+    assert S == (20 if full else 1)
+    assert scaled_grid(geometry.nVoxel, S) == ((8, 8, 8) if full else (32, 32, 32))

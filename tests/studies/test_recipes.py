@@ -1,0 +1,78 @@
+"""Which fits scripts/recipes.py runs, and which results it takes for them; the fits themselves are not run."""
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from helpers.script import FIT
+
+METRICS = dict(
+    psnr_2d=30.0,
+    psnr_2d_r2=29.0,
+    ssim_2d=0.9,
+    psnr_3d=25.0,
+    ssim_3d=0.8,
+    ipsd=0.02,
+    ipsd_targets=10,
+    gaussians=100,
+    iterations=7,
+    seconds_init=0.1,
+    seconds_fit=2.0,
+    history=[dict(seconds=1.0, psnr_2d=20.0, psnr_3d=15.0)],
+)
+
+
+@pytest.fixture
+def recipes(monkeypatch, capsys, tmp_path):
+    """Exit code, standard output and standard error of `recipes.py a.xml ARGS`."""
+
+    def call(*args):
+        monkeypatch.setattr(sys, 'argv', ['recipes.py', 'a.xml', '--out', str(tmp_path), *args])
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(FIT.with_name('recipes.py')), run_name='__main__')
+        return stop.value.code, *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """The commands of the fits that were asked for; each ends at once."""
+    commands = []
+
+    def fit(command, **_):
+        commands.append(command[2:])
+        out = Path(command[command.index('--out') + 1])
+        out.mkdir(parents=True)
+        (out / 'metrics.json').write_text(json.dumps(METRICS))
+        return mock.Mock(returncode=0)
+
+    monkeypatch.setattr(subprocess, 'run', fit)
+    return commands
+
+
+def test_a_fit_of_other_settings_is_another(recipes, fits, tmp_path):
+    def asked(*args):
+        fits.clear()
+        code, text, err = recipes(*args)
+        assert code == 0 and '| a |' in text, err
+        return [[word for flag, word in zip(command, command[1:]) if flag == '-D'] for command in fits]
+
+    assert asked('--methods', 'r2', 'fast') == [['iterations=5000'], []]
+    assert asked('--methods', 'r2', 'fast') == []
+    assert asked('--methods', 'r2', '--iterations', '7') == [['iterations=7']]
+    assert asked('--methods', 'r2:iterations=9,V_S=1', '-D', 'pixels=8') == [['pixels=8', 'iterations=9', 'V_S=1']]
+    assert asked('--methods', 'r2', '-D', 'iterations=9') == [['iterations=9']]
+    assert asked('--methods', 'r2', '--views', '3') == [['iterations=5000']]
+    assert (tmp_path / 'recipes.png').exists()
+
+
+@pytest.mark.parametrize('method', ['nerf', 'r2:V=1', 'r2:V_S'])
+def test_bad_methods(recipes, fits, method):
+    code, _, err = recipes('--methods', 'r2', method)
+    assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not fits
