@@ -1,51 +1,7 @@
 #!/usr/bin/env python3
-"""Check the derivatives of a scene's image against differences: a table of AD, differences and their relative error.
+"""Check the derivatives of a scene's image against differences: a table of AD, differences and their relative error. The same as `lingo-mi gradcheck`."""
 
-    python scripts/gradcheck.py scenes/gaussians.xml
-    python scripts/gradcheck.py my_scene.xml -n 20 --variant llvm_ad_rgb
-
-The exit code is 1 where an error is above 1e-4, and 2 for a scene that cannot be checked.
-"""
-
-import argparse
-
-from lingo_mi.cli.common import Parser, guard
-from lingo_mi.runtime import use_variant
-
-
-def arguments():
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray')
-    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
-    p.add_argument(
-        '--step',
-        type=float,
-        default=1e-4,
-        metavar='H',
-        help="of the differences, in parts of a Gaussian's smallest standard deviation (default: 1e-4)",
-    )
-    p.add_argument(
-        '-n',
-        dest='count',
-        type=int,
-        default=4,
-        metavar='COUNT',
-        help='Gaussians of every cloud and voxels of every grid to check, drawn at random (default: 4)',
-    )
-    return p.parse_args()
-
-
-def main():
-    args = arguments()
-    use_variant(args.variant)
-    from lingo_mi.studies.gradients import TOLERANCE, check, load, table
-
-    rows = check(load(args.scene), args.step, args.count)
-    worst = max(row.error for row in rows)
-    print(table(rows))
-    print(f'largest error {worst:.1e}, tolerance {TOLERANCE:.0e}')
-    return int(not worst <= TOLERANCE)
-
+from lingo_mi.cli import run
 
 if __name__ == '__main__':
-    guard(main)
+    run('gradcheck')

@@ -20,10 +20,10 @@ from lingo_mi.projectors.objects import find_objects
 from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import render_objects, take_scan
 from lingo_mi.studies.accuracy.report import insert, table
 
-SCENES = Path(__file__).resolve().parents[1] / 'scenes' / 'effects'
 # Small, so that a fit takes about a minute.
 SETTINGS = FAST.changed(iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
 FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
@@ -118,7 +118,7 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
 def scans(name: str, parameters: dict, seed: int) -> dict:
     """A clean scan of an experiment's scene, a scan with its effect, and the truth [x, y, z], None where the grid is not the
     object's own."""
-    experiment, loaded = EXPERIMENTS[name], load_scene(SCENES / f'{name}.xml', parameters)
+    experiment, loaded = EXPERIMENTS[name], load_scene(scene_path(f'effects/{name}'), parameters)
     dataset = take_scan(loaded, seed=seed)
     scan, objects = dataset.train, find_objects(loaded.scene)
     clean = Scan(scan.geometry, render_objects(objects, scan.geometry))

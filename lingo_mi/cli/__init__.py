@@ -1,1 +1,49 @@
-"""The command line: one module a command, and what they share (`common`)."""
+"""The command line: `lingo-mi COMMAND`, one module a command, and what they share (`common`)."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+from lingo_mi.cli.common import guard
+
+# In the order of the help: command -> what it does.
+COMMANDS = {
+    'fit': 'fit a cloud of 3D Gaussians to a scan; makes a volume and new views',
+    'reconstruct': 'reconstruct a volume on voxels: FDK, SART, ASD-POCS and others',
+    'phantom': 'make a test object and a scan of it',
+    'gradcheck': "check the derivatives of a scene's image against differences",
+    'recipes': 'compare recipes: quality against time',
+    'tables': "regenerate the paper's tables",
+    'accuracy': 'measure what accuracy costs in time',
+    'hard-cases': 'measure the hard cases: needles, grazing rays, coincident Gaussians',
+    'effects': 'measure what modelling the effects of a real detector is worth',
+    'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
+    'bench-recon': 'time reconstruction on voxels against other packages',
+}
+
+
+def run(command: str):
+    """Run one command with the arguments in `sys.argv`, and exit."""
+    module = importlib.import_module(f'lingo_mi.cli.{command.replace("-", "_")}')
+    guard(module.main)
+
+
+def main():
+    """The console command `lingo-mi`."""
+    wanted = sys.argv[1] if len(sys.argv) > 1 else '--help'
+    if wanted in ('-h', '--help'):
+        width = max(map(len, COMMANDS))
+        print('usage: lingo-mi COMMAND ...   (lingo-mi COMMAND --help)\n')
+        print('\n'.join(f'  {name:{width}s}  {what}' for name, what in COMMANDS.items()))
+        return
+    if wanted == '--version':
+        from lingo_mi import __version__
+
+        print(f'lingo_mi {__version__}')
+        return
+    if wanted not in COMMANDS:
+        print(f'error: there is no command {wanted!r}: use one of {", ".join(COMMANDS)}', file=sys.stderr)
+        sys.exit(2)
+    sys.argv[:2] = [f'lingo-mi {wanted}']
+    run(wanted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 import warnings
 from pathlib import Path
@@ -45,9 +46,18 @@ def guard(main) -> None:
         sys.exit(130)
 
 
+def command_line(*options: str, without=()) -> str:
+    """The command that runs now, to be typed again: with further options, and without some."""
+    program = f'python {sys.argv[0]}' if sys.argv[0].endswith('.py') else sys.argv[0]
+    return ' '.join([program, shlex.join([*(a for a in sys.argv[1:] if a not in without), *options])])
+
+
 def input_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say what is scanned: scene, --projections, --volume and what goes with them."""
-    parser.add_argument('scene', help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml')
+    parser.add_argument(
+        'scene',
+        help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml, or the name of a shipped one, x3d_foot',
+    )
     parser.add_argument(
         '--projections',
         metavar='F',

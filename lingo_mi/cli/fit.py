@@ -1,0 +1,128 @@
+"""Fit a cloud of 3D Gaussians to a CT scan, and make a volume and new views of it.
+
+    python scripts/fit.py scenes/x3d_foot.xml
+    python scripts/fit.py scenes/x3d_foot.xml --method lingo --views 25 --iterations 5000
+    python scripts/fit.py scenes/chest.xml --volume my_ct.nii.gz --views 25
+    python scripts/fit.py scenes/x3d_foot.xml --projections foot_50.pickle
+
+The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
+measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a
+volume in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and
+metrics.json. The baselines 3dgs and xgaussian make neither volume nor scene.
+"""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import (
+    Parser,
+    check_input,
+    command_line,
+    definitions,
+    input_arguments,
+    read_input,
+    writable_folder,
+)
+from lingo_mi.errors import InputError
+from lingo_mi.fit.settings import METHODS
+from lingo_mi.interrupts import between_steps
+from lingo_mi.runtime import use_variant
+from lingo_mi.scene.shipped import scene_path
+
+
+def arguments():
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    input_arguments(p)
+    p.add_argument(
+        '--method',
+        choices=METHODS,
+        default='fast',
+        help='recipe: fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
+        'composite opacities and make views but no volume',
+    )
+    p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
+    p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
+    p.add_argument(
+        '--init',
+        choices=('lingo', 'r2', 'random', 'cuboid'),
+        help='initial cloud: Otsu masks (lingo) or an FDK '
+        'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid)',
+    )
+    p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')
+    p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
+    p.add_argument('--force', action='store_true', help='replace an earlier result')
+    p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    p.add_argument(
+        '-D',
+        dest='define',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='any setting of the fit (see lingo_mi.fit.settings), or a parameter of the scene file',
+    )
+    return p.parse_args()
+
+
+def main():
+    args = arguments()
+    use_variant(args.variant)
+    from lingo_mi.fit.checkpoint import CHECKPOINT, METRICS
+    from lingo_mi.fit.initial import initial_cloud
+    from lingo_mi.fit.loop import run
+    from lingo_mi.progress import Progress
+    from lingo_mi.results.measure import quick_measure, summary
+    from lingo_mi.results.save import write_results
+    from lingo_mi.scene.load import defaults, load_scene
+
+    check_input(args)
+    if args.seed < 0:
+        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    defined = definitions(args.define)
+    args.scene = scene_path(args.scene)
+    own = defaults(args.scene)  # a name of the scene goes before a setting's
+    given = {k: v for k, v in defined.items() if k not in own}
+    options = {k: v for k, v in (('iterations', args.iterations), ('init', args.init)) if v is not None}
+    if twice := given.keys() & options.keys():
+        raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
+    given |= options
+    unknown = [k for k in given if not hasattr(METHODS[args.method], k)]
+    if unknown:
+        names = ', '.join(sorted(own)) or 'it has none'
+        raise InputError(
+            f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit '
+            '(see lingo_mi/fit/settings.py)'
+        )
+    settings = METHODS[args.method].changed(**given)
+    folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
+
+    if args.resume and not (folder / CHECKPOINT).exists():
+        raise InputError(f'{folder / CHECKPOINT}: there is no checkpoint to resume from; run without --resume')
+    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
+    scan = read_input(args, scene, args.views, args.seed)
+    cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
+    with Progress('Fit', settings.iterations) as bar, between_steps() as check:
+
+        def progress(iteration, **fields):
+            bar.update(iteration, **fields)
+            check()
+
+        try:
+            fit = run(
+                scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT, args.resume
+            )
+        except KeyboardInterrupt:
+            again = command_line('--resume', without=('--resume', '--force'))
+            raise KeyboardInterrupt(f'go on with  {again}') from None
+    result = write_results(
+        folder,
+        fit,
+        scan,
+        title=Path(args.volume or args.projections or scene.name).name,
+        method=args.method,
+        seed=args.seed,
+        command=command_line(),
+    )
+    print(summary(result))
+    written = ('report.html', 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'metrics.json')
+    print(f'{folder}/: {", ".join(name for name in written if (folder / name).exists())}')

@@ -1,0 +1,119 @@
+"""Regenerate the paper's tables: new views, CT reconstruction in two stages, and the parts of LINGO.
+
+    python scripts/tables.py views
+    python scripts/tables.py ct --objects foot chest --views 25
+    python scripts/tables.py ablation --scale paper
+
+Objects are the phantoms foot and chest and the volumes aneurism, engine, teapot, tooth, chest_lidc0314, abdomen_ts, aorta_ts,
+head_fsrt and jaw_fsrt, as NAME.nii.gz in the folder that LINGO_MI_DATA names; those that are missing are skipped.
+
+Scale small has 96 voxels and 192 pixels a side, fits of 5000 iterations from 5, 10 and 25 views, and of the objects foot, chest,
+engine and aneurism. It takes a night on two cores: 5 hours for views and ct together, by the times stored in their cells, and 1
+more for the ablation; half an hour (aneurism) to two hours (chest) an object. Scale paper has the paper's 256 voxels, 512 pixels
+and 30,000 iterations, and all objects; it is meant for a GPU.
+
+Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
+tables use what is there. The table, as Markdown and JSON, is renewed after every one of them.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser, writable_folder
+from lingo_mi.errors import InputError
+from lingo_mi.fit.settings import METHODS, settings_of
+from lingo_mi.runtime import use_variant
+
+ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer'
+PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
+
+
+def arguments():
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('table', choices=('views', 'ct', 'ablation'))
+    p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: those of the scale)')
+    p.add_argument('--views', nargs='+', type=int, metavar='N', help='fitted, of 50 (default: 5 10 25; ablation: 25)')
+    p.add_argument(
+        '--iterations',
+        nargs='+',
+        type=int,
+        metavar='N',
+        help='of the fits; ct and ablation take the largest (default: small 5000, paper 5000 15000 30000)',
+    )
+    p.add_argument(
+        '--methods',
+        nargs='+',
+        default=list(PUBLISHED),
+        metavar='METHOD[:name=value,...]',
+        help=f'columns of views and ct: any of {", ".join(METHODS)}, with settings that differ (default: '
+        f'{" ".join(PUBLISHED)}, as in the paper)',
+    )
+    p.add_argument(
+        '--algorithms',
+        nargs='+',
+        choices=ALGORITHMS,
+        default=list(ALGORITHMS[:-1]),
+        metavar='A',
+        help=f'rows of ct, of {", ".join(ALGORITHMS)} (default: all but the last)',
+    )
+    p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')
+    p.add_argument(
+        '--finer',
+        type=int,
+        default=1,
+        metavar='N',
+        help='scan N times as many voxels along each side, where an '
+        'object has them, so that projections hold what the voxels cannot (default: 1)',
+    )
+    p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
+    p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<scale>)')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    return p.parse_args()
+
+
+def main():
+    args = arguments()
+    use_variant(args.variant)
+    from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells, available
+    from lingo_mi.studies.tables.report import groups, plan, write
+
+    scale = replace(SCALES[args.scale], finer=args.finer)
+    views = sorted(set(args.views or ((25,) if args.table == 'ablation' else (5, 10, 25))))
+    iterations = sorted(set(args.iterations or scale.iterations))
+    if views[0] < 1 or views[-1] > SCANNED:
+        raise InputError(f'--views must be from 1 to {SCANNED}, not {" ".join(map(str, views))}')
+    if iterations[0] < 1:
+        raise InputError(f'--iterations must be at least 1, not {iterations[0]}')
+    if args.seed < 0:
+        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if args.finer < 1:
+        raise InputError(f'--finer must be at least 1, not {args.finer}')
+    for method in args.methods:
+        settings_of(method)
+    objects = available(dict.fromkeys(args.objects or scale.objects), print)
+    folder = writable_folder(args.out or Path('out/tables') / args.scale, True, True, '')
+    cells = Cells(folder, scale, args.seed)
+    rows = groups(args.table, views, iterations, args.methods, args.algorithms)
+    planned = plan(rows, objects)
+    if not planned:
+        raise InputError(
+            f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
+            'are no densities; add other --algorithms or --methods'
+        )
+    missing = [cell for cell in planned if cells.get(cell) is None]
+    failed = {}
+    try:
+        for i, cell in enumerate(missing, 1):
+            try:
+                cells.compute(cell, f'[{i}/{len(missing)}] {cell}')
+            except InputError as error:  # of one cell: the others are worth having
+                failed[cell] = error
+            write(args.table, rows, objects, cells, args.scale)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt('the same command goes on from here') from None
+    print(write(args.table, rows, objects, cells, args.scale))
+    print(f'{cells.folder}/: {args.table}.md, {args.table}.json')
+    if failed:
+        cell, error = next(iter(failed.items()))
+        raise InputError(f'{len(failed)} of {len(missing)} cells failed, the first one ({cell}): {error}')

@@ -1,0 +1,28 @@
+"""The scenes that come with the package, by name."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from lingo_mi.errors import InputError
+
+
+def scenes() -> dict[str, Path]:
+    """Path of every shipped scene by name, such as 'x3d_foot' or 'effects/psf'."""
+    root = Path(str(resources.files('lingo_mi.scenes')))
+    return {path.relative_to(root).with_suffix('').as_posix(): path for path in sorted(root.rglob('*.xml'))}
+
+
+def scene_path(scene) -> Path:
+    """The file of a scene: `scene` itself if there is such a file, else the shipped scene of that name.
+
+    Raises InputError where there is neither.
+    """
+    path = Path(scene)
+    if path.exists():
+        return path
+    known = scenes()
+    if str(scene) in known:
+        return known[str(scene)]
+    raise InputError(f'{scene}: there is no such scene; name a file, or one of {", ".join(sorted(known))}')
