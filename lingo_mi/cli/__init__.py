@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from importlib.metadata import version
 
 from lingo_mi.cli.common import guard
 
@@ -38,9 +39,7 @@ def main():
         print('\n'.join(f'  {name:{width}s}  {what}' for name, what in COMMANDS.items()))
         return
     if wanted == '--version':
-        from lingo_mi import __version__
-
-        print(f'lingo_mi {__version__}')
+        print(f'lingo_mi {version("lingo_mi")}')
         return
     if wanted not in COMMANDS:
         print(f'error: there is no command {wanted!r}: use one of {", ".join(COMMANDS)}', file=sys.stderr)
