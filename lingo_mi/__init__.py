@@ -1,8 +1,22 @@
 """Sparse-view X-ray CT with 3D Gaussians: exact line integrals in Mitsuba 3 / Dr.Jit.
 
-`import lingo_mi` and `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba. The geometry, image,
-metric, file and phantom modules load without Mitsuba.
+    import lingo_mi as lm
+
+    data = lm.simulate('x3d_foot', views=25)            # or lm.load('scan.pickle')
+    result = lm.fit(data, 'fast')
+    result.volume()                                     # [x, y, z], density per mm
+    result.render(data.test.geometry)                   # [view, v, u], line integrals
+    lm.reconstruct(data.train, lm.SART(niter=20), start=result)
+    images = lm.project(*result.gaussians, data.test.geometry)   # differentiable: NumPy, Dr.Jit, PyTorch, JAX
+
+The names below are loaded on first use, and choose a variant of Mitsuba where none is active. `import lingo_mi` and
+`mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
 
 from lingo_mi.runtime import find_libllvm, mend_llvm
 
@@ -14,3 +28,57 @@ from lingo_mi.plugins import watch_variants  # noqa: E402 - loads Mitsuba, and D
 watch_variants()
 
 __version__ = '0.1.0'
+
+if TYPE_CHECKING:
+    from lingo_mi.api.data import load, phantom, simulate
+    from lingo_mi.api.fitting import fit
+    from lingo_mi.api.result import Gaussians, Result, load_result
+    from lingo_mi.api.volumes import reconstruct
+    from lingo_mi.errors import InputError
+    from lingo_mi.fit.settings import Settings
+    from lingo_mi.functional import project, voxelize
+    from lingo_mi.geometry import Geometry
+    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Reconstruction, Refined
+    from lingo_mi.runtime import use_variant
+    from lingo_mi.scan import Dataset, Scan
+
+# Name -> the module that defines it.
+_PUBLIC = {
+    'simulate': 'lingo_mi.api.data',
+    'load': 'lingo_mi.api.data',
+    'phantom': 'lingo_mi.api.data',
+    'Geometry': 'lingo_mi.geometry',
+    'Scan': 'lingo_mi.scan',
+    'Dataset': 'lingo_mi.scan',
+    'fit': 'lingo_mi.api.fitting',
+    'Settings': 'lingo_mi.fit.settings',
+    'Result': 'lingo_mi.api.result',
+    'Gaussians': 'lingo_mi.api.result',
+    'load_result': 'lingo_mi.api.result',
+    'reconstruct': 'lingo_mi.api.volumes',
+    'Reconstruction': 'lingo_mi.reconstruction',
+    'FDK': 'lingo_mi.reconstruction',
+    'SART': 'lingo_mi.reconstruction',
+    'OSSART': 'lingo_mi.reconstruction',
+    'SIRT': 'lingo_mi.reconstruction',
+    'CGLS': 'lingo_mi.reconstruction',
+    'ASDPOCS': 'lingo_mi.reconstruction',
+    'Refined': 'lingo_mi.reconstruction',
+    'project': 'lingo_mi.functional',
+    'voxelize': 'lingo_mi.functional',
+    'use_variant': 'lingo_mi.runtime',
+    'InputError': 'lingo_mi.errors',
+}
+__all__ = [*_PUBLIC]
+
+
+def __getattr__(name: str):
+    if name not in _PUBLIC:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

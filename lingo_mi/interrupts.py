@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 from contextlib import contextmanager
 
 
@@ -14,6 +15,9 @@ def between_steps():
     A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A
     second Ctrl-C stops at once.
     """
+    if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread only
+        yield lambda: None
+        return
     pressed = []
 
     def press(*_):

@@ -32,24 +32,24 @@ class Progress:
     `update` may be called at every step: it returns at once unless there is something to draw.
     """
 
-    def __init__(self, description: str, total: int, start: int = 0):
-        """total: steps in all; start: steps done before the loop begins (a resumed fit)."""
+    def __init__(self, description: str, total: int, start: int = 0, shown: bool = True):
+        """total: steps in all; start: steps done before the loop begins (a resumed fit); shown: False draws nothing."""
         self.description, self.total, self.start = description, int(total), int(start)
         self._done, self._fields = self.start, {}
-        self._file = sys.stderr
+        self._file, self._quiet = sys.stderr, not shown
         self._bar = self._task = None
 
     def __enter__(self) -> Progress:
         self._began = self._drawn = time.monotonic()
         self._shown = self.start  # steps at the latest drawing
-        if self._file.isatty() and os.environ.get('TERM') != 'dumb':
+        if not self._quiet and self._file.isatty() and os.environ.get('TERM') != 'dumb':
             self._bar = _bar(self._file)
             self._task = self._bar.add_task(self.description, total=self.total, completed=self.start, fields='')
             self._bar.start()
         return self
 
     def __exit__(self, *error):
-        if self._shown != self._done:
+        if self._shown != self._done and not self._quiet:
             self._draw(time.monotonic())
         if self._bar:
             self._bar.stop()
@@ -62,6 +62,8 @@ class Progress:
                  so that reading a number back from the device does not slow the loop. None is not shown.
         """
         self._done = iteration
+        if self._quiet:
+            return
         if fields:
             self._fields = fields
         now = time.monotonic()

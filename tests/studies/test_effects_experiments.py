@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.studies.effects import EXPERIMENTS, FITS, SCENES, SETTINGS, measure, quality, write
+from lingo_mi.scene.shipped import scenes
+from lingo_mi.studies.effects import EXPERIMENTS, FITS, SETTINGS, measure, quality, write
 
 TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12')
 
 
 def test_every_experiment_has_its_scene():
-    assert set(EXPERIMENTS) == {path.stem for path in SCENES.glob('*.xml')}
+    assert set(EXPERIMENTS) == {name.removeprefix('effects/') for name in scenes() if name.startswith('effects/')}
     with pytest.raises(InputError, match='no experiment'):
         measure('rain')
 

@@ -1,0 +1,66 @@
+"""
+Your own projections
+====================
+
+Measured projections are an array [view, v, u] of line integrals and the geometry of the scanner. They can be handed over as
+arrays, or stored as `scan.npy` with the geometry in `scan.yml` beside it.
+"""
+
+# %%
+# Here are 30 projections as a scanner would deliver them: intensities I, and I0 without an object.
+
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import lingo_mi as lm
+
+angles = np.radians(np.arange(30) * 12.0)
+geometry = lm.Geometry.cone(
+    DSO=500, DSD=750, nDetector=(80, 80), dDetector=(2, 2), nVoxel=(64,) * 3, dVoxel=(1.5,) * 3, angles=angles
+)
+cloud = lm.phantom('shepp_logan', size=64)
+I0 = 1e5
+counts = np.random.default_rng(0).poisson(I0 * np.exp(-lm.simulate(0.02 * cloud.data, geometry).train.projections))
+
+# %%
+# Line integrals are ln(I0 / I). Pixels that counted nothing hold no information: leave them out with a mask.
+
+valid = counts > 0
+projections = np.log(I0 / np.maximum(counts, 1))
+scan = lm.Scan(geometry, projections, valid)
+
+# %%
+# Fit 24 of the views and look at the six that are left.
+
+data = lm.Dataset(scan.subset(np.arange(30) % 5 != 4), scan.subset(np.arange(30) % 5 == 4))
+result = lm.fit(data, 'fast', iterations=300, n_points=5000)
+print({name: round(result.metrics()[name], 2) for name in ('psnr_2d', 'ssim_2d')})
+
+rendered = result.render(data.test.geometry)
+fig, axes = plt.subplots(1, 2, figsize=(8, 3.6), layout='constrained')
+for axis, image, title in zip(axes, (data.test.projections[0], rendered[0]), ('measured', 'rendered')):
+    axis.imshow(image, cmap='gray')
+    axis.set(title=title, xticks=[], yticks=[])
+
+# %%
+# As files: an array, and the geometry in TIGRE's names. Angles are in degrees in files.
+
+folder = Path(tempfile.mkdtemp())
+np.save(folder / 'scan.npy', projections.astype(np.float32))
+(folder / 'scan.yml').write_text("""\
+DSO: 500                 # source to axis, mm
+DSD: 750                 # source to panel, mm
+nDetector: [80, 80]      # v, u
+dDetector: [2, 2]        # mm
+nVoxel: [64, 64, 64]     # x, y, z
+dVoxel: [1.5, 1.5, 1.5]  # mm
+totalAngle: 360
+""")
+loaded = lm.load(folder / 'scan.npy', views=25)
+print(len(loaded.train), 'views to fit,', len(loaded.test), 'held out')
+
+# %%
+# A geometry that another package has made can be used as it is: see `Geometry.from_tigre`, `from_astra` and `from_rtk`.

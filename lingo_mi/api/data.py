@@ -1,0 +1,121 @@
+"""Scans to work on: simulated from a scene, a phantom or a volume, or read from files."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+import numpy as np
+
+from lingo_mi.arrays import as_numpy
+from lingo_mi.errors import InputError
+from lingo_mi.files.scans import read_scan
+from lingo_mi.geometry import Geometry
+from lingo_mi.phantoms import Phantom, make
+from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
+from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
+from lingo_mi.progress import Progress
+from lingo_mi.projectors import grid
+from lingo_mi.runtime import ensure_variant
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.checks import check_memory, warn_if_truncated
+from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.shipped import scene_path
+from lingo_mi.scene.simulate import choose_views, take_scan
+
+
+def simulate(
+    source: str | PathLike | Phantom | np.ndarray,
+    geometry: Geometry | None = None,
+    *,
+    views: int | None = None,
+    held_out: Geometry | None = None,
+    seed: int = 0,
+    parameters: dict | None = None,
+) -> Dataset:
+    """Simulate a scan: exact line integrals of an object, as the scanner would see it.
+
+    source      a Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a
+                `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
+    geometry    for a phantom or a volume: the scanner. A volume must have `geometry.nVoxel` voxels. Without it, a phantom
+                is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out
+    views       how many of the views to fit, evenly spaced; the rest are held out (default: all)
+    held_out    with `geometry`: further views, to measure new views on
+    seed        of random angles and of the noise of a scene's detector
+    parameters  values for the `<default>` names of a scene file
+
+    Returns a `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume`
+    [x, y, z] is the true density, where it is known.
+
+    Raises InputError where the source is unknown, does not fit the geometry, or needs more memory than there is.
+
+        data = lm.simulate('x3d_foot', views=25)
+        data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
+    """
+    ensure_variant()
+    if isinstance(source, (str, PathLike)):
+        if geometry is not None or held_out is not None:
+            raise InputError(f'{source}: a scene has its own scanner; leave out geometry and held_out')
+        scene = load_scene(scene_path(source), {k: str(v) for k, v in (parameters or {}).items()})
+        return take_scan(scene, views or 0, seed=seed)
+    if parameters:
+        raise InputError('parameters are those of a scene file; this source is none')
+    if isinstance(source, Phantom) and geometry is None:
+        if held_out is not None:
+            raise InputError('held_out needs a geometry: give the scanner of the views to fit, too')
+        with Progress('Scan', 2 * (views or 50)) as bar:
+            return x3d_scan(source, views or 50, seed, lambda done, _: bar.update(done))
+    if geometry is None:
+        raise InputError('a volume needs a scanner: give a geometry, such as lm.Geometry.cone(...)')
+    volume = source.data if isinstance(source, Phantom) else np.asarray(as_numpy(source), np.float32)
+    if volume.shape != geometry.nVoxel:
+        raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    check_memory(geometry, held_out)
+    warn_if_truncated(geometry)
+    every = geometry if held_out is None else geometry.joined(held_out)
+    with Progress('Scan', len(every)) as bar:
+
+        def report(done, _):
+            bar.update(done)
+
+        if isinstance(source, Phantom):
+            projections = project_phantom(source, every, report)
+        else:
+            projections = grid.project(volume, every, report)
+    scan = Scan(every, projections)
+    if held_out is None:
+        return choose_views(Dataset(scan, None, volume), views or 0)
+    train, test = scan.subset(slice(0, len(geometry))), scan.subset(slice(len(geometry), None))
+    return choose_views(Dataset(train, test, volume), views or 0)
+
+
+def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views: int | None = None) -> Dataset:
+    """Read a measured or stored scan.
+
+    path       a pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images,
+               `scan.npy` [view, v, u] with `scan.yml` beside it, or the Helsinki Tomography Challenge's .npz
+    geometry   the geometry file of an .npy, where it is another than that of the same stem
+    views      how many of the views to fit, evenly spaced; the rest are held out (default: all)
+
+    Returns a `Dataset` of line integrals ln(I0 / I) [view, v, u]. Raises InputError where the file is missing, damaged, or
+    contradicts its geometry.
+
+        data = lm.load('foot_50.pickle', views=25)
+    """
+    dataset = choose_views(read_scan(path, geometry), views or 0)
+    check_memory(dataset.train.geometry)
+    warn_if_truncated(dataset.train.geometry)
+    return dataset
+
+
+def phantom(name: str, size: int = 256, seed: int = 0) -> Phantom:
+    """A test object made by formula: 'foot', 'chest', 'shepp_logan', 'gaussians' or 'mesh', on size^3 voxels.
+
+    size   voxels a side, 8 to 512
+    seed   of textures, vessels and random Gaussians
+
+    `phantom.data` is float32 [x, y, z] in [0, 1], `phantom.spacing` the voxel size in mm. Raises InputError for an unknown
+    name, a size out of range or a negative seed.
+
+        foot = lm.phantom('foot', size=96)
+    """
+    return make(name, size, seed)

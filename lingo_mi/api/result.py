@@ -1,0 +1,161 @@
+"""What a fit gives: Gaussians, a volume, new views, numbers, files."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.fit.checkpoint import CHECKPOINT, METRICS
+from lingo_mi.fit.fitted import Fitted
+from lingo_mi.fit.settings import Settings
+from lingo_mi.geometry import Geometry
+from lingo_mi.report.figures import overview
+from lingo_mi.report.page import headline
+from lingo_mi.results.measure import measure
+from lingo_mi.results.save import report_data, world_cloud, write_results
+from lingo_mi.runtime import ensure_variant
+from lingo_mi.scan import Dataset
+
+
+class Gaussians(NamedTuple):
+    """A cloud of N Gaussians in the world frame of the scan, ready for `lm.project` and `lm.voxelize`.
+
+    means        float [N, 3], mm
+    scales       float [N, 3], standard deviations, mm
+    quaternions  float [N, 4], (x, y, z, w), unit length
+    density      float [N], value at the centre, 1/mm (of the baselines '3dgs' and 'xgaussian': opacity)
+    """
+
+    means: np.ndarray
+    scales: np.ndarray
+    quaternions: np.ndarray
+    density: np.ndarray
+
+
+class Result:
+    """The result of `lm.fit`, or of `lm.load_result`. In a notebook it shows slices, views, curves and numbers.
+
+        result = lm.fit(data, 'fast')
+        result.volume()                     # float32 [x, y, z], density per mm
+        result.render(data.test.geometry)   # float32 [view, v, u], line integrals
+        result.metrics()['psnr_3d']
+        result.save('out/foot')
+    """
+
+    def __init__(self, fitted: Fitted, recipe: str, data: Dataset | None = None, stored: dict | None = None):
+        """data: the scan and what is held out, for metrics; stored: metrics as they were saved, where there is no data."""
+        self.fitted, self.recipe, self.data, self._stored = fitted, recipe, data, stored
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the fit, with the bounds that the scan sets."""
+        return self.fitted.settings
+
+    @property
+    def geometry(self) -> Geometry:
+        """The scan's geometry, with poses as the fit has corrected them."""
+        return self.fitted.corrected
+
+    @property
+    def history(self) -> list[dict]:
+        """Measurements over time: iteration, seconds, loss, gaussians, and PSNR where it was measured."""
+        return self.fitted.history
+
+    @property
+    def seconds(self) -> float:
+        """Time to start and to fit."""
+        return self.fitted.info['seconds'] + self.fitted.seconds
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The cloud, for `lm.project(*result.gaussians, geometry)`."""
+        return Gaussians(*world_cloud(self.fitted))
+
+    def __len__(self) -> int:
+        return len(self.fitted.state)
+
+    def volume(self, geometry: Geometry | None = None) -> np.ndarray:
+        """The density at the voxel centres of a geometry's grid (default: the scan's), float32 [x, y, z], per mm.
+
+        Raises InputError for the baselines '3dgs' and 'xgaussian', whose opacities are no densities.
+        """
+        volume = self.fitted.volume(geometry)
+        if volume is None:
+            raise InputError(f'{self.recipe}: opacities and radiances make no volume; complete the views and reconstruct')
+        return volume
+
+    def render(self, geometry: Geometry | None = None) -> np.ndarray:
+        """Line integrals in the views of any geometry (default: the scan's), float32 [view, v, u], density times mm.
+
+        Where the fit has modelled effects, what the scan's detector would see, noise apart.
+        """
+        return self.fitted.render(self.geometry if geometry is None else geometry)
+
+    def metrics(self, data: Dataset | None = None) -> dict:
+        """PSNR and SSIM of held-out views and volume, IPSD, times; None where there is no truth to compare with.
+
+        data   what to compare with (default: what was given to `lm.fit`, else the numbers as saved)
+        """
+        data = self.data if data is None else data
+        if data is not None:
+            return measure(self.fitted, data)
+        if self._stored is None:
+            raise InputError('this result was loaded without numbers: give the data to compare with')
+        return self._stored
+
+    def save(self, folder: str | PathLike, *, title: str = '', force: bool = False) -> Path:
+        """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz; returns the folder.
+
+        title   of the report (default: the folder's name)
+        force   replace an earlier result
+
+        Raises InputError where the folder holds files already, or cannot be written.
+        """
+        if self.data is None:
+            raise InputError('this result was loaded from files: copy its folder')
+        folder = Path(folder)
+        if folder.is_dir() and any(folder.iterdir()) and not force:
+            raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
+        write_results(folder, self.fitted, self.data, title=title or folder.name, method=self.recipe)
+        self.fitted.save_checkpoint(folder / CHECKPOINT)
+        return folder
+
+    def __repr__(self) -> str:
+        return (
+            f'Result({self.recipe}: {len(self):,} Gaussians after {self.settings.iterations} iterations, '
+            f'{self.seconds:.0f} s)'
+        )
+
+    def _repr_html_(self) -> str:
+        if self.data is None:
+            return f'<pre>{html.escape(repr(self))}\n{html.escape(headline(self._stored or {}))}</pre>'
+        data = report_data(self.fitted, self.data, self.metrics(), title=self.recipe)
+        picture = base64.b64encode(overview(data, headline(data.metrics))).decode('ascii')
+        return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{picture}">'
+
+
+def load_result(path: str | PathLike) -> Result:
+    """A result from the folder that `Result.save` or the command line wrote, or from a checkpoint (.npz) alone.
+
+    Raises InputError where there is no checkpoint, or it is damaged.
+
+        result = lm.load_result('out/foot')
+    """
+    ensure_variant()
+    path = Path(path)
+    file = path / CHECKPOINT if path.is_dir() else path
+    fitted, numbers = Fitted.from_checkpoint(file), file.with_name(METRICS)
+    stored = None
+    if path.is_dir() and numbers.exists():
+        try:
+            stored = json.loads(numbers.read_text(encoding='utf-8'))
+        except ValueError:
+            raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
+    return Result(fitted, (stored or {}).get('method', 'checkpoint'), stored=stored)
