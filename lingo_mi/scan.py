@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lingo_mi.arrays import as_numpy
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 
@@ -20,22 +21,27 @@ class Scan:
                   valid. What the projections hold in the others, NaN included, is forgotten: they become 0
     effects       what a detector saw besides line integrals (`effects.forward.Effects`); None: nothing. The projections are
                   then -ln of its signal, and densities attenuation at the tube's reference energy
+
+    Projections and masks may be arrays of any library that has `__array__` or `__dlpack__`. Raises InputError where their
+    shapes are not the geometry's, where a valid pixel is not finite, and where no pixel is valid.
+
+        scan = Scan(Geometry.parallel(nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0, 1.5]), np.zeros((2, 8, 8)))
     """
 
     geometry: Geometry
     projections: np.ndarray
     valid: np.ndarray | None = None
-    effects: object = None
+    effects: object = None  # `Effects` is in a package above this one
 
     def __post_init__(self):
-        p = np.asarray(self.projections, np.float32)
+        p = as_numpy(self.projections, 'the projections', np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
         if p.shape != expected:
             raise InputError(
                 f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}'
             )
         if self.valid is not None:
-            valid = np.asarray(self.valid)
+            valid = as_numpy(self.valid, 'the mask of valid pixels')
             if valid.shape != expected or valid.dtype != bool:
                 raise InputError(
                     f'the mask of valid pixels must be true or false and of the shape of the projections, '
@@ -56,7 +62,7 @@ class Scan:
         return len(self.geometry)
 
     def subset(self, index) -> Scan:
-        """The views `index` only."""
+        """The views `index` only: a slice, or integers [m]."""
         return replace(
             self,
             geometry=self.geometry.subset(index),
@@ -69,33 +75,15 @@ class Scan:
 
         A side of fewer than two new pixels is not binned. Pixels of which one is not valid are not valid.
         """
-        g = self.geometry
-        by = [factor if n >= 2 * factor else 1 for n in g.nDetector]
-        rows, columns = (n // f for n, f in zip(g.nDetector, by))
+        geometry, by = self.geometry.binned(factor), self.geometry.bins(factor)
+        rows, columns = geometry.nDetector
 
         def blocks(values):
             return values[:, : rows * by[0], : columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
 
         p = blocks(self.projections).mean((2, 4))
         valid = None if self.valid is None else blocks(self.valid).all((2, 4))
-        step = tuple(d * f for d, f in zip(g.dDetector, by))
-        if g.poses is not None:
-            poses = replace(g.poses, u=g.poses.u * by[1], v=g.poses.v * by[0])
-            return replace(
-                self,
-                geometry=replace(g, nDetector=(rows, columns), dDetector=step, poses=poses),
-                projections=p,
-                valid=valid,
-            )
-        # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
-        lost = [(n - m * f) / 2 * d for n, m, f, d in zip(g.nDetector, (rows, columns), by, g.dDetector)]
-        offset = (g.offDetector[0] + lost[0], g.offDetector[1] - lost[1])
-        return replace(
-            self,
-            geometry=replace(g, nDetector=(rows, columns), dDetector=step, offDetector=offset),
-            projections=p,
-            valid=valid,
-        )
+        return replace(self, geometry=geometry, projections=p, valid=valid)
 
     @property
     def normalised(self) -> np.ndarray:
@@ -105,8 +93,17 @@ class Scan:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z]."""
+    """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
+
+    The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError where it is none.
+
+        Dataset(train=scan.subset(slice(0, None, 2)), test=scan.subset(slice(1, None, 2)))
+    """
 
     train: Scan
     test: Scan | None = None
     volume: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.volume is not None:
+            object.__setattr__(self, 'volume', as_numpy(self.volume, 'the volume'))

@@ -6,7 +6,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.projectors.view import View
 from lingo_mi.scene.data_files import data_file
 from lingo_mi.scene.description import NAMES, describe, parameter, read_scanner
@@ -75,7 +75,7 @@ class CTScanner(mi.Sensor):
     A nested film `ct_detector` says what the panel makes of the light: noise, blur, saturation and more.
 
     The source runs on a circle in the plane z = 0 unless told otherwise; `lingo_mi.geometry.base` states the frame, and
-    `lingo_mi.geometry.rays.scanner_rays` what moves it. One view of a scanner is a
+    `lingo_mi.geometry.trajectories.scanner_rays` what moves it. One view of a scanner is a
     sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scene.load.scan` renders them all.
     """
 
@@ -146,7 +146,8 @@ class CTScanner(mi.Sensor):
 
     def to_string(self):
         g = self.geometry
-        way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if g.poses is None else 'a pose a view'
+        circle = isinstance(g, CircularGeometry)
+        way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if circle else 'a pose a view'
         return (
             f'CTScanner[\n  mode = {g.mode}, {way},\n  nDetector = {g.nDetector}, '
             f'dDetector = {g.dDetector},\n  nVoxel = {g.nVoxel}, '

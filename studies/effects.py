@@ -148,7 +148,7 @@ def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geom
     turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
     turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
     frames = geometry.rays().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
-    return Geometry.posed(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+    return Geometry.from_poses(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
 
 
 def quality(volume, truth) -> dict:

@@ -14,7 +14,7 @@ from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.fit.view import Target
-from lingo_mi.geometry.base import circular
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import Settings, initialise
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres

@@ -157,14 +157,21 @@ def main():
     import drjit as dr
 
     from lingo_mi import phantoms
-    from lingo_mi.geometry.base import Geometry, circular
+    from lingo_mi.geometry.base import CircularGeometry
+    from lingo_mi.geometry.trajectories import circular
     from lingo_mi.scan import Scan
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
     dr.set_thread_count(cores)
     volume = phantoms.make('shepp_logan', args.size).data
-    geometry = Geometry(
-        1000.0, 1500.0, (args.size, args.size), 512 / args.size, volume.shape, 256 / args.size, circular(args.views)
+    geometry = CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(args.size, args.size),
+        dDetector=512 / args.size,
+        nVoxel=volume.shape,
+        dVoxel=256 / args.size,
+        angles=circular(args.views),
     )
     empty = Scan(geometry, np.zeros((args.views, args.size, args.size), np.float32))
     scan = Scan(geometry, ours(geometry, empty, volume)['projector']())

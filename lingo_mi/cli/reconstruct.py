@@ -100,6 +100,7 @@ def main():
     use_variant(args.variant)
     from lingo_mi.completion.two_stage import as_corrected, complete, fitted_views, load_cloud, without_effects
     from lingo_mi.files.volumes import first_voxel, write_volume
+    from lingo_mi.geometry.base import CircularGeometry
     from lingo_mi.progress import Progress
     from lingo_mi.reconstruction.asd_pocs import asd_pocs
     from lingo_mi.reconstruction.cgls import cgls
@@ -176,7 +177,8 @@ def main():
     else:
         if args.complete:
             measured = fitted_views(dataset, cloud.geometry)
-            if args.algorithm == 'fdk' and cloud.corrected.poses is not None and measured.geometry.poses is None:
+            on_circle = [isinstance(g, CircularGeometry) for g in (measured.geometry, cloud.corrected)]
+            if args.algorithm == 'fdk' and on_circle == [True, False]:
                 raise InputError(
                     'filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
                     'take another --algorithm'

@@ -18,7 +18,8 @@ from lingo_mi.fit.poses import Poses
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import State
 from lingo_mi.fit.step import Stepper
-from lingo_mi.geometry.base import Geometry, spread
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import spread
 from lingo_mi.projectors.objects import Ellipsoids, find_objects
 from lingo_mi.reconstruction.effects_correction import corrected
 from lingo_mi.reconstruction.views import gaps, require_circle

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.files.paths import one_line, reading, replacing
+from lingo_mi.paths import one_line, reading, replacing
 
 
 def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> np.ndarray:

@@ -7,7 +7,7 @@ import OpenEXR
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.paths import one_line, reading, replacing
+from lingo_mi.paths import one_line, reading, replacing
 
 
 def write_exr(path, image) -> None:

@@ -25,8 +25,8 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.paths import one_line, reading, replacing
 from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.paths import one_line, reading, replacing
 from lingo_mi.scan import Dataset
 
 

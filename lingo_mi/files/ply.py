@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.files.paths import reading, replacing
+from lingo_mi.paths import reading, replacing
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'

@@ -1,6 +1,6 @@
 """Files of poses, one for every view, whatever their convention: `read_poses` finds the reader.
 
-.xml            RTK's geometry (`rtk_geometry`): needs dDetector; the panel is centred but for the file's own offsets
+.xml            RTK's geometry (`lingo_mi.geometry.rtk`): needs dDetector; the panel is centred but for the file's own offsets
 .npy, .txt, .csv   12 numbers a view, ASTRA's vectors (`astra`): [n, 12]; or projection matrices (`matrices`):
                 [n, 3, 4], which need dDetector, the pixel size that a matrix leaves open
 """
@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.files import arrays, astra, matrices, rtk_geometry
-from lingo_mi.files.paths import one_line, reading
+from lingo_mi.files import arrays
+from lingo_mi.geometry import astra, matrices, rtk
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.paths import one_line, reading
 
 
 def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=(0.0, 0.0, 0.0)) -> Rays:
@@ -30,7 +31,7 @@ def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == '.xml':
-        return rtk_geometry.read(path, nDetector, _needed(dDetector, path))
+        return rtk.read(path, nDetector, _needed(dDetector, path))
     if suffix == '.npy':
         values = arrays.load(path, None)
     elif suffix in ('.txt', '.csv'):

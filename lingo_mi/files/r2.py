@@ -17,8 +17,8 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
-from lingo_mi.files.paths import new_folder, one_line, reading
 from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.paths import new_folder, one_line, reading
 from lingo_mi.scan import Dataset
 
 META = 'meta_data.json'

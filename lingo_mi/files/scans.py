@@ -17,7 +17,8 @@ degrees:
                                    +z
     rotDetector, COR, tilt, pitch, z   optional: a panel turned by (roll, pitch, yaw), an axis off centre, a source
                            lifted out of the plane of rotation, a helix by mm a turn (at z = 0 for the angle 0) or by
-                           the height of every view (`lingo_mi.geometry.rays.scanner_rays` defines them; angles in degrees)
+                           the height of every view (angles in degrees;
+                           `lingo_mi.geometry.trajectories.scanner_rays` defines them)
     poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
@@ -45,9 +46,8 @@ import numpy as np
 import yaml
 
 from lingo_mi.errors import InputError
-from lingo_mi.files import arrays, astra, naf, r2
+from lingo_mi.files import arrays, naf, r2
 from lingo_mi.files.images import read_exr, write_exr
-from lingo_mi.files.paths import new_folder, one_line, reading, replacing
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.tigre import (
     MOTION,
@@ -59,7 +59,10 @@ from lingo_mi.files.tigre import (
     to_posed,
 )
 from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
-from lingo_mi.geometry.base import circular
+from lingo_mi.geometry import astra
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.paths import new_folder, one_line, reading, replacing
 from lingo_mi.scan import Dataset, Scan
 
 _KEYS = {
@@ -125,7 +128,7 @@ def _geometry(values, n, where, test=False):
     if poses is None:
         return to_geometry(values, _angles(values, prefix + 'angles', n, where), where)
 
-    def frames(n_detector, step, parallel, origin):
+    def views(n_detector, step, parallel, origin):
         if isinstance(poses, str):
             found = read_poses(Path(where).parent / poses, n_detector, step, parallel, origin)
         else:
@@ -134,7 +137,7 @@ def _geometry(values, n, where, test=False):
             raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
         return found
 
-    return to_posed(values, frames, where)
+    return to_posed(values, views, where)
 
 
 def _angles(values, key, n, where):
@@ -190,7 +193,7 @@ def _line_integrals(projections, values, where, projections_path):
 
 
 def _dump_yaml(path, geometry, test=None, **more):
-    if any(g is not None and g.poses is not None for g in (geometry, test)):
+    if not all(g is None or isinstance(g, CircularGeometry) for g in (geometry, test)):
         values = {'mode': geometry.mode}
         values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
         values['poses'] = astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, helix
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.trajectories import helix
 from lingo_mi.scan import Dataset, Scan
 
 # Names that move the scanner off its circle.
@@ -159,7 +160,7 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
         for name, length in (('offOrigin', 3), ('offDetector', 2))
     )
     try:
-        return Geometry(
+        return CircularGeometry(
             DSO=float(_numbers(values, 'DSO', where, 1)[0]),
             DSD=float(_numbers(values, 'DSD', where, 1)[0]),
             nDetector=n_detector,
@@ -175,8 +176,8 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
 
-def to_posed(values: dict, frames, where) -> Geometry:
-    """A Geometry of given poses: frames(nDetector, dDetector or None, parallel, offOrigin) gives them.
+def to_posed(values: dict, views, where) -> Geometry:
+    """A Geometry of given poses: views(nDetector, dDetector or None, parallel, offOrigin) gives them.
 
     values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
 
@@ -199,14 +200,14 @@ def to_posed(values: dict, frames, where) -> Geometry:
     try:
         if mode not in ('cone', 'parallel'):
             raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
-        return Geometry.posed(
-            frames(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin
+        return Geometry.from_poses(
+            views(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin
         )
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
 
-def from_geometry(geometry: Geometry, offset_order: str = 'vu') -> dict:
+def from_geometry(geometry: CircularGeometry, offset_order: str = 'vu') -> dict:
     """The inverse of `to_geometry` for a circular scan, without the angles: plain floats, ints and lists, mm."""
     offset = geometry.offDetector[::-1] if offset_order == 'uv' else geometry.offDetector
     return {
@@ -254,7 +255,7 @@ def check_one_scanner(dataset: Dataset, where, poses: bool = False) -> None:
     holds `poses`, in those. Without them, all views must be on the circle."""
     geometries = [scan.geometry for scan in (dataset.train, dataset.test) if scan is not None]
     names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
-    if any(g.poses is not None for g in geometries):
+    if not all(isinstance(g, CircularGeometry) for g in geometries):
         if not poses:
             raise InputError(
                 f'{where}: this format holds circular scans only, and this one has other poses; write it as '

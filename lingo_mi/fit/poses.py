@@ -61,7 +61,7 @@ class Poses:
         f = self.correct(g.normalised_rays())
         source = f.source if f.parallel else f.source / g.scale + centre
         frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
-        return Geometry.posed(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+        return Geometry.from_poses(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
     def undone(self) -> Poses:
         """What takes corrected views back to where they were."""

@@ -1,6 +1,18 @@
-"""Scanner geometry in TIGRE's terms: NumPy only, no Mitsuba."""
+"""Where a scan's rays are: scanners in TIGRE's terms, poses, and what other packages call them. NumPy only, no Mitsuba."""
 
-from lingo_mi.geometry.base import Geometry, circular, helix, spread
-from lingo_mi.geometry.rays import Rays, scanner_rays
+from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import circular, helix, scanner_rays, spread
 
-__all__ = ['Geometry', 'Rays', 'circular', 'helix', 'scanner_rays', 'spread']
+__all__ = [
+    'CircularGeometry',
+    'Geometry',
+    'PosedGeometry',
+    'Rays',
+    'camera_matrices',
+    'circular',
+    'helix',
+    'scanner_rays',
+    'spread',
+]

@@ -11,9 +11,8 @@ For the angle a (radians):
 Projections are stored [view, v, u], pixel centres at (i + 1/2) pixel steps. `offDetector` is TIGRE's (v, u): a positive
 first entry lifts the panel towards +z, against the row order. Volumes are stored [x, y, z].
 
-That is the circle. Any other motion is a pose for every view: `Geometry.per_view` makes them from TIGRE's numbers (helix,
-tilt, turned or moving panels), `Geometry.posed` takes them as they are (`lingo_mi.files.poses` reads RTK's, ASTRA's and
-projection matrices). Whatever projects asks `rays()`.
+That is the circle, a `CircularGeometry`. Any other motion is a `PosedGeometry`, with a pose for every view. The constructors
+of `Geometry` choose between the two, and whatever projects asks `rays()`.
 
 Normalised frame: the volume's longest side is scaled to 2 and its centre moved to the origin. Lengths and line
 integrals are multiplied by `Geometry.scale` = 2 / max(sVoxel); densities keep their number.
@@ -21,66 +20,361 @@ integrals are multiplied by `Geometry.scale` = 2 / max(sVoxel); densities keep t
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from os import PathLike
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.rays import Rays, scanner_rays
+from lingo_mi.geometry import astra, rtk, tigre
+from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.circle import circle_of
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import helix, scanner_rays
 
-SAME = 1e-3  # pixels by which a pose may miss a circle and still be one
 
+@dataclass(frozen=True, kw_only=True)
+class Geometry(ABC):
+    """A scan with a flat panel and a voxel grid: what every kind of scan has, and the constructors of both kinds.
 
-@dataclass(frozen=True)
-class Geometry:
-    """A scan with a flat panel: on a circle, or with a pose for every view.
+    mode         'cone' or 'parallel'
+    nDetector    pixels, (v, u): rows, columns; at least 1
+    dDetector    pixel size, (v, u), mm
+    nVoxel       voxels, (x, y, z); at least 1
+    dVoxel       voxel size, (x, y, z), mm
+    offOrigin    centre of the volume, (x, y, z), mm
+    angles       [n] radians: the direction to the source, seen from above
+    DSO, DSD     distances from the source to the axis and to the panel, mm
 
-    mode                  'cone' or 'parallel'
-    DSO, DSD              distances from the source to the axis and to the panel, mm
-    nDetector, dDetector  pixels and pixel size, (v, u), mm
-    nVoxel, dVoxel        voxels and voxel size, (x, y, z), mm
-    angles                [n] radians
-    offOrigin             centre of the volume, (x, y, z), mm
-    offDetector           shift of the panel, (v, u), mm, positive v up
-    poses                 rays of every view, mm, where they are not those of the circle. They alone count then: DSO, DSD,
-                          dDetector, offDetector and angles are nominal, for labels (see `posed`)
+    One number may stand for all of nDetector, dDetector, nVoxel, dVoxel, offOrigin and offDetector. Wrong shapes, numbers
+    that are not finite, and sizes and counts that are not positive raise InputError.
+
+        geometry = Geometry.cone(DSO=1000, DSD=1500, nDetector=512, dDetector=1, nVoxel=256, dVoxel=1, angles=circular(50))
+        geometry.rays().source   # [50, 3], mm
     """
 
-    DSO: float
-    DSD: float
+    mode: str
     nDetector: tuple[int, int]
     dDetector: tuple[float, float]
     nVoxel: tuple[int, int, int]
     dVoxel: tuple[float, float, float]
     angles: np.ndarray = field(repr=False)
-    mode: str = 'cone'
+    DSO: float
+    DSD: float
     offOrigin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    offDetector: tuple[float, float] = (0.0, 0.0)
-    poses: Rays | None = field(default=None, repr=False)
+
+    # ---- constructors --------------------------------------------------------------------------------------
+
+    @classmethod
+    def cone(
+        cls, *, DSO: float, DSD: float, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        angles: ArrayLike, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
+        COR: float = 0.0, tilt: float = 0.0,
+    ) -> Geometry:  # fmt: skip
+        """A cone beam whose source moves on a circle about z.
+
+        DSO, DSD      distances from the source to the axis and to the panel, mm: DSD >= DSO > 0
+        angles        [n] radians, n >= 1
+        offDetector   shift of the panel, (v, u), mm, positive v up
+        rotDetector   the panel turned by (roll, pitch, yaw), radians; COR: an axis off centre, mm; tilt: the source lifted
+                      out of the plane of rotation, radians. `trajectories.scanner_rays` defines them
+
+        The other arguments are those of the class. Without rotDetector, COR and tilt it is a `CircularGeometry`. Raises
+        InputError for numbers that make no scan.
+
+            Geometry.cone(DSO=1000, DSD=1500, nDetector=(384, 512), dDetector=0.8, nVoxel=256, dVoxel=1, angles=circular(90))
+        """
+        scan = dict(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
+        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
+        return cls._moving('cone', scan, rotDetector=rotDetector, COR=COR, tilt=tilt)
+
+    @classmethod
+    def parallel(
+        cls, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        angles: ArrayLike, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
+        COR: float = 0.0, tilt: float = 0.0,
+    ) -> Geometry:  # fmt: skip
+        """A parallel beam that turns about z; the arguments are those of `cone`, without the distances.
+
+        Its beam is not turned by rotDetector. Raises InputError for numbers that make no scan.
+
+            Geometry.parallel(nDetector=(1, 512), dDetector=1, nVoxel=(256, 256, 1), dVoxel=1, angles=circular(90, 180))
+        """
+        scan = dict(DSO=0.0, DSD=0.0, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
+        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
+        return cls._moving('parallel', scan, rotDetector=rotDetector, COR=COR, tilt=tilt)
+
+    @classmethod
+    def helix(
+        cls, *, DSO: float, DSD: float, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        angles: ArrayLike, pitch: float, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
+        COR: float = 0.0, tilt: float = 0.0,
+    ) -> Geometry:  # fmt: skip
+        """A cone beam whose source and panel climb `pitch` mm a turn, at z = 0 for the angle 0.
+
+        angles   [n] radians, beyond 2 pi where there are several turns; negative ones lie below z = 0
+
+        The other arguments are those of `cone`. Raises InputError for numbers that make no scan.
+
+            turns = circular(180, total=1440, start=-720)   # four turns about the middle
+            Geometry.helix(DSO=600, DSD=1000, nDetector=256, dDetector=1, nVoxel=128, dVoxel=1, angles=turns, pitch=32)
+        """
+        scan = dict(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
+        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
+        return cls._moving('cone', scan, rotDetector=rotDetector, COR=COR, tilt=tilt, height=helix(angles, pitch))
+
+    @classmethod
+    def _moving(cls, mode, scan: dict, **motion) -> Geometry:
+        """The circle of the numbers `scan`, or what `motion` makes of it where any of that is not zero."""
+        circle = CircularGeometry(mode=mode, **scan)
+        if not any(np.any(value) for value in motion.values()):
+            return circle
+        motion['rotDetector'] = _numbers('rotDetector', motion['rotDetector'], float, 3)
+        return cls.per_view(**circle.numbers(), **motion)
+
+    @classmethod
+    def per_view(
+        cls, *, DSO: ArrayLike, DSD: ArrayLike, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        angles: ArrayLike, mode: str = 'cone', offOrigin: ArrayLike = 0.0, **motion: ArrayLike,
+    ) -> Geometry:  # fmt: skip
+        """A scan whose numbers may change from view to view, in TIGRE's terms.
+
+        DSO, DSD    mm, one number or [n]
+        angles      [n] radians or [n, 3] Euler angles
+        offOrigin   (x, y, z) mm; or [n, 3], TIGRE's way to move the object: the grid then stays at their mean, and the
+                    scanner moves by what is left, the other way round
+        motion      offDetector, rotDetector, COR, height, tilt, once or for every view: see `trajectories.scanner_rays`
+
+        Raises InputError for numbers that make no scan.
+
+            Geometry.per_view(DSO=[900, 905], DSD=1400, nDetector=64, dDetector=2, nVoxel=64, dVoxel=1, angles=[0, 1.5])
+        """
+        if mode not in ('cone', 'parallel'):
+            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
+        panel = CircularGeometry(
+            DSO=1.0, DSD=1.0, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel, angles=[0.0]
+        )  # one number may stand for both
+        rays = scanner_rays(angles, DSO, DSD, panel.nDetector, panel.dDetector, mode == 'parallel', **motion)
+        if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
+            raise InputError(
+                'a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)'
+            )
+        origin = np.asarray(offOrigin, float)
+        if origin.ndim == 2:
+            if origin.shape != (len(rays), 3):
+                raise InputError(
+                    f'offOrigin must be 3 numbers, or that for each of {len(rays)} views, not an array of '
+                    f'shape {origin.shape}'
+                )
+            mean = origin.mean(0)
+            rays, origin = rays.moved(shift=mean - origin), mean
+        return cls.from_poses(rays, panel.nDetector, nVoxel, dVoxel, origin)
+
+    @classmethod
+    def from_poses(
+        cls, rays: Rays, nDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike, offOrigin: ArrayLike = 0.0
+    ) -> Geometry:
+        """A scan with a given pose for every view.
+
+        rays        in mm; the other arguments are those of the class
+
+        Poses that are a circle's to a thousandth of a pixel (the source around z, the panel upright, rows down) give the
+        `CircularGeometry`, which every file format knows, others a `PosedGeometry`. Raises InputError for poses that are
+        none, see `Rays.checked`.
+
+            Geometry.from_poses(Rays(source, corner, u, v, parallel=False), nDetector=(20, 24), nVoxel=64, dVoxel=0.5)
+        """
+        posed = PosedGeometry(poses=rays, nDetector=nDetector, nVoxel=nVoxel, dVoxel=dVoxel, offOrigin=offOrigin)
+        circle = circle_of(posed.poses, posed.nDetector)
+        if circle is None:
+            return posed
+        return CircularGeometry(mode=posed.mode, **circle, **posed._panel_and_grid())
+
+    @classmethod
+    def from_tigre(cls, geo: object, angles: ArrayLike) -> Geometry:
+        """The scan that a geometry of TIGRE for Python describes.
+
+        geo      `tigre.geometry`, or a dict with its names. Its own order is turned round: nVoxel, dVoxel and offOrigin are
+                 (z, y, x) there, rotDetector is about (x, y, z); nDetector, dDetector and offDetector are (v, u). Lengths in
+                 mm; DSO, DSD, offOrigin, offDetector, rotDetector and COR once or for every view
+        angles   [n] radians or [n, 3] Euler angles, as `tigre.Ax` takes them
+
+        TIGRE's rows run up, this package's down, and its volumes are [z, y, x]: `projections[:, ::-1]` and `volume.T` go with
+        the result. Raises InputError where a number is missing or makes no scan.
+
+            geo = tigre.geometry_default(high_resolution=False)
+            scan = Scan(Geometry.from_tigre(geo, angles), tigre.Ax(image, geo, angles)[:, ::-1])
+        """
+        scan, moves = tigre.numbers(geo, angles)
+        return cls.per_view(**scan) if moves else CircularGeometry(**scan)
+
+    @classmethod
+    def from_astra(
+        cls,
+        proj_geom: dict,
+        vol_geom: dict | None = None,
+        *,
+        nVoxel: ArrayLike | None = None,
+        dVoxel: ArrayLike | None = None,
+    ) -> Geometry:
+        """The scan that geometries of the ASTRA toolbox describe.
+
+        proj_geom        a dict of the type 'cone', 'cone_vec', 'parallel3d' or 'parallel3d_vec'; lengths as they are
+        vol_geom         a dict of `astra.create_vol_geom` in three dimensions, or instead of it
+        nVoxel, dVoxel   voxels and voxel size, (x, y, z), of a grid about the origin
+
+        ASTRA's arrays are [v, view, u] with rows that run up, and volumes [z, y, x]: `sinogram.transpose(1, 0, 2)[:, ::-1]`
+        and `volume.T` go with the result. Raises InputError for other types, and where a number is missing or makes no scan.
+
+            proj = astra.create_proj_geom('cone', 1.0, 1.0, 256, 256, np.linspace(0, 2 * np.pi, 90, False), 1000, 500)
+            Geometry.from_astra(proj, astra.create_vol_geom(128, 128, 128))
+        """
+        if (vol_geom is None) == (nVoxel is None) or (nVoxel is None) != (dVoxel is None):
+            raise InputError('an ASTRA geometry needs either vol_geom or both nVoxel and dVoxel')
+        grid: dict = dict(nVoxel=nVoxel, dVoxel=dVoxel) if vol_geom is None else astra.grid(vol_geom)
+        if proj_geom.get('type') in astra.CIRCLES:
+            return CircularGeometry(**astra.circle(proj_geom), **grid)
+        rays, nDetector = astra.views(proj_geom)
+        return cls.from_poses(rays, nDetector, **grid)
+
+    @classmethod
+    def from_rtk(
+        cls, source: str | PathLike | object, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        offOrigin: ArrayLike = 0.0,
+    ) -> Geometry:  # fmt: skip
+        """The scan that a geometry of RTK describes.
+
+        source   the path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`
+
+        The other arguments are those of the class: RTK says neither the panel's pixels nor the grid. Its images are taken as
+        centred. RTK's axes (x, y, z) are this package's (y, z, x), and its rows run up: `stack[:, ::-1]` goes with the
+        result. Raises InputError where the file is missing, damaged or another one, and for cylindrical panels.
+
+            Geometry.from_rtk('geometry.xml', nDetector=256, dDetector=1.0, nVoxel=128, dVoxel=1.0)
+        """
+        nDetector, dDetector = _numbers('nDetector', nDetector, int, 2), _numbers('dDetector', dDetector, float, 2)
+        rays = rtk.read(source, nDetector, dDetector)
+        return cls.from_poses(rays, nDetector, nVoxel, dVoxel, offOrigin)
+
+    # ---- what every kind has -------------------------------------------------------------------------------
 
     def __post_init__(self):
-        def fix(name, kind, length):
-            value = np.atleast_1d(np.asarray(getattr(self, name), float)).ravel()
-            if len(value) == 1:
-                value = np.repeat(value, length)
-            if len(value) != length or not np.all(np.isfinite(value)):
-                raise InputError(f'{name} must be {length} finite numbers, not {getattr(self, name)!r}')
-            object.__setattr__(self, name, tuple(kind(x) for x in value))
-
-        if self.mode not in ('cone', 'parallel'):
-            raise InputError(f"mode must be 'cone' or 'parallel', not {self.mode!r}")
         for name, kind, length in (
             ('nDetector', int, 2),
             ('dDetector', float, 2),
             ('nVoxel', int, 3),
             ('dVoxel', float, 3),
             ('offOrigin', float, 3),
-            ('offDetector', float, 2),
         ):
-            fix(name, kind, length)
-        for name in ('nDetector', 'dDetector', 'nVoxel', 'dVoxel'):
-            if min(getattr(self, name)) <= 0:
-                raise InputError(f'{name} must be positive, not {getattr(self, name)}')
+            value = _numbers(name, getattr(self, name), kind, length)
+            if name != 'offOrigin' and min(value) <= 0:
+                raise InputError(f'{name} must be positive, not {value}')
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.angles)
+
+    @abstractmethod
+    def rays(self) -> Rays:
+        """The rays of all views in the world frame, mm."""
+
+    @abstractmethod
+    def subset(self, index) -> Geometry:
+        """The same scan with the views `index` only: a slice, or integers [m]."""
+
+    @abstractmethod
+    def binned(self, factor: int) -> Geometry:
+        """The same rays with `factor` x `factor` pixels taken as one; rows and columns left over are dropped.
+
+        A side of fewer than two new pixels is not binned: see `bins`.
+        """
+
+    def joined(self, other: Geometry) -> Geometry:
+        """The views of this scan, then those of another by the same scanner on the same grid.
+
+        Raises InputError where one is a cone beam and the other parallel.
+        """
+        return PosedGeometry(poses=self.rays().joined(other.rays()), **self._panel_and_grid())
+
+    def with_volume(self, nVoxel: ArrayLike, dVoxel: ArrayLike) -> Geometry:
+        """The same scan with another voxel grid, (x, y, z), about the same centre."""
+        return replace(self, nVoxel=nVoxel, dVoxel=dVoxel)
+
+    @property
+    def sDetector(self) -> tuple[float, float]:
+        """Size of the panel, (v, u), mm."""
+        (nv, nu), (dv, du) = self.nDetector, self.dDetector
+        return nv * dv, nu * du
+
+    @property
+    def sVoxel(self) -> tuple[float, float, float]:
+        """Size of the volume, (x, y, z), mm."""
+        (nx, ny, nz), (dx, dy, dz) = self.nVoxel, self.dVoxel
+        return nx * dx, ny * dy, nz * dz
+
+    @property
+    def scale(self) -> float:
+        """Factor from mm to normalised lengths."""
+        return 2 / max(self.sVoxel)
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half the volume's sides in the normalised frame, [3]; the largest is 1."""
+        return np.array(self.sVoxel) * self.scale / 2
+
+    def normalised_rays(self) -> Rays:
+        """The rays of all views in the normalised frame, where the volume's longest side is [-1, 1]."""
+        rays, centre, k = self.rays(), np.array(self.offOrigin), self.scale
+        source = rays.source if rays.parallel else (rays.source - centre) * k
+        return Rays(source, (rays.corner - centre) * k, rays.u * k, rays.v * k, rays.parallel)
+
+    def voxel_matrices(self) -> np.ndarray:
+        """Projection matrices [view, 3, 4] from voxel indices (i, j, k, 1) to (x w, y w, w), float64.
+
+        x, y are continuous pixel positions as in `Rays`; w is the distance from the source along the panel's
+        normal over its value at the axis (parallel: 1).
+        """
+        out = camera_matrices(self.rays())
+        if self.mode == 'cone':
+            out *= self.DSD / self.DSO  # w = 1 on the axis instead of the panel
+        first = np.array(self.offOrigin) + (np.array(self.dVoxel) - self.sVoxel) / 2
+        out[:, :, 3] += out[:, :, :3] @ first
+        out[:, :, :3] *= self.dVoxel
+        return out
+
+    def bins(self, factor: int) -> tuple[int, int]:
+        """How many rows and columns make one of `binned(factor)`: `factor`, or 1 along a side of fewer than two new pixels."""
+        if factor < 1:
+            raise InputError(f'pixels are averaged by a whole number from 1 on, not by {factor}')
+        by_v, by_u = (factor if n >= 2 * factor else 1 for n in self.nDetector)
+        return by_v, by_u
+
+    def _panel_and_grid(self) -> dict:
+        return {name: getattr(self, name) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CircularGeometry(Geometry):
+    """The source on a circle about z before an upright panel, rows down.
+
+    offDetector   shift of the panel, (v, u), mm, positive v up
+
+    The other numbers are those of `Geometry`. DSO and DSD of a parallel beam only place its panel. Raises InputError for
+    numbers that make no scan, among them a cone beam without DSD >= DSO > 0.
+
+        CircularGeometry(DSO=1000, DSD=1500, nDetector=512, dDetector=1, nVoxel=256, dVoxel=1, angles=[0.0, 1.5])
+    """
+
+    mode: str = 'cone'
+    offDetector: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self):
+        if self.mode not in ('cone', 'parallel'):
+            raise InputError(f"mode must be 'cone' or 'parallel', not {self.mode!r}")
+        super().__post_init__()
+        object.__setattr__(self, 'offDetector', _numbers('offDetector', self.offDetector, float, 2))
         angles = np.atleast_1d(np.asarray(self.angles, float))
         if angles.ndim != 1 or len(angles) == 0:
             raise InputError('the scan has no views: give at least one angle')
@@ -92,186 +386,100 @@ class Geometry:
                 object.__setattr__(self, name, float(getattr(self, name)))
             except (TypeError, ValueError):
                 raise InputError(f'{name} must be one number, in mm, not {getattr(self, name)!r}') from None
-        if self.poses is not None:
-            object.__setattr__(self, 'poses', self.poses.checked())
-            if len(self.poses) != len(angles) or self.poses.parallel != (self.mode == 'parallel'):
-                raise InputError(
-                    f'{len(angles)} angles of a {self.mode} beam contradict {len(self.poses)} poses of a '
-                    f'{"parallel" if self.poses.parallel else "cone"} beam'
-                )
-        elif self.mode == 'cone' and not (np.isfinite(self.DSD) and self.DSD >= self.DSO > 0):
+        if self.mode == 'cone' and not (np.isfinite(self.DSD) and self.DSD >= self.DSO > 0):
             raise InputError(
                 f'a cone beam needs DSD >= DSO > 0, but DSO = {self.DSO:g} and DSD = {self.DSD:g} '
                 '(both are distances from the source, in mm)'
             )
 
-    @classmethod
-    def posed(cls, frames: Rays, nDetector, nVoxel, dVoxel, offOrigin=(0.0, 0.0, 0.0)) -> Geometry:
-        """A scan with a given pose for every view.
-
-        frames      in mm
-        nDetector   (v, u) pixels; the other arguments as for the class
-
-        Poses that are a circle's to a thousandth of a pixel (the source around z, the panel upright, rows down) give the
-        plain geometry of that circle, which every file format knows. Otherwise the nominal DSO is the mean distance from
-        the source to the volume's centre, DSD that to the panel's plane, dDetector the mean length of the steps, `angles`
-        the directions to the source as seen from above. Raises InputError for poses that are none, see `Rays.checked`.
-        """
-        frames = frames.checked()
-        nDetector = tuple(int(n) for n in nDetector)
-        toward = -frames.source if frames.parallel else frames.source - np.asarray(offOrigin, float)
-        normal = np.cross(frames.u, frames.v)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        angles = np.arctan2(toward[:, 1], toward[:, 0])
-        if frames.parallel:
-            DSO, DSD = 0.0, float(np.mean(np.abs(np.sum(frames.corner * normal, 1))))
-        else:
-            DSO = float(np.mean(np.linalg.norm(toward, axis=1)))
-            DSD = float(np.mean(np.abs(np.sum((frames.corner - frames.source) * normal, 1))))
-        step = tuple(float(np.mean(np.linalg.norm(x, axis=1))) for x in (frames.v, frames.u))
-        more = dict(nVoxel=nVoxel, dVoxel=dVoxel, offOrigin=offOrigin, mode='parallel' if frames.parallel else 'cone')
-        circle = _circle(frames, nDetector)
-        if circle is not None:
-            return cls(**circle, nDetector=nDetector, **more)
-        return cls(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=step, angles=angles, poses=frames, **more)
-
-    @classmethod
-    def per_view(
-        cls, *, DSO, DSD, nDetector, dDetector, nVoxel, dVoxel, angles, mode='cone', offOrigin=(0.0, 0.0, 0.0), **motion
-    ) -> Geometry:
-        """A scan whose numbers may change from view to view, in TIGRE's terms.
-
-        DSO, DSD    mm, one number or [n]
-        angles      [n] radians or [n, 3] Euler angles
-        offOrigin   (x, y, z) mm; or [n, 3], TIGRE's way to move the object: the grid then stays at their mean, and the
-                    scanner moves by what is left, the other way round
-        motion      offDetector, rotDetector, COR, height, tilt: see `frames.scanner_rays`
-
-        Raises InputError for numbers that make no scan.
-        """
-        if mode not in ('cone', 'parallel'):
-            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
-        panel = cls(1.0, 1.0, nDetector, dDetector, nVoxel, dVoxel, [0.0])  # one number may stand for both
-        frames = scanner_rays(angles, DSO, DSD, panel.nDetector, panel.dDetector, mode == 'parallel', **motion)
-        if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
-            raise InputError(
-                'a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)'
-            )
-        origin = np.asarray(offOrigin, float)
-        if origin.ndim == 2:
-            if origin.shape != (len(frames), 3):
-                raise InputError(
-                    f'offOrigin must be 3 numbers, or that for each of {len(frames)} views, not an array of '
-                    f'shape {origin.shape}'
-                )
-            mean = origin.mean(0)
-            frames, origin = frames.moved(shift=mean - origin), mean
-        return cls.posed(frames, panel.nDetector, nVoxel, dVoxel, origin)
-
-    def __len__(self) -> int:
-        return len(self.angles)
-
-    @property
-    def sDetector(self):
-        """Size of the panel, (v, u), mm."""
-        return tuple(n * d for n, d in zip(self.nDetector, self.dDetector))
-
-    @property
-    def sVoxel(self):
-        """Size of the volume, (x, y, z), mm."""
-        return tuple(n * d for n, d in zip(self.nVoxel, self.dVoxel))
-
-    @property
-    def scale(self) -> float:
-        """Factor from mm to normalised lengths."""
-        return 2 / max(self.sVoxel)
-
-    def subset(self, index) -> Geometry:
-        """The same scan with the views `index` only."""
-        return replace(self, angles=self.angles[index], poses=None if self.poses is None else self.poses[index])
-
-    def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then those of another by the same scanner on the same grid."""
-        poses = None
-        if self.poses is not None or other.poses is not None:
-            poses = self.rays().joined(other.rays())
-        return replace(self, angles=np.concatenate([self.angles, other.angles]), poses=poses)
-
-    def with_volume(self, nVoxel, dVoxel) -> Geometry:
-        """The same scan with another voxel grid."""
-        return replace(self, nVoxel=tuple(nVoxel), dVoxel=tuple(dVoxel))
+    def numbers(self) -> dict:
+        """All numbers by name, as the class and `Geometry.per_view` take them."""
+        scanner = {name: getattr(self, name) for name in ('mode', 'DSO', 'DSD', 'dDetector', 'offDetector', 'angles')}
+        return scanner | self._panel_and_grid()
 
     def rays(self) -> Rays:
         """The rays of all views in the world frame, mm."""
-        if self.poses is not None:
-            return self.poses
         return scanner_rays(
             self.angles, self.DSO, self.DSD, self.nDetector, self.dDetector, self.mode == 'parallel', self.offDetector
         )
 
-    def normalised_rays(self) -> Rays:
-        """The rays of all views in the normalised frame, where the volume's longest side is [-1, 1]."""
-        f, centre, k = self.rays(), np.array(self.offOrigin), self.scale
-        source = f.source if f.parallel else (f.source - centre) * k
-        return Rays(source, (f.corner - centre) * k, f.u * k, f.v * k, f.parallel)
+    def subset(self, index) -> CircularGeometry:
+        """The same scan with the views `index` only: a slice, or integers [m]."""
+        return replace(self, angles=self.angles[index])
 
-    @property
-    def half(self) -> np.ndarray:
-        """Half the volume's sides in the normalised frame, [3]; the largest is 1."""
-        return np.array(self.sVoxel) * self.scale / 2
+    def joined(self, other: Geometry) -> Geometry:
+        """The views of this scan, then those of another by the same scanner on the same grid."""
+        if isinstance(other, CircularGeometry):
+            return replace(self, angles=np.concatenate([self.angles, other.angles]))
+        return super().joined(other)
+
+    def binned(self, factor: int) -> CircularGeometry:
+        """The same rays with `factor` x `factor` pixels taken as one: see `Geometry.binned`."""
+        by = self.bins(factor)
+        shape = tuple(n // f for n, f in zip(self.nDetector, by))
+        step = tuple(d * f for d, f in zip(self.dDetector, by))
+        # Dropped pixels at the end move the panel's centre: u grows with the column, z falls with the row.
+        lost = [(n - m * f) / 2 * d for n, m, f, d in zip(self.nDetector, shape, by, self.dDetector)]
+        offset = (self.offDetector[0] + lost[0], self.offDetector[1] - lost[1])
+        return replace(self, nDetector=shape, dDetector=step, offDetector=offset)
 
 
-def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
-    """n angles (radians) evenly spaced over [start, start + total) degrees."""
-    if n < 1:
-        raise InputError(f'a scan needs at least one view, not {n}')
-    return np.radians(start + total * np.arange(n) / n)
+@dataclass(frozen=True, kw_only=True)
+class PosedGeometry(Geometry):
+    """A scan with a pose for every view.
 
+    poses   `Rays` of all views, mm; the other arguments are nDetector, nVoxel, dVoxel and offOrigin
 
-def helix(angles, pitch: float) -> np.ndarray:
-    """Heights [n] in mm of a helix that climbs `pitch` mm a turn: 0 at the angle 0.
+    What the poses imply is for labels: DSO is the mean distance from the source to the volume's centre, DSD that to the
+    panel's plane, dDetector the mean length of the steps, `angles` the directions to the source as seen from above. Raises
+    InputError for poses that are none, see `Rays.checked`. `Geometry.from_poses` gives a `CircularGeometry` where it can.
 
-    angles   [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi
+        PosedGeometry(poses=Rays(source, corner, u, v, parallel=False), nDetector=(20, 24), nVoxel=64, dVoxel=0.5)
     """
-    return pitch * np.asarray(angles, float) / (2 * np.pi)
+
+    poses: Rays = field(repr=False)
+    mode: str = field(init=False)
+    dDetector: tuple[float, float] = field(init=False)
+    angles: np.ndarray = field(init=False, repr=False)
+    DSO: float = field(init=False)
+    DSD: float = field(init=False)
+
+    def __post_init__(self):
+        rays = self.poses.checked()
+        step_v, step_u = (float(np.mean(np.linalg.norm(x, axis=1))) for x in (rays.v, rays.u))
+        object.__setattr__(self, 'poses', rays)
+        object.__setattr__(self, 'mode', 'parallel' if rays.parallel else 'cone')
+        object.__setattr__(self, 'dDetector', (step_v, step_u))
+        super().__post_init__()
+        toward = -rays.source if rays.parallel else rays.source - np.asarray(self.offOrigin)
+        object.__setattr__(self, 'angles', np.arctan2(toward[:, 1], toward[:, 0]))
+        normal = np.cross(rays.u, rays.v)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        to_panel = rays.corner if rays.parallel else rays.corner - rays.source
+        object.__setattr__(self, 'DSO', 0.0 if rays.parallel else float(np.mean(np.linalg.norm(toward, axis=1))))
+        object.__setattr__(self, 'DSD', float(np.mean(np.abs(np.sum(to_panel * normal, 1)))))
+
+    def rays(self) -> Rays:
+        """The rays of all views in the world frame, mm."""
+        return self.poses
+
+    def subset(self, index) -> PosedGeometry:
+        """The same scan with the views `index` only: a slice, or integers [m]."""
+        return replace(self, poses=self.poses[index])
+
+    def binned(self, factor: int) -> PosedGeometry:
+        """The same rays with `factor` x `factor` pixels taken as one: see `Geometry.binned`."""
+        by_v, by_u = self.bins(factor)
+        nv, nu = self.nDetector
+        poses = replace(self.poses, u=self.poses.u * by_u, v=self.poses.v * by_v)
+        return replace(self, nDetector=(nv // by_v, nu // by_u), poses=poses)
 
 
-def spread(total: int, n: int) -> np.ndarray:
-    """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses."""
-    if not 1 <= n <= total:
-        raise InputError(f'{n} views were asked for, but the scan has {total}')
-    return np.arange(n) * total // n
-
-
-def _circle(frames: Rays, nDetector) -> dict | None:
-    """DSO, DSD, dDetector, offDetector and angles of the circle that the poses are, None where they are none."""
-    out = -frames.source if frames.parallel else frames.source
-    angles = np.arctan2(out[:, 1], out[:, 0])
-    c, s = np.cos(angles), np.sin(angles)
-    centre = frames.centre(nDetector)
-    DSO = 0.0 if frames.parallel else float(np.mean(np.hypot(out[:, 0], out[:, 1])))
-    circle = dict(
-        DSO=DSO,
-        DSD=float(DSO - np.mean(centre[:, 0] * c + centre[:, 1] * s)),
-        angles=angles,
-        dDetector=tuple(float(np.mean(np.linalg.norm(x, axis=1))) for x in (frames.v, frames.u)),
-        offDetector=(float(np.mean(centre[:, 2])), float(np.mean(centre[:, 1] * c - centre[:, 0] * s))),
-    )
-    if not frames.parallel and not circle['DSD'] >= DSO > 0:
-        return None
-    like = scanner_rays(
-        circle['angles'], DSO, circle['DSD'], nDetector, circle['dDetector'], frames.parallel, circle['offDetector']
-    )
-    # A beam's direction moves what it meets at a distance.
-    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1
-    allowed = SAME * min(circle['dDetector'])
-    near = all(
-        np.abs(a - b).max() * size <= allowed
-        for a, b, size in (
-            (frames.source, like.source, reach),
-            (frames.corner, like.corner, 1),
-            (frames.u, like.u, nDetector[1]),
-            (frames.v, like.v, nDetector[0]),
-        )
-    )
-    return circle if near else None
+def _numbers(name: str, value, kind: type, length: int) -> tuple:
+    """`length` finite numbers of a kind; one may stand for all."""
+    array = np.atleast_1d(np.asarray(value, float)).ravel()
+    if len(array) == 1:
+        array = np.repeat(array, length)
+    if len(array) != length or not np.all(np.isfinite(array)):
+        raise InputError(f'{name} must be {length} finite numbers, not {value!r}')
+    return tuple(kind(x) for x in array)

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.phantoms import Phantom
 from lingo_mi.scan import Dataset, Scan
 
@@ -19,7 +20,7 @@ def default_geometry(phantom: Phantom, angles, pixels: int = 512) -> Geometry:
     pixels of 1 mm for a cube of 256 mm).
     """
     pixel = 2 * max(n * d for n, d in zip(phantom.data.shape, phantom.spacing)) / pixels
-    return Geometry(
+    return CircularGeometry(
         DSO=1000.0,
         DSD=1500.0,
         nDetector=(pixels, pixels),

@@ -22,8 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
-from lingo_mi.geometry.camera import voxel_matrices
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 
 COLUMN = 8  # floats a detector column
 RUN = 8  # voxels a lane of the transpose
@@ -97,7 +96,7 @@ class Joseph(Stack):
 
     def __init__(self, geometry: Geometry):
         super().__init__(geometry)
-        if geometry.poses is not None:
+        if not isinstance(geometry, CircularGeometry):
             raise InputError('this projector needs a source on a circle about z and an upright panel')
         half = np.hypot(*(abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2])))
         if geometry.mode == 'cone' and geometry.DSO <= half:
@@ -120,7 +119,7 @@ class Joseph(Stack):
 
     def _column_matrix(self):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
-        return voxel_matrices(self.geometry)[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
+        return self.geometry.voxel_matrices()[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
 
     def forward(self, volume, views):
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].

@@ -20,7 +20,6 @@ from scipy import fft
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.geometry.camera import voxel_matrices
 from lingo_mi.reconstruction.rectify import upright
 from lingo_mi.reconstruction.views import gaps
 from lingo_mi.scan import Scan
@@ -196,7 +195,7 @@ def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
     geometry = scan.geometry
     volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
     dr.make_opaque(volume)
-    matrices, weights = voxel_matrices(geometry), view_weights(geometry)
+    matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
     n = len(geometry)
     for start in range(0, n, BATCH):
         images = filtered(scan.projections[start : start + BATCH], geometry, filter).transpose(0, 2, 1)

@@ -10,9 +10,11 @@ import numpy as np
 from scipy import ndimage
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import SAME, Geometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.camera import camera_matrices
-from lingo_mi.geometry.rays import Rays, scanner_rays
+from lingo_mi.geometry.circle import SAME
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import scanner_rays
 from lingo_mi.reconstruction.views import gaps, require_pixels
 from lingo_mi.scan import Scan
 
@@ -67,14 +69,14 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     Raises InputError where the source leaves a circle about z, where the panel moves against it by more than a tenth of its
     size, is turned so far that no line along the circle crosses it, or is not wholly before the source.
     """
-    if geometry.poses is None:
+    if isinstance(geometry, CircularGeometry):
         return geometry
-    frames, (n_v, n_u) = geometry.poses, geometry.nDetector
+    rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
     DSO, DSD, angles = _circle(geometry, what)
     # Its positions are mm from the central ray, along the circle and downwards.
-    plane = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), frames.parallel)
+    plane = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), rays.parallel)
     corners = np.array([[0, n_u, 0, n_u], [0, 0, n_v, n_v], [1, 1, 1, 1]], float)
-    shadow = _homographies(frames, plane) @ corners
+    shadow = _homographies(rays, plane) @ corners
     if shadow[:, 2].min() <= 0:
         raise InputError(f'{what} needs a panel behind the axis; a part of this one is beside the source')
     shadow /= shadow[:, 2:]
@@ -95,32 +97,32 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
         else:
             right = max(right, -left)
             left = -right
-    step_u, step_v = _steps(_homographies(plane, frames), shadow)
-    return Geometry(
-        DSO,
-        DSD,
-        tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
-        (step_v, step_u),
-        geometry.nVoxel,
-        geometry.dVoxel,
-        angles,
-        geometry.mode,
-        geometry.offOrigin,
-        (-(top + bottom) / 2, (left + right) / 2),
+    step_u, step_v = _steps(_homographies(plane, rays), shadow)
+    return CircularGeometry(
+        DSO=DSO,
+        DSD=DSD,
+        nDetector=tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
+        dDetector=(step_v, step_u),
+        nVoxel=geometry.nVoxel,
+        dVoxel=geometry.dVoxel,
+        angles=angles,
+        mode=geometry.mode,
+        offOrigin=geometry.offOrigin,
+        offDetector=(-(top + bottom) / 2, (left + right) / 2),
     )
 
 
 def _circle(geometry: Geometry, what: str):
     """DSO, the mean DSD and the angles [view] of the circle about z that the source moves on, InputError where it does not."""
-    frames = geometry.poses
-    out = -frames.source if frames.parallel else frames.source
+    rays = geometry.rays()
+    out = -rays.source if rays.parallel else rays.source
     angles = np.arctan2(out[:, 1], out[:, 0])
-    DSO = 0.0 if frames.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
-    depth = -np.sum(frames.centre(geometry.nDetector)[:, :2] * np.stack([np.cos(angles), np.sin(angles)], 1), 1)
+    DSO = 0.0 if rays.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
+    depth = -np.sum(rays.centre(geometry.nDetector)[:, :2] * np.stack([np.cos(angles), np.sin(angles)], 1), 1)
     DSD = DSO + max(float(depth.mean()), 0.0)
-    source = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), frames.parallel).source
-    reach = np.linalg.norm(frames.corner, axis=1).max() if frames.parallel else 1.0
-    if np.abs(source - frames.source).max() * reach > SAME * min(geometry.dDetector):
+    source = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), rays.parallel).source
+    reach = np.linalg.norm(rays.corner, axis=1).max() if rays.parallel else 1.0
+    if np.abs(source - rays.source).max() * reach > SAME * min(geometry.dDetector):
         raise InputError(f'{what} needs a source on a circle about z; this scan has other poses')
     return DSO, DSD, angles
 

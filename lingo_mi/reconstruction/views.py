@@ -7,19 +7,19 @@ from itertools import product
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
 def on_circle(scan: Scan) -> bool:
     """Whether the source moves on a circle about z before an upright panel, and every pixel is valid; `upright.is_circular`
     asks the same of a panel that is turned or tilted."""
-    return scan.geometry.poses is None and scan.valid is None
+    return isinstance(scan.geometry, CircularGeometry) and scan.valid is None
 
 
 def require_circle(scan: Scan, what: str):
     """Raises InputError, naming what needs it, for a scan that is not `on_circle`."""
-    if scan.geometry.poses is not None:
+    if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)
 

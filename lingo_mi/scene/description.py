@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.files import astra
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.tigre import to_posed
-from lingo_mi.geometry.base import Geometry, circular, helix
+from lingo_mi.geometry import astra
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.scene.data_files import data_file
 
 MOST_VIEWS = 100_000
@@ -55,32 +54,24 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
     def join(values):
         return ', '.join(repr(float(x)) if isinstance(x, float) else str(x) for x in values)
 
-    g = geometry
-    if g.poses is not None:
-        vectors = astra.to_vectors(g.poses, g.nDetector)
-        return dict(
-            type='ct_scanner',
-            mode=g.mode,
-            nDetector=join(g.nDetector),
-            nVoxel=join(g.nVoxel),
-            dVoxel=join(g.dVoxel),
-            offOrigin=join(g.offOrigin),
-            poses=join(vectors.ravel().tolist()),
-            view=index,
-        )
-    return dict(
+    shared = dict(
         type='ct_scanner',
-        mode=g.mode,
-        DSO=g.DSO,
-        DSD=g.DSD,
-        nDetector=join(g.nDetector),
-        dDetector=join(g.dDetector),
-        offDetector=join(g.offDetector),
-        nVoxel=join(g.nVoxel),
-        dVoxel=join(g.dVoxel),
-        offOrigin=join(g.offOrigin),
-        angles=join(np.degrees(g.angles).tolist()),
+        mode=geometry.mode,
+        nDetector=join(geometry.nDetector),
+        nVoxel=join(geometry.nVoxel),
+        dVoxel=join(geometry.dVoxel),
+        offOrigin=join(geometry.offOrigin),
         view=index,
+    )
+    if not isinstance(geometry, CircularGeometry):
+        vectors = astra.to_vectors(geometry.rays(), geometry.nDetector)
+        return shared | dict(poses=join(vectors.ravel().tolist()))
+    return shared | dict(
+        DSO=geometry.DSO,
+        DSD=geometry.DSD,
+        dDetector=join(geometry.dDetector),
+        offDetector=join(geometry.offDetector),
+        angles=join(np.degrees(geometry.angles).tolist()),
     )
 
 
@@ -152,12 +143,11 @@ def read_scanner(props):
         raise InputError(f'rotDetector must be 3 angles (roll, pitch, yaw), not {turned}')
 
     def geometry(at):
-        circle = Geometry(angles=at, **shared)
+        circle = CircularGeometry(angles=at, **shared)
         if not (pitch or tilt or any(turned)):
             return circle
-        plain = {f.name: getattr(circle, f.name) for f in fields(circle) if f.name != 'poses'}
         return Geometry.per_view(
-            **plain, height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned)
+            **circle.numbers(), height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned)
         )
 
     if not held_out:
@@ -174,7 +164,7 @@ def _read_poses(props, shared):
     known = {k: v for k, v in shared.items() if k != 'mode'}
     known |= {'dDetector': _numbers(props, 'dDetector')} if 'dDetector' in props else {}
 
-    def frames(n_detector, step, parallel, origin):
+    def views(n_detector, step, parallel, origin):
         poses = props['poses']
         try:
             numbers = [float(x) for x in poses.replace(',', ' ').split()]
@@ -184,4 +174,4 @@ def _read_poses(props, shared):
             raise InputError(f'poses must be 12 numbers for every view, not {len(numbers)}')
         return astra.from_vectors(np.reshape(numbers, (-1, 12)), n_detector, parallel)
 
-    return to_posed(known | {'mode': shared['mode']}, frames, 'poses')
+    return to_posed(known | {'mode': shared['mode']}, views, 'poses')

@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import spread
+from lingo_mi.geometry.trajectories import spread
 from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
 from lingo_mi.projectors.accuracy import Quality

@@ -11,7 +11,8 @@ from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS, VOLUMETRIC
 from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.ipsd import ipsd
 from lingo_mi.phantoms.x3d_scan import simulate
 from lingo_mi.results.measure import quick_measure
@@ -24,7 +25,15 @@ def dataset(side: int, pixels: int, views: int) -> Dataset:
     """The foot phantom on side^3 voxels, before panels of pixels^2."""
     phantom = phantoms.make('foot', side)
     angles = np.concatenate([circular(views, 180.0), np.sort(np.random.default_rng(0).uniform(0, np.pi, views))])
-    geometry = Geometry(1000.0, 1500.0, pixels, 512 / pixels, phantom.data.shape, phantom.spacing, angles)
+    geometry = CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=pixels,
+        dDetector=512 / pixels,
+        nVoxel=phantom.data.shape,
+        dVoxel=phantom.spacing,
+        angles=angles,
+    )
     both = Scan(geometry, simulate(phantom, geometry))
     return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)
 

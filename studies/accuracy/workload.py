@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
 from lingo_mi.studies.closed_form import image_and_gradients
@@ -40,7 +40,16 @@ class Workload:
         self.columns = [x.astype(np.float32) for x in columns]
         self.pixels, self.order = pixels, order
         self.weights = rng.normal(size=(pixels, pixels)).astype(np.float32)
-        self.geometry = Geometry(DSO, DSD, pixels, PANEL / pixels, 8, 1 / 4, [0.4], mode=mode)
+        self.geometry = CircularGeometry(
+            DSO=DSO,
+            DSD=DSD,
+            nDetector=pixels,
+            dDetector=PANEL / pixels,
+            nVoxel=8,
+            dVoxel=1 / 4,
+            angles=[0.4],
+            mode=mode,
+        )
         self.view = View.of(self.geometry.rays(), 0, pixels, pixels)
         self.data = mi.TensorXf(np.concatenate(self.columns[:3], 1))
         self.density = mi.TensorXf(self.columns[3][:, None])

@@ -27,7 +27,6 @@ from skimage.transform import resize_local_mean
 from lingo_mi import metrics, phantoms
 from lingo_mi.completion.two_stage import filled
 from lingo_mi.errors import InputError
-from lingo_mi.files.paths import replacing
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.fit import checkpoint
 from lingo_mi.fit.checkpoint import CHECKPOINT
@@ -36,6 +35,7 @@ from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import extensible, run
 from lingo_mi.fit.settings import Settings, settings_of
 from lingo_mi.interrupts import between_steps
+from lingo_mi.paths import replacing
 from lingo_mi.phantoms.x3d_scan import scan
 from lingo_mi.progress import Progress
 from lingo_mi.reconstruction.asd_pocs import asd_pocs

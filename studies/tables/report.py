@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.files.paths import replacing
 from lingo_mi.fit.settings import settings_of
+from lingo_mi.paths import replacing
 from lingo_mi.studies.tables.cells import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume
 
 TITLES = dict(

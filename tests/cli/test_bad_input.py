@@ -10,7 +10,7 @@ import pytest
 
 from helpers.script import FIT, SCENE, fit
 from lingo_mi.files.scans import write_scan
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Scan
 
 QUICK = '--iterations', '2', '-D', 'n_points=100'
@@ -19,7 +19,9 @@ QUICK = '--iterations', '2', '-D', 'n_points=100'
 @pytest.fixture(scope='module')
 def scan():
     """Measured projections of nothing in particular."""
-    geometry = Geometry(DSO=100, DSD=150, nDetector=(8, 10), dDetector=4, nVoxel=16, dVoxel=1, angles=np.arange(6.0))
+    geometry = CircularGeometry(
+        DSO=100, DSD=150, nDetector=(8, 10), dDetector=4, nVoxel=16, dVoxel=1, angles=np.arange(6.0)
+    )
     return Scan(geometry, np.full((6, 8, 10), 3, np.float32))
 
 

@@ -24,7 +24,8 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.files.scans import write_scan
-from lingo_mi.geometry.base import circular
+from lingo_mi.geometry.base import CircularGeometry, PosedGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
 from lingo_mi.reconstruction.asd_pocs import asd_pocs
 from lingo_mi.reconstruction.fdk import fdk
@@ -458,7 +459,7 @@ def test_corrected_poses(scene, tmp_path):
     assert code == 0, err
     dataset, cloud = take_scan(load_scene(scene)), load_cloud(path)
     geometry = dataset.train.geometry
-    assert cloud.geometry.poses is None and cloud.corrected.poses is not None
+    assert isinstance(cloud.geometry, CircularGeometry) and isinstance(cloud.corrected, PosedGeometry)
     np.testing.assert_allclose(cloud.geometry.rays().source, geometry.rays().source[::2], atol=1e-4)
     measured = fitted_views(dataset, cloud.geometry)
     np.testing.assert_array_equal(measured.projections, dataset.train.projections[::2])

@@ -14,7 +14,7 @@ from lingo_mi.effects.hardening import Tube
 from lingo_mi.effects.scatter import Scatter, _energies, smoothed
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.objects import GridInCube, find_objects
 from lingo_mi.projectors.sampling import bounds, on_grid
 from lingo_mi.projectors.sensors import view_of
@@ -116,7 +116,7 @@ def geometry(**changes):
         angles=[0.3],
         offDetector=(10.0, 20.0),
     )
-    return Geometry(**settings | changes)
+    return CircularGeometry(**settings | changes)
 
 
 def water_box():

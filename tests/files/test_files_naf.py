@@ -9,7 +9,7 @@ import pytest
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import naf
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -155,8 +155,16 @@ def test_held_out_views_may_be_called_test(tmp_path):
 
 def sample():
     rng = np.random.default_rng(1)
-    g = Geometry(
-        900, 1400, (4, 6), (1.5, 2.5), (5, 6, 7), (1, 2, 3), [0.1, 0.7, 3.0], offOrigin=(1, -2, 3), offDetector=(4, -5)
+    g = CircularGeometry(
+        DSO=900,
+        DSD=1400,
+        nDetector=(4, 6),
+        dDetector=(1.5, 2.5),
+        nVoxel=(5, 6, 7),
+        dVoxel=(1, 2, 3),
+        angles=[0.1, 0.7, 3.0],
+        offOrigin=(1, -2, 3),
+        offDetector=(4, -5),
     )
     train = Scan(g, rng.random((3, 4, 6)))
     test = Scan(g.subset([2, 0]), rng.random((2, 4, 6)))
@@ -358,7 +366,12 @@ def test_write_refuses(tmp_path):
     dataset = sample()
     with pytest.raises(InputError, match='cannot be written'):
         naf.write(tmp_path / 'no folder' / 'a.pickle', dataset)
-    other = Scan(Geometry(900, 1400, (4, 6), (1.5, 2.5), (5, 6, 7), (1, 2, 4), [0.0]), np.ones((1, 4, 6)))
+    other = Scan(
+        CircularGeometry(
+            DSO=900, DSD=1400, nDetector=(4, 6), dDetector=(1.5, 2.5), nVoxel=(5, 6, 7), dVoxel=(1, 2, 4), angles=[0.0]
+        ),
+        np.ones((1, 4, 6)),
+    )
     with pytest.raises(InputError, match='one scanner'):
         naf.write(tmp_path / 'a.pickle', Dataset(dataset.train, other))
     assert not list(tmp_path.iterdir())

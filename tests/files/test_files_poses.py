@@ -6,11 +6,11 @@ import pytest
 import yaml
 
 from lingo_mi.errors import InputError
-from lingo_mi.files import astra, matrices, rtk_geometry
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan, write_scan
-from lingo_mi.geometry.base import Geometry, helix
-from lingo_mi.geometry.rays import rotation
+from lingo_mi.geometry import astra, matrices, rtk
+from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.trajectories import helix, rotation
 from lingo_mi.scan import Dataset, Scan
 
 SHAPE, STEP = (20, 24), (1.5, 2.0)
@@ -67,8 +67,8 @@ def test_round_trips(tmp_path, mode):
     np.testing.assert_allclose(pixels(back), pixels(f), atol=1e-9)
     if not parallel:  # the panel of a parallel beam may stand anywhere along it
         same_poses(back, f)
-    rtk_geometry.write(tmp_path / 'g.xml', f, SHAPE)
-    back = rtk_geometry.read(tmp_path / 'g.xml', SHAPE, STEP)
+    rtk.write(tmp_path / 'g.xml', f, SHAPE)
+    back = rtk.read(tmp_path / 'g.xml', SHAPE, STEP)
     np.testing.assert_allclose(pixels(back), pixels(f), atol=1e-9)
     if not parallel:
         same_poses(back, f)
@@ -79,7 +79,7 @@ def test_files_of_poses(tmp_path, name):
     f = scan_of().rays()
     path, vectors = tmp_path / name, astra.to_vectors(f, SHAPE)
     if name == 'g.xml':
-        rtk_geometry.write(path, f, SHAPE)
+        rtk.write(path, f, SHAPE)
     elif name == 'm.npy':
         np.save(path, matrices.to_matrices(f))
     elif name == 'p.npy':
@@ -99,8 +99,8 @@ def test_astra_vectors_by_hand():
     x, y = f.project([[10.0, 0.0, 4.0], [0.0, 100.0, 0.0]], 0)
     np.testing.assert_allclose(x, [12 + 1.5 * 10 / 2, 12])
     np.testing.assert_allclose(y, [10 + 1.5 * 4 / 1.5, 10])
-    g = Geometry.posed(f, SHAPE, **GRID)
-    assert g.poses is not None and (g.DSO, g.DSD) == (300, 450)  # its rows run up: not this package's circle
+    g = Geometry.from_poses(f, SHAPE, **GRID)
+    assert isinstance(g, PosedGeometry) and (g.DSO, g.DSD) == (300, 450)  # its rows run up: not this package's circle
 
 
 def test_matrices_by_hand():
@@ -109,7 +109,7 @@ def test_matrices_by_hand():
     c = np.sqrt(0.5)
     R = np.array([[-c, c, 0], [0, 0, -1], [-c, -c, 0]])  # right, down, forward of a camera at (c, c, 0)
     P = K @ np.column_stack([R, [0, 0, 300.0]])
-    circle = Geometry(300.0, 450.0, SHAPE, STEP, **GRID, angles=[np.pi / 4])
+    circle = CircularGeometry(DSO=300.0, DSD=450.0, nDetector=SHAPE, dDetector=STEP, **GRID, angles=[np.pi / 4])
     for sign in (1, -1):
         same_poses(matrices.from_matrices([sign * P], SHAPE, STEP, False), circle.rays())
     np.testing.assert_allclose(matrices.to_matrices(circle.rays())[0] * 450, P, atol=1e-9)
@@ -174,7 +174,7 @@ def rtk_file(tmp_path, parallel=False):
 
 @pytest.mark.parametrize('parallel', [False, True])
 def test_rtks_own_file(tmp_path, parallel):
-    f = rtk_geometry.read(rtk_file(tmp_path, parallel), SHAPE, STEP)
+    f = rtk.read(rtk_file(tmp_path, parallel), SHAPE, STEP)
     assert f.parallel == parallel and len(f) == 2
     for view, matrix in enumerate([RTK_PARALLEL] if parallel else RTK_MATRICES):
         a, b, w = np.array(matrix) @ np.concatenate([POINTS[:, [1, 2, 0]], np.ones((20, 1))], 1).T
@@ -185,16 +185,18 @@ def test_rtks_own_file(tmp_path, parallel):
 
 def test_matrices_in_the_file_for_rtk(tmp_path):
     """RTK refuses a file whose matrices are not its own."""
-    f = rtk_geometry.read(rtk_file(tmp_path), SHAPE, STEP)
-    rtk_geometry.write(tmp_path / 'again.xml', f, SHAPE)
+    f = rtk.read(rtk_file(tmp_path), SHAPE, STEP)
+    rtk.write(tmp_path / 'again.xml', f, SHAPE)
     text = (tmp_path / 'again.xml').read_text()
     parts = [part.split('</Matrix>')[0].split() for part in text.split('<Matrix>')[1:]]
     found = [np.reshape([float(x) for x in part], (3, 4)) for part in parts]
     np.testing.assert_allclose(found, RTK_MATRICES, rtol=1e-11, atol=1e-9)
-    circle = Geometry(300.0, 450.0, SHAPE, STEP, **GRID, angles=[0.3, 1.0], offDetector=(3.0, -4.0))
-    rtk_geometry.write(tmp_path / 'circle.xml', circle.rays(), SHAPE)
-    same = Geometry.posed(read_poses(tmp_path / 'circle.xml', SHAPE, STEP), SHAPE, **GRID)
-    assert same.poses is None
+    circle = CircularGeometry(
+        DSO=300.0, DSD=450.0, nDetector=SHAPE, dDetector=STEP, **GRID, angles=[0.3, 1.0], offDetector=(3.0, -4.0)
+    )
+    rtk.write(tmp_path / 'circle.xml', circle.rays(), SHAPE)
+    same = Geometry.from_poses(read_poses(tmp_path / 'circle.xml', SHAPE, STEP), SHAPE, **GRID)
+    assert isinstance(same, CircularGeometry)
     np.testing.assert_allclose(
         [same.DSO, same.DSD, *same.offDetector, *same.angles], [300, 450, 3, -4, 0.3, 1.0], rtol=1e-12
     )
@@ -276,7 +278,7 @@ def test_poses_in_yaml(tmp_path):
     np.save(tmp_path / 'matrices.npy', matrices.to_matrices(f))
     same_poses(read_scan(npy(tmp_path, poses='matrices.npy')).train.geometry.rays(), f)
     # Rows of RTK's images run up: the poses are given with the rows down, and the array is turned round to match.
-    rtk_geometry.write(tmp_path / 'g.xml', f, SHAPE)
+    rtk.write(tmp_path / 'g.xml', f, SHAPE)
     scan = read_scan(npy(tmp_path, poses='g.xml')).train
     same_poses(scan.geometry.rays(), f)
     np.testing.assert_array_equal(scan.projections, projections()[:, ::-1])
@@ -307,7 +309,7 @@ def test_moving_scanners_in_scenes(tmp_path):
     same_poses(
         sensor.test_geometry.rays(), Geometry.per_view(**like, angles=held_out, height=helix(held_out, 30.0)).rays()
     )
-    assert scanner(**plain).geometry.poses is None
+    assert isinstance(scanner(**plain).geometry, CircularGeometry)
     # A view of it is a sensor with the same poses, by its description.
     view = sensor.view(2)
     same_poses(view.geometry.rays(), sensor.geometry.rays())
@@ -318,7 +320,7 @@ def test_moving_scanners_in_scenes(tmp_path):
 def test_files_of_poses_in_scenes(tmp_path, monkeypatch):
     monkeypatch.setenv('LINGO_MI_DATA', str(tmp_path))
     f = scan_of().rays()
-    rtk_geometry.write(tmp_path / 'g.xml', f, SHAPE)
+    rtk.write(tmp_path / 'g.xml', f, SHAPE)
     same_poses(scanner(poses='g.xml', dDetector='1.5, 2').geometry.rays(), f)
     np.savetxt(tmp_path / 'p.txt', astra.to_vectors(f, SHAPE))
     same_poses(scanner(poses='p.txt').geometry.rays(), f)
@@ -408,7 +410,7 @@ def test_what_rtk_cannot_say(tmp_path):
         (tilted, 'askew'),
     ):
         with pytest.raises(InputError, match=match):
-            rtk_geometry.write(path, bad, SHAPE)
+            rtk.write(path, bad, SHAPE)
     assert not path.exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import r2
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -83,8 +83,16 @@ def test_optional_parts(tmp_path):
 
 def sample():
     rng = np.random.default_rng(1)
-    g = Geometry(
-        900, 1400, (4, 6), (1.5, 2.5), (5, 6, 7), (1, 2, 3), [0.1, 0.7, 3.0], offOrigin=(1, -2, 3), offDetector=(4, -5)
+    g = CircularGeometry(
+        DSO=900,
+        DSD=1400,
+        nDetector=(4, 6),
+        dDetector=(1.5, 2.5),
+        nVoxel=(5, 6, 7),
+        dVoxel=(1, 2, 3),
+        angles=[0.1, 0.7, 3.0],
+        offOrigin=(1, -2, 3),
+        offDetector=(4, -5),
     )
     return Dataset(
         Scan(g, rng.random((3, 4, 6))),

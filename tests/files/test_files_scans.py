@@ -10,21 +10,21 @@ import yaml
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan
 
 
 def sample(mode='cone'):
     rng = np.random.default_rng(1)
-    g = Geometry(
-        900,
-        1400,
-        (4, 6),
-        (1.5, 2.5),
-        (5, 6, 7),
-        (1, 2, 3),
-        [0.1, 0.7, 3.0],
-        mode,
+    g = CircularGeometry(
+        DSO=900,
+        DSD=1400,
+        nDetector=(4, 6),
+        dDetector=(1.5, 2.5),
+        nVoxel=(5, 6, 7),
+        dVoxel=(1, 2, 3),
+        angles=[0.1, 0.7, 3.0],
+        mode=mode,
         offOrigin=(1, -2, 3),
         offDetector=(4, -5),
     )

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lingo_mi import paths
 from lingo_mi.errors import InputError
-from lingo_mi.files import paths, volumes
+from lingo_mi.files import volumes
 from lingo_mi.files.volumes import centred_affine, first_voxel, git_blob_sha1, read_volume, write_volume
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 
 SHAPE, SPACING = (4, 5, 6), (0.5, 1.0, 2.5)
 COUNTS = np.arange(120, dtype=np.uint8).reshape(SHAPE)
@@ -124,7 +125,16 @@ def test_our_nifti_round_trips_unchanged(tmp_path, suffix, scale):
 def test_nifti_header_and_place(tmp_path):
     import nibabel
 
-    g = Geometry(900, 1400, (4, 6), 1, SHAPE, SPACING, [0.0], offOrigin=(10, 20, 30))
+    g = CircularGeometry(
+        DSO=900,
+        DSD=1400,
+        nDetector=(4, 6),
+        dDetector=1,
+        nVoxel=SHAPE,
+        dVoxel=SPACING,
+        angles=[0.0],
+        offOrigin=(10, 20, 30),
+    )
     path = tmp_path / 'v.nii'
     write_volume(path, COUNTS, SPACING, first_voxel(g), 'normalised')
     image = nibabel.load(path)

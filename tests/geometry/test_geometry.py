@@ -5,8 +5,9 @@ import pytest
 
 from helpers.bodies import BODIES
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, circular, helix
-from lingo_mi.geometry.rays import Rays, rotation, scanner_rays
+from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import circular, helix, rotation, scanner_rays
 from lingo_mi.scan import Scan
 
 PANEL = dict(nDetector=(24, 30), dDetector=(2.5, 2.0))
@@ -16,7 +17,7 @@ POINTS = np.random.default_rng(0).uniform(-15, 15, (20, 3))
 
 
 def circle(mode='cone', **changes):
-    return Geometry(**{**dict(DSO=300.0, DSD=450.0, angles=ANGLES, mode=mode), **PANEL, **GRID, **changes})
+    return CircularGeometry(**{**dict(DSO=300.0, DSD=450.0, angles=ANGLES, mode=mode), **PANEL, **GRID, **changes})
 
 
 def moving(**changes):
@@ -44,8 +45,8 @@ def test_circle_by_its_formula(mode):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_poses_of_a_circle_are_that_circle(mode):
     g = circle(mode, offDetector=(4.0, -7.0), offOrigin=(1.0, -2.0, 3.0))
-    same = Geometry.posed(g.rays(), g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
-    assert same.poses is None and same.mode == mode
+    same = Geometry.from_poses(g.rays(), g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+    assert isinstance(same, CircularGeometry) and same.mode == mode
     np.testing.assert_allclose(same.dDetector, g.dDetector, rtol=1e-14)
     np.testing.assert_allclose(pixels(same.rays()), pixels(g.rays()), atol=1e-10)
     if mode == 'cone':
@@ -67,7 +68,7 @@ def test_poses_of_a_circle_are_that_circle(mode):
 )
 def test_other_poses_are_kept(change):
     g = moving(**change)
-    assert g.poses is not None and len(g) == 5 and g.mode == 'cone'
+    assert isinstance(g, PosedGeometry) and len(g) == 5 and g.mode == 'cone'
     assert np.abs(pixels(g.rays()) - pixels(circle().rays())).max() > 0.01
     some = g.subset([3, 1])
     np.testing.assert_array_equal(some.rays().corner, g.rays().corner[[3, 1]])
@@ -87,7 +88,7 @@ def test_other_poses_are_kept(change):
 def test_no_motion_is_the_circle(change):
     """A helix of pitch 0, a tilt of 0, ... among them."""
     g = moving(**change)
-    assert g.poses is None
+    assert isinstance(g, CircularGeometry)
     np.testing.assert_allclose(pixels(g.rays()), pixels(circle().rays()), atol=1e-10)
 
 
@@ -288,13 +289,14 @@ def test_bad_poses():
     for match, change in bad.items():
         arrays = dict(source=f.source, corner=f.corner, u=f.u, v=f.v) | change
         with pytest.raises(InputError, match=match):
-            Geometry.posed(Rays(**arrays, parallel=False), **GRID, nDetector=(24, 30))
+            Geometry.from_poses(Rays(**arrays, parallel=False), **GRID, nDetector=(24, 30))
     p = circle('parallel').rays()
     with pytest.raises(InputError, match='view 0 has a beam along its panel'):
-        Geometry.posed(Rays(p.u, p.corner, p.u, p.v, True), **GRID, nDetector=(24, 30))
-    with pytest.raises(InputError, match='contradict'):
-        circle(poses=f[:2])
-    with pytest.raises(InputError, match='contradict'):
-        circle('parallel', poses=f)
+        Geometry.from_poses(Rays(p.u, p.corner, p.u, p.v, True), **GRID, nDetector=(24, 30))
+    # Angles and beam cannot contradict the poses: they follow from them.
+    few = PosedGeometry(poses=f[:2], **GRID, nDetector=(24, 30))
+    assert len(few) == len(few.angles) == 2 and few.mode == 'cone'
+    with pytest.raises(InputError, match='parallel and of a cone'):
+        few.joined(circle('parallel'))
     with pytest.raises(InputError, match='one scan'):
         moving(tilt=0.1).joined(circle('parallel'))

@@ -24,10 +24,10 @@ import pytest
 from scipy.ndimage import zoom
 
 from helpers.bodies import BODIES, Ellipsoids
-from lingo_mi.files import rtk_geometry
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.geometry.base import Geometry, helix
-from lingo_mi.geometry.rays import rotation
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.rtk import write as write_rtk
+from lingo_mi.geometry.trajectories import helix, rotation
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph
 
@@ -68,7 +68,7 @@ class RTK:
 
     def __init__(self, g, folder):
         self.g = g
-        rtk_geometry.write(folder / 'geometry.xml', g.rays(), g.nDetector)
+        write_rtk(folder / 'geometry.xml', g.rays(), g.nDetector)
         reader = rtk.ThreeDCircularProjectionGeometryXMLFileReader.New(Filename=str(folder / 'geometry.xml'))
         reader.GenerateOutputInformation()
         self.reader, self.geometry = reader, reader.GetOutputObject()
@@ -191,7 +191,7 @@ def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
 
 @pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, offset', 'parallel, offset'])
 def test_joseph_is_rtks(name, tmp_path, abdomen):
-    g = Geometry(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0)
+    g = CircularGeometry(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0)
     expected = RTK(g, tmp_path).volume(abdomen)
     found = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
     found = found.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)

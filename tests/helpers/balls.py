@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Scan
 
 
@@ -19,7 +20,7 @@ def geometry(mode='cone', angles=None, **changes):
         offOrigin=(5.0, -4.0, 3.0),
         offDetector=(4.0, -7.0),
     )
-    return Geometry(**{**settings, **changes})
+    return CircularGeometry(**{**settings, **changes})
 
 
 def ellipsoids(geo, *bodies):

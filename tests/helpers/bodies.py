@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lingo_mi.geometry.rays import rotation
+from lingo_mi.geometry.trajectories import rotation
 
 
 class Ellipsoids:

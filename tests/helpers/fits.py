@@ -7,7 +7,8 @@ import pytest
 
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.settings import R2
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.phantoms.gaussians import Cloud
 from lingo_mi.scan import Scan
@@ -39,7 +40,7 @@ def geometry(views=3, **changes):
         dVoxel=(8.0, 8.0, 8.0),
         angles=circular(views, 180, start=10),
     )
-    return Geometry(**{**settings, **changes})
+    return CircularGeometry(**{**settings, **changes})
 
 
 def tiny_scan(g, flat=False):

@@ -1,6 +1,7 @@
 """What tests share with grid projector."""
 
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 
 
 def scan(mode='cone', n=4, **changes):
@@ -16,4 +17,4 @@ def scan(mode='cone', n=4, **changes):
         offOrigin=(3.0, -2.0, 1.0),
         offDetector=(2.0, -4.0),
     )
-    return Geometry(**{**settings, **changes})
+    return CircularGeometry(**{**settings, **changes})

@@ -28,8 +28,9 @@ from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.fit.loop import run as fit
 from lingo_mi.fit.settings import FAST
 from lingo_mi.fit.state import activate
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.view import View, vector64
@@ -117,7 +118,7 @@ def scanner(mode='cone', shape=(24, 32), angle=33.0, size=(3.2, 3.0), **changes)
     settings = dict(
         DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, nVoxel=8, dVoxel=0.25, angles=np.radians([angle])
     )
-    return Geometry(**{**settings, 'mode': mode, **changes}).rays(), shape
+    return CircularGeometry(**{**settings, 'mode': mode, **changes}).rays(), shape
 
 
 def on_device(cloud):
@@ -579,7 +580,7 @@ def _render(cloud):
 
 def measured(angles, shape=(24, 24)):
     """A scan of some Gaussians, exact."""
-    geometry = Geometry(
+    geometry = CircularGeometry(
         DSO=5.0, DSD=7.5, nDetector=shape, dDetector=3.4 / max(shape), nVoxel=16, dVoxel=0.125, angles=angles
     )
     cloud, frames = random_cloud(np.random.default_rng(9), 6, spread=0.4, size=0.15), geometry.rays()

@@ -5,7 +5,8 @@ import pytest
 
 from lingo_mi.errors import InputError
 from lingo_mi.fit.r2_start import r2_initialise
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.density import FAINTEST, least_squares_factor, mean_pixel
 from lingo_mi.lingo.initialise import Settings, draw, initialise
 from lingo_mi.lingo.ipsd import ipsd, neighbour_distance, reverse_distance
@@ -25,7 +26,7 @@ def sphere_scan(radius=0.5, n=6, centre=(0.2, -0.1, 0.15), density=0.8, **change
         dVoxel=(2 / 48,) * 3,
         angles=circular(n, start=5),
     )
-    geometry = Geometry(**{**settings, **changes})
+    geometry = CircularGeometry(**{**settings, **changes})
     frames, out = geometry.normalised_rays(), []
     x, y = np.meshgrid(np.arange(geometry.nDetector[1]) + 0.5, np.arange(geometry.nDetector[0]) + 0.5)
     for view in range(n):

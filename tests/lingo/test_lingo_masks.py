@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo import voxel_filter
 from lingo_mi.lingo.masks import Masks, masks
 from lingo_mi.lingo.otsu import otsu
@@ -26,7 +27,7 @@ def scan(mode='cone', n=5, **changes):
         offOrigin=(0.1, 0.0, -0.05),
         offDetector=(0.043, 0.1),
     )
-    return Geometry(**{**settings, **changes})
+    return CircularGeometry(**{**settings, **changes})
 
 
 def random_masks(n, shape, rng):

@@ -11,7 +11,7 @@ import pytest
 
 from lingo_mi import phantoms
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.phantoms import chest, foot, gaussians, mesh, shepp_logan
 from lingo_mi.phantoms import x3d_scan as scanning
 
@@ -30,7 +30,7 @@ def _halved(data):
 
 
 def _geometry(mode='cone', angles=(0.0, 0.7, 2.3), pixels=16, pixel=21.0, size=64):
-    return Geometry(
+    return CircularGeometry(
         DSO=1000.0,
         DSD=1500.0,
         nDetector=(pixels, pixels + 4),
@@ -192,7 +192,7 @@ def test_gaussian_projection_is_the_closed_form(mode):
 
 
 def test_gaussians_refuse_a_source_inside():
-    geometry = Geometry(DSO=40.0, DSD=300.0, nDetector=4, dDetector=1.0, nVoxel=8, dVoxel=32.0, angles=[0.0])
+    geometry = CircularGeometry(DSO=40.0, DSD=300.0, nDetector=4, dDetector=1.0, nVoxel=8, dVoxel=32.0, angles=[0.0])
     with pytest.raises(InputError, match='enlarge DSO'):
         gaussians.cloud(100).project(geometry)
     with pytest.raises(InputError, match='at least one'):

@@ -18,7 +18,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.scan import Scan
 
@@ -41,7 +41,7 @@ def scanner_geometry(sensor=SCANNER):
     def numbers(name):
         return [float(x) for x in sensor[name].split(',')]
 
-    return Geometry(
+    return CircularGeometry(
         DSO=sensor['DSO'],
         DSD=sensor['DSD'],
         angles=np.radians(numbers('angles')),
@@ -350,7 +350,7 @@ def middle(image):
 
 
 def asymmetric(mode, offset):
-    return Geometry(
+    return CircularGeometry(
         DSO=400.0,
         DSD=600.0,
         nDetector=(120, 100),

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.alpha import composite, flatten
 from lingo_mi.projectors.view import View
 
@@ -13,7 +14,7 @@ NAMES = 'centre', 'scale', 'rotation', 'opacity', 'radiance'
 
 
 def geometry(mode='cone'):
-    return Geometry(
+    return CircularGeometry(
         DSO=500.0,
         DSD=750.0,
         nDetector=(22, 37),

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.phantoms.mesh import Mesh, flange
 from lingo_mi.runtime import use_variant
@@ -136,8 +136,16 @@ def test_pixel_centres_on_vertices_of_many_triangles():
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_concave_part_with_holes(mode):
-    geometry = Geometry(
-        900, 1400, SHAPE, (8.0, 8.0), (32,) * 3, (8.0,) * 3, [0.3, 2.0, 4.4], mode, offDetector=(11.0, -7.0)
+    geometry = CircularGeometry(
+        DSO=900,
+        DSD=1400,
+        nDetector=SHAPE,
+        dDetector=(8.0, 8.0),
+        nVoxel=(32,) * 3,
+        dVoxel=(8.0,) * 3,
+        angles=[0.3, 2.0, 4.4],
+        mode=mode,
+        offDetector=(11.0, -7.0),
     )
     part = flange()
     paths, frames = paths_of(part), geometry.rays()

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from helpers.algorithms import ALGORITHMS
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from helpers.grids import scan
-from lingo_mi.geometry.base import Geometry, circular, helix
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.projectors.exact import ExactPair
 from lingo_mi.projectors.grid import backproject, project
 from lingo_mi.projectors.joseph import Joseph
@@ -25,7 +26,7 @@ def moved(geo, shift=0.0, turn=(0.0, 0.0, 0.0)):
     n = len(geo)
     turns = Rotation.from_rotvec(np.tile(turn, (n, 1))).as_matrix()
     shifts = np.broadcast_to(np.reshape(shift, (-1, 1)) * [0, 0, 1.0], (n, 3))
-    return Geometry.posed(geo.rays().moved(turns, shifts), geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
+    return Geometry.from_poses(geo.rays().moved(turns, shifts), geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
 
 
 def laminography(geo):

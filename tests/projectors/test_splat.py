@@ -10,7 +10,7 @@ import pytest
 from helpers import oracle
 from helpers.hard_cases import PARAMETERS, host, on_device
 from helpers.oracle import Cloud, Pose, random_cloud, relative
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.exponential import exp2_of_negative
@@ -28,7 +28,7 @@ def scanner(mode='cone', shape=(33, 46), angle=33.0, size=(3.2, 3.0), **changes)
     settings = dict(
         DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, nVoxel=8, dVoxel=0.25, angles=np.radians([angle])
     )
-    return Geometry(**{**settings, 'mode': mode, **changes}).rays(), shape
+    return CircularGeometry(**{**settings, 'mode': mode, **changes}).rays(), shape
 
 
 def tilted(parallel):

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.algorithms import ALGORITHMS
 from helpers.balls import BALL, assert_ball, ball_errors, ellipsoids, geometry
-from lingo_mi.geometry.base import circular
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.fdk import fdk
 
 # A panel off the axis by a few pixels, and one that reaches 110 mm on one side of the central ray, 10 mm on the other.

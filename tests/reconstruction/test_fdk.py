@@ -6,8 +6,8 @@ import pytest
 
 from helpers.balls import BALL, centres, ellipsoids, geometry
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, circular
-from lingo_mi.geometry.camera import voxel_matrices
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.fdk import WINDOWS, fdk, ramp, ray_weights, view_weights
 from lingo_mi.scan import Scan
 
@@ -115,7 +115,7 @@ def test_matrices_agree_with_the_frames(mode):
     geo = geometry(mode, circular(5, start=20))
     ijk = np.random.default_rng(0).integers(0, 28, (20, 3))
     points = (ijk + 0.5) * geo.dVoxel - np.array(geo.sVoxel) / 2 + geo.offOrigin
-    for view, matrix in enumerate(voxel_matrices(geo)):
+    for view, matrix in enumerate(geo.voxel_matrices()):
         x, y, w = matrix @ np.c_[ijk, np.ones(20)].T
         expected = geo.rays().project(points, view)
         np.testing.assert_allclose((x / w, y / w), expected, rtol=1e-10)
@@ -159,8 +159,14 @@ def test_measured_fan_beam(data):
     data = np.load(file)
     voxel = 0.1483
     angles = np.radians(data['angles_deg'][:-1])  # the last view repeats the first
-    geo = Geometry(
-        float(data['DSO']), float(data['DSD']), (1, 560), float(data['dDetector']), (512, 512, 1), voxel, angles
+    geo = CircularGeometry(
+        DSO=float(data['DSO']),
+        DSD=float(data['DSD']),
+        nDetector=(1, 560),
+        dDetector=float(data['dDetector']),
+        nVoxel=(512, 512, 1),
+        dVoxel=voxel,
+        angles=angles,
     )
     volume = fdk(Scan(geo, data['sinogram_ta'][:-1, None]))[..., 0]
     reference = data['fbp_ta']

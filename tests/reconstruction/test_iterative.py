@@ -16,7 +16,8 @@ from helpers.matrices import matrix
 from lingo_mi import phantoms
 from lingo_mi.completion.two_stage import complete
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
@@ -399,7 +400,7 @@ def test_no_kernel_is_compiled_after_the_first_iterations(system):
 @pytest.mark.parametrize('algorithm', [fdk, lambda scan: complete(scan, None, 9)])
 def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
     geo = small(n=5)
-    moved = Geometry.posed(
+    moved = Geometry.from_poses(
         geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]), geo.nDetector, geo.nVoxel, geo.dVoxel
     )
     ones = np.ones((5, *geo.nDetector), np.float32)
@@ -415,7 +416,7 @@ def test_the_projector_refuses_other_poses():
     geo = small(n=2)
     with pytest.raises(InputError, match='circle'):
         Joseph(
-            Geometry.posed(
+            Geometry.from_poses(
                 geo.rays().moved(shift=np.array([[0, 0, 0], [0, 0, 1.0]])), geo.nDetector, geo.nVoxel, geo.dVoxel
             )
         )

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.requirements import NEEDS, needed
 
 # Not `resource`, whose maximum begins with that of the process which started this one.
@@ -18,7 +19,8 @@ import numpy as np
 from lingo_mi.runtime import use_variant
 use_variant('llvm_ad_mono')
 import mitsuba as mi
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.asd_pocs import asd_pocs
 from lingo_mi.reconstruction.cgls import cgls
 from lingo_mi.reconstruction.fdk import fdk
@@ -28,7 +30,9 @@ from lingo_mi.scan import Scan
 from lingo_mi.projectors.joseph import Joseph
 
 def run(size, pixels, views):
-    geometry = Geometry(1000., 1500., (pixels, pixels), 512 / pixels, (size,) * 3, 256 / size, circular(views))
+    geometry = CircularGeometry(
+        DSO=1000., DSD=1500., nDetector=pixels, dDetector=512 / pixels, nVoxel=size, dVoxel=256 / size, angles=circular(views)
+    )
     project = Joseph(geometry).forward(mi.Float(np.ones(size ** 3, np.float32)), np.arange(views))[0]
     scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
     del project
@@ -50,7 +54,15 @@ print(before, peak())
 
 def scanned(size, pixels, views):
     """The geometry that `PROGRAM` runs."""
-    return Geometry(1000.0, 1500.0, (pixels, pixels), 512 / pixels, (size,) * 3, 256 / size, circular(views))
+    return CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(pixels, pixels),
+        dDetector=512 / pixels,
+        nVoxel=(size,) * 3,
+        dVoxel=256 / size,
+        angles=circular(views),
+    )
 
 
 def taken(algorithm, *sizes):

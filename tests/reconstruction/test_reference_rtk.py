@@ -9,7 +9,7 @@ import pytest
 
 from helpers import rtk
 from helpers.balls import BALL, centres, ellipsoids, geometry
-from lingo_mi.geometry.base import circular
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.cgls import cgls
 from lingo_mi.reconstruction.fdk import fdk
 from lingo_mi.reconstruction.sart import sweep

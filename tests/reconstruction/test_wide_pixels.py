@@ -9,7 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from lingo_mi import phantoms
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
@@ -40,7 +41,9 @@ def test_blurred_is_that_of_scipy():
 
 def test_excess_width():
     """Magnified 1.5 times, pixels are 2 mm wide and 4 mm high at the axis."""
-    geo = Geometry(400, 600, (8, 8), (6, 3), (4, 4, 4), (1, 2, 2), circular(3))
+    geo = CircularGeometry(
+        DSO=400, DSD=600, nDetector=(8, 8), dDetector=(6, 3), nVoxel=(4, 4, 4), dVoxel=(1, 2, 2), angles=circular(3)
+    )
     np.testing.assert_allclose(excess_width(geo), (0.5**0.5, 0, 0.5**0.5), rtol=1e-6)
     np.testing.assert_allclose(excess_width(replace(geo, dVoxel=(2.01, 2.01, 4.01))), 0)
     np.testing.assert_allclose(excess_width(replace(geo, mode='parallel', dDetector=(2, 1))), (0, 0, 0))

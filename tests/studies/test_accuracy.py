@@ -13,7 +13,7 @@ import pytest
 from helpers import oracle
 from helpers.oracle import random_cloud, relative
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.accuracy import PRESETS
 from lingo_mi.studies import alternatives
 from lingo_mi.studies.accuracy import Sizes, measure
@@ -72,7 +72,7 @@ def render(work, **settings):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_closed_form_is_the_oracle(mode):
     rng = np.random.default_rng(3)
-    g = Geometry(
+    g = CircularGeometry(
         DSO=5,
         DSD=7.5,
         nDetector=(20, 27),

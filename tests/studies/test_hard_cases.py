@@ -17,7 +17,8 @@ from lingo_mi.fit.loss_scale import loss_scale, otsu
 from lingo_mi.fit.losses import combined, ssim
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import activate, inverse_scale, inverse_softplus, softplus, start
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.masks import Masks, masks
 from lingo_mi.lingo.otsu import otsu as otsu_of_paper
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
@@ -312,7 +313,7 @@ def test_otsu_of_flat_images(value):
 
 @pytest.mark.parametrize('full, expected', [(False, 0.0), (True, 1.0)])
 def test_voxel_scaling_at_the_ends_of_occupancy(full, expected):
-    geometry = Geometry(
+    geometry = CircularGeometry(
         DSO=5.0, DSD=7.0, nDetector=(40, 40), dDetector=0.2, nVoxel=32, dVoxel=0.0625, angles=circular(4)
     )
     everywhere = np.full((4, 40, 40), full)

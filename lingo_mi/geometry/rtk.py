@@ -1,4 +1,4 @@
-"""RTK's geometry files: `RTKThreeDCircularGeometry` in XML, versions 2 and 3.
+"""RTK's geometry: its object, and its files, `RTKThreeDCircularGeometry` in XML, versions 2 and 3.
 
 Every view has SourceToIsocenterDistance (SID), SourceToDetectorDistance (SDD; 0: a parallel beam), GantryAngle,
 OutOfPlaneAngle and InPlaneAngle in degrees, ProjectionOffsetX and Y, SourceOffsetX and Y, in mm; what all views share may
@@ -17,6 +17,7 @@ Rit et al., "The Reconstruction Toolkit (RTK)", J. Phys.: Conf. Ser. 489 (2014),
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,9 +25,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.errors import InputError
-from lingo_mi.files.paths import one_line, reading, replacing
 from lingo_mi.geometry.camera import camera_matrices
-from lingo_mi.geometry.rays import Rays, rotation
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import rotation
+from lingo_mi.paths import one_line, reading, replacing
 
 ROOT = 'RTKThreeDCircularGeometry'
 _NUMBERS = (
@@ -40,66 +42,71 @@ _NUMBERS = (
     'SourceOffsetX',
     'SourceOffsetY',
 )
+_ANGLES = slice(2, 5)  # of _NUMBERS
 _IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', 'CollimationVSup')
 _AXES = [2, 0, 1]  # our x, y, z in RTK's
 
 
-def read(path, nDetector, dDetector) -> Rays:
-    """The views of a file, in mm, rows down. nDetector, dDetector: (v, u), pixels and mm.
+def read(source, nDetector, dDetector) -> Rays:
+    """The views of RTK's geometry, in mm, rows down.
+
+    source                 the path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`
+    nDetector, dDetector   (v, u), pixels and mm
 
     Raises InputError where the file is missing, damaged or another one, for cylindrical detectors, and for elements that
-    are not known. The matrices in the file, which follow from its numbers, and collimation are passed over.
+    are not known. The matrices, which follow from the numbers, and collimation are passed over.
     """
-    views = [[view[name] for name in _NUMBERS] for view in _views(path)]
-    if not views:
-        raise InputError(f'{path}: holds no projections')
-    sid, sdd, gantry, out, turn, px, py, sx, sy = np.array(views).T
+    where = source if isinstance(source, (str, PathLike)) else "RTK's geometry"
+    columns = _from_file(source) if where is source else _from_object(source)
+    sid, sdd, gantry, out, turn, px, py, sx, sy = columns
+    if not len(sid):
+        raise InputError(f'{where}: holds no projections')
     parallel = not sdd.any()
     if not parallel and not (sdd > 0).all():
         raise InputError(
-            f'{path}: mixes parallel and cone beams (SourceToDetectorDistance of 0 and not), or has a negative distance'
+            f'{where}: mixes parallel and cone beams (SourceToDetectorDistance of 0 and not), or has a negative distance'
         )
-    axes = rotation('y', np.radians(gantry)) @ rotation('x', np.radians(out)) @ rotation('z', np.radians(turn))
+    axes = rotation('y', gantry) @ rotation('x', out) @ rotation('z', turn)
     e1, e2, e3 = (axes[:, _AXES, i] for i in range(3))
     (nv, nu), (dv, du) = nDetector, dDetector
     x, y, z = (a[:, None] for a in (px - nu / 2 * du, py + nv / 2 * dv, sid - sdd if not parallel else 0 * sid))
-    source = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
+    start = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
     try:
-        return Rays(source, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
+        return Rays(start, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
     except InputError as error:
-        raise InputError(f'{path}: {error}') from None
+        raise InputError(f'{where}: {error}') from None
 
 
-def write(path, frames: Rays, nDetector) -> None:
+def write(path, rays: Rays, nDetector) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
 
     Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between
     views, mirrored ones, panels askew to a parallel beam; and where the file cannot be written.
     """
-    step_u, step_v = (np.linalg.norm(a, axis=1) for a in (frames.u, frames.v))
-    e1, e2 = frames.u / step_u[:, None], -frames.v / step_v[:, None]
+    step_u, step_v = (np.linalg.norm(a, axis=1) for a in (rays.u, rays.v))
+    e1, e2 = rays.u / step_u[:, None], -rays.v / step_v[:, None]
     e3 = np.cross(e1, e2)
     if np.abs(np.sum(e1 * e2, 1)).max() > 1e-6:
         raise InputError(f'{path}: RTK has no panels whose rows and columns are not at right angles')
     if any(np.ptp(step) > 1e-6 * step.mean() for step in (step_u, step_v)):
         raise InputError(f'{path}: RTK has one pixel size for all views')
-    centre = frames.centre(nDetector)
-    zero = np.zeros(len(frames))
-    if frames.parallel:
-        if np.abs(np.cross(frames.source, e3)).max() > 1e-6:
+    centre = rays.centre(nDetector)
+    zero = np.zeros(len(rays))
+    if rays.parallel:
+        if np.abs(np.cross(rays.source, e3)).max() > 1e-6:
             raise InputError(f'{path}: RTK has no panels askew to a parallel beam')
-        sid, sdd, sx, sy = np.full(len(frames), 1000.0), zero, zero, zero
+        sid, sdd, sx, sy = np.full(len(rays), 1000.0), zero, zero, zero
     else:
-        sx, sy, sid = (np.sum(frames.source * e, 1) for e in (e1, e2, e3))
+        sx, sy, sid = (np.sum(rays.source * e, 1) for e in (e1, e2, e3))
         sdd = sid - np.sum(centre * e3, 1)
-    if (np.sum(frames.source * e3, 1) > 0 if frames.parallel else sdd <= 0).any():
+    if (np.sum(rays.source * e3, 1) > 0 if rays.parallel else sdd <= 0).any():
         raise InputError(f'{path}: RTK has no mirrored panels')
     axes = np.stack([e[:, [1, 2, 0]] for e in (e1, e2, e3)], -1)
     gantry, out, turn = Rotation.from_matrix(axes).as_euler('YXZ', degrees=True).T
     px, py = (np.sum(centre * e, 1) for e in (e1, e2))
     columns = dict(zip(_NUMBERS, (sid, sdd, np.mod(gantry, 360), out, turn, px, py, sx, sy)))
     root = ElementTree.Element(ROOT, version='3')
-    for view, matrix in enumerate(_matrices(frames, nDetector, sdd, step_u, step_v)):
+    for view, matrix in enumerate(_matrices(rays, nDetector, sdd, step_u, step_v)):
         node = ElementTree.SubElement(root, 'Projection')
         for name, values in columns.items():
             ElementTree.SubElement(node, name).text = repr(float(values[view]))
@@ -110,6 +117,22 @@ def write(path, frames: Rays, nDetector) -> None:
     text = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
     with replacing(path) as temporary:
         temporary.write_text(text, encoding='utf-8')
+
+
+def _from_file(path) -> np.ndarray:
+    """The columns of `_NUMBERS` of all views, [9, n], angles in radians."""
+    views = [[view[name] for name in _NUMBERS] for view in _views(path)]
+    columns = np.array(views, float).reshape(-1, len(_NUMBERS)).T
+    columns[_ANGLES] = np.radians(columns[_ANGLES])
+    return columns
+
+
+def _from_object(geometry) -> np.ndarray:
+    """The same of RTK's object, which keeps its angles in radians."""
+    if geometry.GetRadiusCylindricalDetector():
+        raise InputError("RTK's geometry: RadiusCylindricalDetector is not supported")
+    plural = [name + 's' if not name.endswith(('X', 'Y')) else f'{name[:-1]}s{name[-1]}' for name in _NUMBERS]
+    return np.array([getattr(geometry, 'Get' + name)() for name in plural], float)
 
 
 def _views(path):
@@ -151,11 +174,11 @@ def _number(node, path) -> dict:
     return {node.tag: value}
 
 
-def _matrices(frames, nDetector, sdd, step_u, step_v):
+def _matrices(rays, nDetector, sdd, step_u, step_v):
     """RTK's own matrices: from RTK's (x, y, z, 1) to the image's position in mm, times the negative distance."""
-    to_mm = np.zeros((len(frames), 3, 3))
+    to_mm = np.zeros((len(rays), 3, 3))
     to_mm[:, 0, 0], to_mm[:, 0, 2] = step_u, -nDetector[1] / 2 * step_u
     to_mm[:, 1, 1], to_mm[:, 1, 2] = -step_v, nDetector[0] / 2 * step_v
     to_mm[:, 2, 2] = 1
-    scale = np.ones(len(frames)) if frames.parallel else -sdd
-    return scale[:, None, None] * (to_mm @ camera_matrices(frames))[:, :, [1, 2, 0, 3]]
+    scale = np.ones(len(rays)) if rays.parallel else -sdd
+    return scale[:, None, None] * (to_mm @ camera_matrices(rays))[:, :, [1, 2, 0, 3]]

@@ -16,9 +16,9 @@ from lingo_mi.geometry.rays import Rays
 _TO_INDEX = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 
 
-def to_matrices(frames: Rays) -> np.ndarray:
+def to_matrices(rays: Rays) -> np.ndarray:
     """The views' matrices, float64 [n, 3, 4]; w is 1 on the panel, 0 at the source (everywhere 1 for a parallel beam)."""
-    return _TO_INDEX @ camera_matrices(frames)
+    return _TO_INDEX @ camera_matrices(rays)
 
 
 def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0.0, 0.0, 0.0)) -> Rays:

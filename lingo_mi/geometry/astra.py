@@ -1,0 +1,105 @@
+"""Scans of the ASTRA toolbox: its dicts, and poses as its vectors, 12 numbers a view.
+
+    cone_vec         source, panel's centre, u, v
+    parallel3d_vec   direction of the beam, panel's centre, u, v
+
+each (x, y, z), u and v one pixel long: from pixel (0, 0) to its neighbour in the row, and in the column. ASTRA's world is
+this package's, in mm. Its arrays are [v, view, u] and volumes [z, y, x]: transpose them. `to_vectors` and `from_vectors` assume
+nothing about where a row lies: vectors made by ASTRA's own `geom_2vec` have v along +z, this package's scanners v along -z, and
+both mean the same as long as they stay with their projections. `circle` and `views` reverse ASTRA's rows, so that its scanners
+are this package's.
+
+ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.create_vol_geom`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.rays import Rays
+
+CIRCLES = {'cone': 'cone', 'parallel3d': 'parallel'}  # ASTRA's types of scans on a circle, and their beams
+VECTORS = {'cone_vec': 'cone', 'parallel3d_vec': 'parallel'}  # of scans with a pose for every view
+
+
+def to_vectors(rays: Rays, nDetector) -> np.ndarray:
+    """ASTRA's vectors of the views, float64 [n, 12]; nDetector is (v, u) pixels."""
+    return np.concatenate([rays.source, rays.centre(nDetector), rays.u, rays.v], 1)
+
+
+def from_vectors(vectors, nDetector, parallel: bool) -> Rays:
+    """The views of ASTRA's vectors [n, 12]; nDetector is (v, u) pixels. InputError where they are no poses."""
+    try:
+        vectors = np.asarray(vectors, float)
+    except (TypeError, ValueError):
+        raise InputError('poses must be 12 numbers for every view') from None
+    if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
+        raise InputError(
+            f'poses must be 12 numbers for every view (source, centre of the panel, u, v), not an array of '
+            f'shape {vectors.shape}'
+        )
+    source, centre, u, v = vectors[:, :3], vectors[:, 3:6], vectors[:, 6:9], vectors[:, 9:]
+    corner = centre - nDetector[1] / 2 * u - nDetector[0] / 2 * v
+    return Rays(source, corner, u, v, parallel).checked()
+
+
+def circle(proj_geom: dict) -> dict:
+    """The scanner of a dict of the types `CIRCLES`, as the numbers of a `CircularGeometry`; ASTRA's rows reversed.
+
+    Raises InputError where a number is missing.
+    """
+    mode = CIRCLES[proj_geom['type']]
+    DSO, to_panel = (
+        _given(proj_geom, 'DistanceOrigin' + of) if mode == 'cone' else 0.0 for of in ('Source', 'Detector')
+    )
+    return dict(
+        mode=mode,
+        DSO=DSO,
+        DSD=DSO + to_panel,
+        nDetector=_panel(proj_geom),
+        dDetector=(_given(proj_geom, 'DetectorSpacingY'), _given(proj_geom, 'DetectorSpacingX')),
+        # ASTRA's source is at DSO (sin a, -cos a, 0).
+        angles=np.asarray(_given(proj_geom, 'ProjectionAngles'), float) - np.pi / 2,
+    )
+
+
+def views(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
+    """The views of a dict of the types `VECTORS`, ASTRA's rows reversed, and the panel's pixels (v, u).
+
+    The beam of a parallel scan is taken to come from in front of its panel; its line integrals know no direction.
+
+    Raises InputError where the type is another one, a number is missing, or the vectors are no poses.
+    """
+    kind = proj_geom.get('type')
+    if kind not in VECTORS:
+        raise InputError(f'an ASTRA geometry must be of the type {", ".join(CIRCLES | VECTORS)}, not {kind!r}')
+    nDetector = _panel(proj_geom)
+    rays = from_vectors(_given(proj_geom, 'Vectors'), nDetector, VECTORS[kind] == 'parallel')
+    source, v = rays.source, -rays.v
+    if rays.parallel:
+        source = source * np.sign(np.sum(source * np.cross(rays.u, v), 1, keepdims=True))
+    return Rays(source, rays.corner - nDetector[0] * v, rays.u, v, rays.parallel), nDetector
+
+
+def grid(vol_geom: dict) -> dict:
+    """The voxel grid of a dict of `astra.create_vol_geom`: nVoxel, dVoxel and offOrigin, (x, y, z).
+
+    Raises InputError where it has two dimensions only, or a number is missing.
+    """
+    if 'GridSliceCount' not in vol_geom:
+        raise InputError('the ASTRA volume has no GridSliceCount: give one of three dimensions')
+    window = _given(vol_geom, 'option')
+    nVoxel = [_given(vol_geom, f'Grid{name}Count') for name in ('Col', 'Row', 'Slice')]
+    low, high = (np.array([_given(window, f'Window{end}{axis}') for axis in 'XYZ'], float) for end in ('Min', 'Max'))
+    return dict(nVoxel=nVoxel, dVoxel=(high - low) / nVoxel, offOrigin=(low + high) / 2)
+
+
+def _panel(proj_geom) -> tuple[int, int]:
+    return int(_given(proj_geom, 'DetectorRowCount')), int(_given(proj_geom, 'DetectorColCount'))
+
+
+def _given(values: dict, name: str):
+    if name not in values:
+        raise InputError(f'the ASTRA geometry has no {name}')
+    return values[name]

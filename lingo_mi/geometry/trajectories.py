@@ -1,0 +1,107 @@
+"""How a scanner moves: the angles of a circle, the heights of a helix, and the rays of any motion in TIGRE's terms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.rays import Rays
+
+
+def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
+    """n angles (radians) evenly spaced over [start, start + total) degrees."""
+    if n < 1:
+        raise InputError(f'a scan needs at least one view, not {n}')
+    return np.radians(start + total * np.arange(n) / n)
+
+
+def helix(angles, pitch: float) -> np.ndarray:
+    """Heights [n] in mm of a helix that climbs `pitch` mm a turn: 0 at the angle 0.
+
+    angles   [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi
+    """
+    return pitch * np.asarray(angles, float) / (2 * np.pi)
+
+
+def spread(total: int, n: int) -> np.ndarray:
+    """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses."""
+    if not 1 <= n <= total:
+        raise InputError(f'{n} views were asked for, but the scan has {total}')
+    return np.arange(n) * total // n
+
+
+def rotation(axis: str, angle) -> np.ndarray:
+    """Matrices [n, 3, 3] that turn by `angle` [n] (radians, right-handed) about 'x', 'y' or 'z'."""
+    angle = np.atleast_1d(np.asarray(angle, float))
+    i = 'xyz'.index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    out = np.zeros((len(angle), 3, 3))
+    out[:, i, i] = 1
+    out[:, j, j] = out[:, k, k] = np.cos(angle)
+    out[:, k, j] = np.sin(angle)
+    out[:, j, k] = -out[:, k, j]
+    return out
+
+
+def scanner_rays(
+    angles,
+    DSO,
+    DSD,
+    nDetector,
+    dDetector,
+    parallel=False,
+    offDetector=(0.0, 0.0),
+    rotDetector=(0.0, 0.0, 0.0),
+    COR=0.0,
+    height=0.0,
+    tilt=0.0,
+) -> Rays:
+    """The rays of a scanner's views in the world frame of `lingo_mi.geometry.base`, from TIGRE's numbers.
+
+    Each argument but `parallel`, `nDetector` and `dDetector` may be given once or per view, with a first axis of n.
+
+    angles       [n] radians, or [n, 3] Euler angles: the view is turned by Rz(a1) Ry(a2) Rz(a3)
+    DSO, DSD     distances from the source to the axis and to the panel, mm
+    nDetector, dDetector   pixels and pixel size in mm, (v, u)
+    offDetector  (v, u), mm: shift of the panel, positive v up; after its rotation
+    rotDetector  (roll, pitch, yaw), radians: the panel is turned by Rz(roll) Ry(pitch) Rx(yaw) about its centre, in the
+                 frame (towards the source, u, up). Roll turns it about the vertical, yaw in its own plane
+    COR          shift of source and panel along u, mm: minus the offset of the true axis of rotation
+    height       shift of source and panel along z, mm (a helix)
+    tilt         radians by which the source is lifted out of the plane of rotation, the panel sunk (laminography)
+
+    The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code), but for `height` and `tilt`,
+    which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite sign. The beam of a parallel
+    scan is not turned by rotDetector. Raises InputError where an argument has neither one value nor one a view.
+    """
+    angles = np.asarray(angles, float)
+    n = len(angles)
+
+    def each(name, value, *shape):
+        value = np.asarray(value, float)
+        if value.shape not in (shape, (n, *shape)):
+            raise InputError(
+                f'{name} must be {" x ".join(map(str, shape)) or "one"} number{"s" * bool(shape)}, or that for '
+                f'each of {n} views, not an array of shape {value.shape}'
+            )
+        return np.broadcast_to(value, (n, *shape))
+
+    euler = angles if angles.ndim == 2 else np.stack([angles, np.zeros(n), np.zeros(n)], 1)
+    euler = each('angles', euler, 3)
+    DSO, DSD, COR = each('DSO', DSO), each('DSD', DSD), each('COR', COR)
+    height, tilt = each('height', height), each('tilt', tilt)
+    off = each('offDetector', offDetector, 2)
+    roll, pitch, yaw = each('rotDetector', rotDetector, 3).T
+    (dv, du), (nv, nu) = dDetector, nDetector
+
+    # At the angle 0: the source on the x axis, u along y, rows down.
+    turn = rotation('z', euler[:, 0]) @ rotation('y', euler[:, 1] - tilt) @ rotation('z', euler[:, 2])
+    panel = turn @ rotation('z', roll) @ rotation('y', pitch) @ rotation('x', yaw)
+    out, across, up = (turn[:, :, i] for i in range(3))
+    u, v = panel[:, :, 1], -panel[:, :, 2]
+    tangent = rotation('z', euler[:, 0])[:, :, 1]
+    shift = COR[:, None] * tangent + height[:, None] * np.array([0.0, 0.0, 1.0])
+    centre = (DSO - DSD)[:, None] * out + off[:, 1:] * across + off[:, :1] * up + shift
+    corner = centre - nu / 2 * du * u - nv / 2 * dv * v
+    source = -out if parallel else DSO[:, None] * out + shift
+    return Rays(source, corner, du * u, dv * v, parallel)
