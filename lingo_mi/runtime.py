@@ -111,3 +111,24 @@ def use_variant(name: str | None = None) -> str:
     if variant.startswith('cuda'):
         raise InputError(f'--variant {name}: no NVIDIA GPU can be used; leave it out to run on the CPU')
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
+
+
+def ensure_variant(device: str | None = None) -> str:
+    """The name of the active Mitsuba variant, with derivatives; chooses one (`use_variant`) where none is active yet.
+
+    device   'cpu' or 'cuda', where the caller's arrays lie; None: anywhere
+
+    Raises InputError where no such variant can run, or where the active one works on another device.
+    """
+    import mitsuba as mi
+
+    active = mi.variant()
+    if active is None or '_ad_' not in active:
+        return use_variant({None: None, 'cpu': 'llvm_ad_mono', 'cuda': 'cuda_ad_mono'}[device])
+    where = 'cuda' if active.startswith('cuda') else 'cpu'
+    if device not in (None, where):
+        raise InputError(
+            f'the arrays are on the device {device!r}, but the variant {active} works on {where!r}: move the arrays there, or '
+            f'call mitsuba.set_variant({"cuda_ad_mono" if device == "cuda" else "llvm_ad_mono"!r}) first'
+        )
+    return active

@@ -8,6 +8,7 @@ import numpy as np
 
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import State
+from lingo_mi.projectors.upload import uploaded
 
 
 def _types():
@@ -96,18 +97,3 @@ def _softplus(x):
     small = dr.exp(dr.select(above, -x, x))
     series = small * (1 - small * (1 / 2 - small * (1 / 3 - small / 4)))  # 1 + small would round small away
     return dr.select(above, x, 0) + dr.select(small < 0.01, series, dr.log(1 + small))
-
-
-def uploaded(values):
-    """A copy of NumPy's values, Float [N], that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
-
-    Dr.Jit reads NumPy's memory in place and compiles its alignment into the kernels, which would then be others after every
-    densification.
-    """
-    room = np.empty(len(values) + 16, np.float32)
-    start = -room.ctypes.data % 64 // 4
-    out = room[start : start + len(values)]
-    out[:] = values
-    out = mi.Float(out)
-    dr.make_opaque(out)  # one value alone would otherwise be a literal, and be compiled in
-    return out

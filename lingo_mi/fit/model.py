@@ -10,10 +10,10 @@ from scipy import ndimage
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import hardened, second_share
 from lingo_mi.errors import InputError
-from lingo_mi.fit.device import uploaded
 from lingo_mi.fit.scatter import Scattered
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction import effects_correction as corrections
 from lingo_mi.scan import Scan
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fit import losses
-from lingo_mi.fit.device import DeviceState, uploaded
+from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.model import RENEWED, model_of, trusted, weights_of
 from lingo_mi.fit.poses import Poses, gathered, place
 from lingo_mi.fit.scatter import RENEWED as SCATTER_RENEWED
@@ -19,6 +19,7 @@ from lingo_mi.fit.view import Target, differentiate, differentiate_replayed, eva
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.objects import Ellipsoids
+from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.reconstruction.views import require_signal

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fit import losses
-from lingo_mi.fit.device import uploaded
 from lingo_mi.fit.loss_scale import loss_scale
 from lingo_mi.fit.settings import Settings
 from lingo_mi.projectors.alpha import composite, flatten
@@ -20,6 +19,7 @@ from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.frozen import Replay
 from lingo_mi.projectors.radiance import seen
 from lingo_mi.projectors.splat import splat
+from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
 

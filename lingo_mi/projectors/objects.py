@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import re
-import warnings
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.errors import InputError
 from lingo_mi.projectors import cloud, grid
+from lingo_mi.projectors.usable import require_usable
 
-# Shapes hold no Python attributes of ours, so what was learnt of a shape is kept here, the latest ones: a mesh's edges, and
-# that a cloud is usable. While an array is kept alive no other one has its index, so what has changed is not taken for it.
+# Caches by shape, since shapes hold no Python attributes of ours: the edges of a mesh, and that a cloud is usable. Keeping an
+# array alive stops Dr.Jit from reusing its index, which is part of the key.
 _MESHES: dict = {}
 MOST_MESHES = 64
 _USABLE: dict = {}
 MOST_USABLE = 2
-
-# Of Gaussians, in the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
-MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
-SAFE_ASPECT = 1e6
 
 
 def find_objects(scene) -> list:
@@ -65,46 +61,11 @@ class Ellipsoids:
         data, self.density = params['data'], params['density']
         self.second = params['second'] if 'second' in params else None  # share of a second material
         self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
-        key = data.index, self.density.index
-        if key not in _USABLE and self._usable():
+        key, gaussians = (data.index, self.density.index), (self.centre, self.scale, self.rotation, self.density)
+        if key not in _USABLE and require_usable(*gaussians, f'the ellipsoids {self.name!r}'):
             while len(_USABLE) >= MOST_USABLE:
                 _USABLE.pop(next(iter(_USABLE)))
             _USABLE[key] = dr.detach(data), dr.detach(self.density)
-
-    def _usable(self) -> bool:
-        """Whether all Gaussians can be integrated accurately; AccuracyWarning where they can, but not accurately, InputError
-        where they cannot. Waits for the device."""
-        with dr.suspend_grad():
-            shortest, longest = dr.min(self.scale), dr.max(self.scale)
-            turn = dr.squared_norm(self.rotation)
-            sound = (
-                dr.isfinite(dr.sum(self.centre) + dr.sum(self.scale) + self.density + turn)
-                & (dr.max(dr.abs(self.centre)) <= MOST_LENGTH)
-                & (longest <= MOST_LENGTH)
-                & (shortest >= 1 / MOST_LENGTH)
-                & (dr.abs(self.density) <= MOST_DENSITY)
-                & (turn > 1e-30)
-                & (longest <= MOST_ASPECT * shortest)
-            )
-            thin = longest > SAFE_ASPECT * shortest
-            worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if dr.width(sound) else 0
-            if worst == 2:
-                first = int(dr.compress(~sound)[0])
-                raise InputError(
-                    f'Gaussian {first} of the ellipsoids {self.name!r} is not usable: centre, density and rotation must '
-                    f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
-                    f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}'
-                )
-            if worst == 1:
-                first = int(dr.compress(thin)[0])
-                warnings.warn(
-                    AccuracyWarning(
-                        f'the scales of Gaussian {first} of the ellipsoids {self.name!r} are more than {SAFE_ASPECT:.0e} '
-                        'apart: its image may be off by 1e-4 and its derivatives by 1e-3'
-                    ),
-                    stacklevel=2,
-                )
-        return worst == 0
 
     @classmethod
     def of(cls, centre, scale, rotation, density, second, name: str) -> Ellipsoids:

@@ -1,0 +1,129 @@
+r"""The exact forward operators of a cloud of Gaussians, on whatever arrays the caller has.
+
+    sigma(x) = sum_i density_i exp(-1/2 |diag(1/scale_i) R_i^T (x - mean_i)|^2)
+
+`project` integrates sigma along the rays of a scan, in closed form (`projectors.footprint`); `voxelize` samples it at the
+centres of the scan's voxels. What comes out is of the caller's kind, with the caller's automatic differentiation:
+
+    NumPy, lists, anything with __array__ or __dlpack__ -> NumPy
+    Dr.Jit arrays and tensors -> TensorXf
+    PyTorch tensors -> tensors on the same device; on CUDA a variant of Mitsuba for CUDA must be active, or none yet
+    JAX arrays -> JAX arrays, by way of the host
+
+All is computed and given in float32, also for float64 input, whose gradients are float64 again.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.functional.frameworks import call
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors import cutoff
+from lingo_mi.projectors import voxelize as voxels
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.usable import require_usable
+from lingo_mi.projectors.view import View, vector64
+
+
+def project(
+    means,
+    scales,
+    quaternions,
+    density,
+    geometry: Geometry,
+    *,
+    extent: float = cutoff.RENDER,
+    views: Iterable[int] | None = None,
+):
+    """Line integrals of a cloud of Gaussians along the rays of a scan: images [n, v, u], float32, of the caller's kind.
+
+    means        [N, 3] centres, mm, in the world frame of `lingo_mi.geometry`
+    scales       [N, 3] standard deviations along the Gaussians' own axes, mm, positive
+    quaternions  [N, 4] rotations from these axes to the world, (x, y, z, w), of any length but zero
+    density      [N] values at the centres, in 1/mm for images without a unit
+    geometry     the scan; its rays run from the source (a parallel beam: from infinity) through the pixel centres to the panel
+    extent       cut-off in standard deviations, 1 to 20; 5 is good to 1e-5 of the image's maximum
+    views        indices of the views to project, n of them; None for all
+
+    The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
+    Differentiable in all four, not in the geometry: in forward and reverse mode, in JAX in reverse mode. A result that is to
+    be differentiated holds about 100 bytes for each Gaussian in each view until it is, so a step of a fit had better
+    project some views than all.
+
+        images = project(means, scales, quaternions, density, geometry, views=[0, 7])
+        loss = ((images - measured) ** 2).mean()
+        loss.backward()                              # PyTorch
+
+    Raises InputError for arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no
+    extent or no rotation, views that the scan has not, and arrays on another device than the active variant's.
+    """
+    height, width = geometry.nDetector
+    index = _indices(views, len(geometry.rays()))
+    rays = geometry.rays()[index]
+    extent = _extent(extent)
+
+    def images(*gaussians):
+        found = [line_integrals(*gaussians, View.of(rays, i, height, width), extent) for i in range(len(index))]
+        return found[0] if len(found) == 1 else dr.concat(found)
+
+    return call(
+        _checked(images, 'project'), (means, scales, quaternions, density), (len(index), height, width), 'project'
+    )
+
+
+def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent: float = cutoff.RENDER):
+    """Densities of a cloud of Gaussians at the centres of the scan's voxels: a grid [x, y, z], float32, of the caller's kind.
+
+    Arguments and errors are those of `project`. Differentiable in all four arrays, in reverse mode.
+
+        grid = voxelize(means, scales, quaternions, density, geometry)
+    """
+    shape = tuple(geometry.nVoxel)
+    corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
+    extent = _extent(extent)
+
+    def grid(*gaussians):
+        cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
+        values = voxels.voxelize(*gaussians, cells, extent, deep=True)
+        i, (nx, ny, nz) = dr.arange(mi.UInt32, np.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
+        # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
+        x, rest = i // (ny * nz), i % (ny * nz)
+        return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
+
+    return call(_checked(grid, 'voxelize'), (means, scales, quaternions, density), shape, 'voxelize')
+
+
+def _checked(function, name: str):
+    """A function of Gaussians that first makes sure that they are usable."""
+
+    def wrapped(*gaussians):
+        require_usable(*gaussians, f'the arrays given to {name}')
+        return function(*gaussians)
+
+    return wrapped
+
+
+def _extent(extent) -> float:
+    if not 1 <= extent <= 20:
+        raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
+    return float(extent)
+
+
+def _indices(views, count: int) -> np.ndarray:
+    """Indices of views, int [n], of those that a scan has."""
+    if views is None:
+        return np.arange(count)
+    try:
+        found = np.array([operator.index(i) for i in views], int)
+    except TypeError:
+        raise InputError(f'views must be whole numbers, one a view, not {views!r}') from None
+    if len(found) == 0 or found.min() < -count or found.max() >= count:
+        raise InputError(f'views must be at least one number from 0 to {count - 1}, not {views!r}')
+    return found

@@ -1,0 +1,47 @@
+"""JAX's arrays through Dr.Jit, by way of the host: a callback, so that it works within `jax.jit` and on any device."""
+
+from __future__ import annotations
+
+import drjit as dr
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lingo_mi.projectors.upload import uploaded_tensor
+
+
+def call_jax(function, arrays, shape):
+    """A function of Dr.Jit's tensors, of JAX's arrays: float32 of that shape, differentiable in reverse mode."""
+    arrays = [a.astype(jnp.float32) for a in arrays]
+
+    def values(*host):
+        return function(*map(uploaded_tensor, host)).numpy()
+
+    def gradients(upstream, *host):
+        tensors = [uploaded_tensor(a) for a in host]
+        dr.enable_grad(tensors)
+        dr.set_grad(out := function(*tensors), uploaded_tensor(upstream))
+        dr.enqueue(dr.ADMode.Backward, out)
+        dr.traverse(dr.ADMode.Backward)
+        return [dr.grad(x).numpy() for x in tensors]
+
+    @jax.custom_vjp
+    def operator(*arrays):
+        return _on_host(values, jax.ShapeDtypeStruct(shape, jnp.float32), *arrays)
+
+    def backward(arrays, upstream):
+        return tuple(_on_host(gradients, [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays], upstream, *arrays))
+
+    operator.defvjp(lambda *arrays: (operator(*arrays), arrays), backward)
+    return operator(*arrays)
+
+
+def _on_host(function, result, *arrays):
+    """function(*arrays) of NumPy's arrays; a callback where JAX traces, whose errors would hide ours elsewhere."""
+
+    def of_numpy(*arrays):
+        return function(*map(np.asarray, arrays))
+
+    if any(isinstance(a, jax.core.Tracer) for a in arrays):
+        return jax.pure_callback(of_numpy, result, *arrays, vmap_method='sequential')
+    return jax.tree.map(jnp.asarray, of_numpy(*arrays))

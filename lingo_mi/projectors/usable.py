@@ -1,0 +1,56 @@
+"""Which Gaussians can be integrated, and which of them accurately."""
+
+from __future__ import annotations
+
+import warnings
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.errors import AccuracyWarning, InputError
+
+# In the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
+MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
+SAFE_ASPECT = 1e6
+
+
+def require_usable(centre, scale, rotation, density, where: str) -> bool:
+    """Whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
+
+    centre, scale, rotation, density   as for `footprint.project`
+    where                              what the Gaussians belong to, for the messages
+
+    Warns with AccuracyWarning and returns False where a Gaussian can be integrated, but not accurately. Raises InputError
+    where one cannot be: it is not finite, its quaternion is zero, or a scale is not positive or out of range.
+    """
+    with dr.suspend_grad():
+        shortest, longest = dr.min(scale), dr.max(scale)
+        turn = dr.squared_norm(rotation)
+        sound = (
+            dr.isfinite(dr.sum(centre) + dr.sum(scale) + density + turn)
+            & (dr.max(dr.abs(centre)) <= MOST_LENGTH)
+            & (longest <= MOST_LENGTH)
+            & (shortest >= 1 / MOST_LENGTH)
+            & (dr.abs(density) <= MOST_DENSITY)
+            & (turn > 1e-30)
+            & (longest <= MOST_ASPECT * shortest)
+        )
+        thin = longest > SAFE_ASPECT * shortest
+        worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if dr.width(sound) else 0
+        if worst == 2:
+            first = int(dr.compress(~sound)[0])
+            raise InputError(
+                f'Gaussian {first} of {where} is not usable: centre, density and rotation must '
+                f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
+                f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}'
+            )
+        if worst == 1:
+            first = int(dr.compress(thin)[0])
+            warnings.warn(
+                AccuracyWarning(
+                    f'the scales of Gaussian {first} of {where} are more than {SAFE_ASPECT:.0e} '
+                    'apart: its image may be off by 1e-4 and its derivatives by 1e-3'
+                ),
+                stacklevel=3,
+            )
+    return worst == 0

@@ -1,0 +1,403 @@
+"""`functional.project` and `voxelize` on arrays of every kind: values and gradients against the float64 oracle, bad input."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from helpers import oracle
+from helpers.oracle import Pose, random_cloud, relative
+from lingo_mi.errors import InputError
+from lingo_mi.functional import project, voxelize
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.projectors.upload import uploaded_tensor
+from lingo_mi.runtime import ensure_variant
+from lingo_mi.studies.closed_form import image_and_gradients
+
+EXTENT = 6.0
+NAMES = 'centre', 'scale', 'rotation', 'density'
+KINDS = 'numpy', 'drjit', 'torch', 'jax'
+DIFFERENTIABLE = KINDS[1:]
+BEAMS = 'cone', 'parallel'
+
+
+def scan(mode='cone', nVoxel=(11, 9, 10)):
+    """Three views of a small panel, and an off-centre grid."""
+    return Geometry(
+        DSO=500,
+        DSD=750,
+        nDetector=(24, 31),
+        dDetector=(7, 6),
+        nVoxel=nVoxel,
+        dVoxel=(9, 10, 8),
+        angles=circular(3),
+        mode=mode,
+        offOrigin=(4, -3, 2),
+    )
+
+
+def gaussians(count=9):
+    return random_cloud(np.random.default_rng(1), count, spread=35, size=9)
+
+
+def columns(cloud):
+    return [np.float32(getattr(cloud, n)) for n in NAMES]
+
+
+def framework(kind: str):
+    if kind in ('torch', 'jax'):
+        return pytest.importorskip(kind, reason=f'{kind} is not installed')
+
+
+def arrays_of(kind, values):
+    """NumPy's arrays in another kind."""
+    module = framework(kind)
+    if kind == 'numpy':
+        return list(values)
+    if kind == 'drjit':
+        return [mi.TensorXf(x) for x in values]
+    if kind == 'torch':
+        return [module.tensor(x, device=_device()) for x in values]
+    return [module.numpy.asarray(x) for x in values]
+
+
+def _device():
+    return 'cuda' if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else 'cpu'
+
+
+def host(x):
+    """NumPy's values of an array of any kind, float64."""
+    return np.asarray(x.detach().cpu() if hasattr(x, 'detach') else x).astype(float)
+
+
+def differentiated(kind, function, values, weights):
+    """function(*values), and the derivatives of sum(weights * function) by the values, in arrays of a kind."""
+    arrays, (weights,) = arrays_of(kind, values), arrays_of(kind, [np.float32(weights)])
+    if kind == 'jax':
+        import jax
+
+        out, pullback = jax.vjp(function, *arrays)
+        return out, pullback(weights)
+    if kind == 'drjit':
+        dr.enable_grad(arrays)
+        out = function(*arrays)
+        dr.backward(dr.sum(out * weights, axis=None))
+        return out, [dr.grad(x) for x in arrays]
+    for x in arrays:
+        x.requires_grad_()
+    out = function(*arrays)
+    (out * weights).sum().backward()
+    return out, [x.grad for x in arrays]
+
+
+def assert_derivatives(found, expected):
+    for name, derivative in zip(NAMES, found):
+        assert relative(host(derivative), expected[name]) < 1e-5, name
+
+
+@pytest.fixture(scope='module', params=BEAMS)
+def views(request):
+    """A scan, weights of its pixels, images and derivatives by the oracle."""
+    g, cloud = scan(request.param), gaussians()
+    height, width = g.nDetector
+    weights = np.float32(np.random.default_rng(0).normal(size=(3, height, width))).astype(float)
+    poses = [Pose.of(g.rays(), i, height, width) for i in range(3)]
+    images = np.array([oracle.line_integrals(cloud, pose).reshape(height, width) for pose in poses])
+    parts = [oracle.gradients(cloud, pose, w.ravel()) for pose, w in zip(poses, weights)]
+    return g, cloud, weights, images, {n: sum(part[n] for part in parts) for n in NAMES}
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_images(kind, views):
+    g, cloud, _, expected, _ = views
+    arrays = arrays_of(kind, columns(cloud))
+    found = project(*arrays, g, extent=EXTENT)
+    assert type(found) is {'numpy': np.ndarray, 'drjit': mi.TensorXf}.get(kind, type(arrays[0]))
+    assert str(found.dtype).endswith('float32') if kind != 'drjit' else True
+    assert relative(host(found), expected) < 2e-6
+    some = project(*arrays, g, extent=EXTENT, views=[2, -3])
+    np.testing.assert_array_equal(host(some), host(found)[[2, 0]])
+
+
+@pytest.mark.parametrize('kind', DIFFERENTIABLE)
+def test_derivatives_of_images(kind, views):
+    g, cloud, weights, expected, derivatives = views
+    out, found = differentiated(kind, lambda *x: project(*x, g, extent=EXTENT), columns(cloud), weights)
+    assert relative(host(out), expected) < 2e-6
+    assert_derivatives(found, derivatives)
+
+
+def test_the_closed_form_agrees():
+    """By the float64 form that the published errors are measured against, one view alone."""
+    g, cloud = scan(), gaussians()
+    weights = np.random.default_rng(3).normal(size=g.nDetector)
+    image, expected = image_and_gradients([getattr(cloud, n) for n in NAMES], g.rays()[[1]], g.nDetector, weights)
+    out, found = differentiated(
+        'drjit', lambda *x: project(*x, g, extent=EXTENT, views=[1]), columns(cloud), weights[None]
+    )
+    assert relative(host(out), image) < 2e-6
+    assert_derivatives(found, expected)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('nVoxel', [(11, 9, 10), (6, 1, 13)])
+def test_voxels(kind, nVoxel):
+    g, cloud = scan(nVoxel=nVoxel), gaussians()
+    axes = [o + d * (np.arange(n) - (n - 1) / 2) for o, d, n in zip(g.offOrigin, g.dVoxel, nVoxel)]
+    points = np.stack(np.meshgrid(*axes, indexing='ij'), -1).reshape(-1, 3)
+    weights = np.float32(np.random.default_rng(0).normal(size=nVoxel)).astype(float)
+
+    def grid(*arrays):
+        return voxelize(*arrays, g, extent=EXTENT)
+
+    if kind == 'numpy':
+        out = grid(*columns(cloud))
+    else:
+        out, found = differentiated(kind, grid, columns(cloud), weights)
+        assert_derivatives(found, oracle.value_gradients(cloud, points, weights.ravel()))
+    assert tuple(out.shape) == nVoxel
+    assert relative(host(out), oracle.values_at(cloud, points)) < 2e-6
+
+
+def test_dr_jit_vectors(views):
+    """Point3f, Vector3f, Vector4f and Float give what tensors give, in forward mode, too."""
+    g, cloud, weights, expected, derivatives = views
+    types = mi.Point3f, mi.Vector3f, mi.Vector4f, mi.Float
+    arrays = [Type(x.T.copy()) for Type, x in zip(types, columns(cloud))]
+    dr.enable_grad(arrays)
+    images = project(*arrays, g, extent=EXTENT)
+    assert relative(images.numpy(), expected) < 2e-6
+    dr.forward(arrays[3])  # the image of densities that all grow by 1
+    along = (weights * dr.grad(images).numpy()).sum()
+    assert abs(along - derivatives['density'].sum()) < 1e-5 * np.abs(derivatives['density']).sum()
+
+
+def test_literals():
+    """Arrays of one number repeated, which Dr.Jit does not store."""
+    equal = [mi.TensorXf(x) for x in (np.zeros((5, 3)), np.full((5, 3), 9), np.tile([0, 0, 0, 1], (5, 1)))]
+    found = project(*equal, dr.full(mi.TensorXf, 0.2, 5), scan())
+    one = project(np.zeros((1, 3)), np.full((1, 3), 9), [[0, 0, 0, 1]], [1.0], scan())
+    np.testing.assert_allclose(found.numpy(), one, rtol=1e-5)
+
+
+def test_anything_that_numpy_reads():
+    """Lists, whole numbers, float64, arrays of another order of memory, and what knows __dlpack__ alone."""
+
+    class Foreign:
+        def __init__(self, values):
+            self.values = values
+
+        def __dlpack__(self, **options):
+            return self.values.__dlpack__(**options)
+
+        def __dlpack_device__(self):
+            return self.values.__dlpack_device__()
+
+    g, values = scan(), columns(gaussians())
+    expected = project(*values, g)
+    for convert in (np.ndarray.tolist, np.float64, np.asfortranarray, Foreign):
+        np.testing.assert_array_equal(project(*map(convert, values), g), expected)
+    whole = [[0, 1, 2]], [[9, 8, 7]], [[0, 0, 0, 2]], [1]
+    np.testing.assert_array_equal(project(*whole, g), project(*map(np.float32, whole), g))
+
+
+@pytest.mark.parametrize('kind', ['torch', 'jax'])
+def test_float64(kind):
+    """Float64 is computed in float32; PyTorch's derivatives are float64 again."""
+    module, g, values = framework(kind), scan(), columns(gaussians())
+    expected = project(*values, g)
+    if kind == 'jax':
+        with module.enable_x64(True):
+            arrays = [module.numpy.asarray(x, dtype='float64') for x in values]
+            assert arrays[0].dtype == 'float64'
+            found = project(*arrays, g)
+            slopes = module.grad(lambda m: project(m, *arrays[1:], g).sum())(arrays[0])
+    else:
+        arrays = [module.tensor(x, dtype=module.float64, device=_device(), requires_grad=True) for x in values]
+        found = project(*arrays, g)
+        found.sum().backward()
+        slopes = arrays[0].grad
+    assert str(found.dtype).endswith('float32') and str(slopes.dtype).endswith('float64')
+    np.testing.assert_allclose(host(found), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_torch_parameters_and_no_grad():
+    torch = framework('torch')
+    g, values = scan(), columns(gaussians())
+    parameters = [torch.nn.Parameter(x) for x in arrays_of('torch', values)]
+    out = project(*parameters, g)
+    out.sum().backward()  # of one value repeated
+    assert all(p.grad.shape == p.shape and p.grad.abs().max() > 0 for p in parameters)
+    with torch.no_grad():
+        without = project(*parameters, g)
+    assert out.requires_grad and not without.requires_grad
+    np.testing.assert_array_equal(host(out), host(without))
+    strided = [torch.stack([p.detach(), p.detach()], -1)[..., 0] for p in parameters]
+    np.testing.assert_array_equal(host(project(*strided, g)), host(without))
+
+
+def test_a_constant_in_torch():
+    """Derivatives by some of the four alone."""
+    framework('torch')
+    arrays = arrays_of('torch', columns(gaussians()))
+    arrays[3].requires_grad_()
+    project(*arrays, scan(), views=[0]).sum().backward()
+    assert arrays[3].grad.min() > 0 and arrays[0].grad is None
+
+
+def test_within_a_jitted_function_of_jax():
+    jax = framework('jax')
+    g, arrays = scan(), arrays_of('jax', columns(gaussians()))
+
+    def loss(*x):
+        return (project(*x, g, views=[0, 1]) ** 2).sum() + voxelize(*x, g).sum()
+
+    expected = jax.value_and_grad(loss, argnums=(0, 1, 2, 3))(*arrays)
+    found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3)))(*arrays)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_a_training_loop_in_torch():
+    """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
+    torch = framework('torch')
+    g = Geometry(500, 750, (32, 32), (6, 6), (16,) * 3, (8,) * 3, circular(8))
+    rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
+    measured = torch.tensor(project(*truth, g, extent=8.0), device=_device())
+    grid = voxelize(*truth, g, extent=8.0)
+
+    def parameter(values):
+        return torch.nn.Parameter(torch.tensor(values, dtype=torch.float32, device=_device()))
+
+    means = parameter(truth[0] + rng.normal(0, 4, (12, 3)))
+    log_scales = parameter(np.full((12, 3), np.log(12.0)))
+    quaternions = parameter(np.tile([0.0, 0, 0, 1], (12, 1)))
+    log_density = parameter(np.full(12, np.log(0.5)))
+    rates = (means, 0.6), (log_scales, 0.03), (quaternions, 0.03), (log_density, 0.03)
+    optimiser = torch.optim.Adam([dict(params=[p], lr=rate) for p, rate in rates])
+
+    def error():
+        found = voxelize(*(x.detach() for x in cloud()), g)
+        return relative(host(found), grid)
+
+    def cloud():
+        return means, log_scales.exp(), quaternions, log_density.exp()
+
+    before = error()
+    for step in range(200):
+        views = [step % 8, (step + 3) % 8]
+        loss = (project(*cloud(), g, views=views) - measured[views]).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    assert before > 0.4 and error() < 0.1
+
+
+def test_nothing_is_compiled_anew():
+    """Other views and other numbers of Gaussians run the kernels of the first."""
+    values = columns(gaussians(12))
+
+    def run(count, views):
+        def both():
+            arrays = [uploaded_tensor(x[:count]) for x in values]  # how the caller's lie in memory would be compiled in
+            dr.enable_grad(arrays)
+            images = project(*arrays, scan(), views=views)
+            dr.backward(dr.sum(images * images, axis=None))
+            dr.eval([dr.grad(x) for x in arrays])
+            project(*(x[:count] for x in values), scan(), views=views)
+            voxelize(*(x[:count] for x in values), scan())
+
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            both()
+            dr.sync_thread()
+            return {k['hash'] for k in dr.kernel_history((dr.KernelType.JIT,))}
+
+    known = run(12, [0]) | run(12, [0])  # what is recorded is traced a little differently from what is replayed
+    assert run(12, [1]) <= known and run(9, [2]) <= known and run(9, [0]) <= known
+
+
+GOOD = [np.zeros((4, 3)), np.ones((4, 3)), np.tile([0.0, 0, 0, 1], (4, 1)), np.ones(4)]
+NAN = np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 0.0)
+BAD = {
+    'two components': ([GOOD[0][:, :2], *GOOD[1:]], r'means must be of the shape \[N, 3\], not \[4, 2\]'),
+    'transposed': ([GOOD[0].T, *GOOD[1:]], r'means must be of the shape \[N, 3\], not \[3, 4\]'),
+    'one scale a Gaussian': ([GOOD[0], np.ones(4), *GOOD[2:]], r'scales must be of the shape \[4, 3\], not \[4\]'),
+    'fewer quaternions': (
+        [*GOOD[:2], GOOD[2][:3], GOOD[3]],
+        r'quaternions must be of the shape \[4, 4\], not \[3, 4\]',
+    ),
+    'a column of densities': ([*GOOD[:3], np.ones((4, 1))], r'density must be of the shape \[4\], not \[4, 1\]'),
+    'no axis': ([np.float32(1), *GOOD[1:]], r'means must be of the shape \[N, 3\], not \[\]'),
+    'empty': ([x[:0] for x in GOOD], 'the cloud is empty'),
+    'NaN': ([NAN, *GOOD[1:]], 'Gaussian 2 of the arrays given to'),
+    'infinite density': ([*GOOD[:3], np.array([1, 1, 1, np.inf])], 'Gaussian 3 of the arrays'),
+    'scale of zero': ([GOOD[0], GOOD[1] * [1, 0, 1], *GOOD[2:]], 'the scales positive'),
+    'negative scale': ([GOOD[0], -GOOD[1], *GOOD[2:]], 'the scales positive'),
+    'quaternion of zero': ([*GOOD[:2], 0 * GOOD[2], GOOD[3]], 'the quaternion not zero'),
+}
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('name', BAD)
+@pytest.mark.parametrize('function', [project, voxelize])
+def test_bad_arrays(function, name, kind):
+    values, message = BAD[name]
+    arrays = arrays_of(kind, map(np.float32, values))
+    with pytest.raises(InputError, match=message) as caught:
+        function(*arrays, scan())
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'views, message',
+    [
+        ([], 'at least one'),
+        ([3], 'from 0 to 2'),
+        ([-4], 'from 0 to 2'),
+        ([0.5], 'whole'),
+        ('ab', 'whole'),
+        (7, 'whole'),
+    ],
+)
+def test_bad_views(views, message):
+    with pytest.raises(InputError, match=message):
+        project(*GOOD, scan(), views=views)
+
+
+@pytest.mark.parametrize('extent', [0.5, 21, np.nan])
+def test_bad_extent(extent):
+    for function in (project, voxelize):
+        with pytest.raises(InputError, match='extent is in standard deviations'):
+            function(*GOOD, scan(), extent=extent)
+
+
+@pytest.mark.parametrize('values', [None, 'abc', [['a', 'b', 'c']] * 4, [[1, 2], [3]]])
+def test_what_is_no_array(values):
+    with pytest.raises(InputError, match='means'):
+        project(values, *GOOD[1:], scan())
+
+
+def test_several_kinds_at_once():
+    with pytest.raises(InputError, match='of one kind, not means of Dr.Jit, scales of NumPy'):
+        project(mi.TensorXf(GOOD[0]), *GOOD[1:], scan())
+
+
+def test_torch_devices():
+    torch = framework('torch')
+    arrays = [torch.tensor(x, dtype=torch.float32) for x in GOOD]
+    with pytest.raises(InputError, match='the CPU or on one CUDA device, not on .*meta'):
+        project(*(x.to('meta') for x in arrays), scan())
+    if _device() == 'cuda':
+        with pytest.raises(InputError, match="on the device 'cpu', but the variant cuda"):
+            project(*arrays, scan())
+
+
+def test_variant(variant):
+    """An active variant stays, unless the arrays lie elsewhere."""
+    here, there = ('cuda', 'cpu') if variant.startswith('cuda') else ('cpu', 'cuda')
+    assert ensure_variant() == ensure_variant(here) == variant == mi.variant()
+    with pytest.raises(InputError, match=f'on the device {there!r}, but the variant {variant} works on {here!r}'):
+        ensure_variant(there)
