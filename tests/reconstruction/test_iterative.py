@@ -14,7 +14,7 @@ from helpers.algorithms import ALGORITHMS
 from helpers.grids import scan as small
 from helpers.matrices import matrix
 from lingo_mi import phantoms
-from lingo_mi.completion.two_stage import complete
+from lingo_mi.completion.views import complete
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry, circular
 from lingo_mi.metrics import psnr_3d
