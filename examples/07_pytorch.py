@@ -18,7 +18,13 @@ import lingo_mi as lm
 foot = lm.phantom('foot', size=32)
 angles = np.linspace(0, np.pi, 12, endpoint=False)
 geometry = lm.Geometry.cone(
-    DSO=1000, DSD=1500, nDetector=(48, 48), dDetector=(12, 12), nVoxel=foot.data.shape, dVoxel=foot.spacing, angles=angles
+    DSO=1000,
+    DSD=1500,
+    nDetector=(48, 48),
+    dDetector=(12, 12),
+    nVoxel=foot.data.shape,
+    dVoxel=foot.spacing,
+    angles=angles,
 )
 target = torch.as_tensor(lm.simulate(foot, geometry).train.projections)
 

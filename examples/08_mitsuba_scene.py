@@ -30,7 +30,11 @@ scene = mi.load_dict(
     {
         'type': 'scene',
         'integrator': {'type': 'lingo_xray'},
-        'cloud': {'type': 'ellipsoids', 'data': mi.TensorXf(gaussians), 'density': mi.TensorXf(np.full((200, 1), 0.02, np.float32))},
+        'cloud': {
+            'type': 'ellipsoids',
+            'data': mi.TensorXf(gaussians),
+            'density': mi.TensorXf(np.full((200, 1), 0.02, np.float32)),
+        },
         'cube': {
             'type': 'cube',
             'to_world': mi.ScalarTransform4f().translate([25, 0, 0]).rotate([1, 1, 0], 30).scale(6),

@@ -29,6 +29,33 @@ watch_variants()
 
 __version__ = '0.1.0'
 
+__all__ = [
+    'simulate',
+    'load',
+    'phantom',
+    'Geometry',
+    'Scan',
+    'Dataset',
+    'fit',
+    'Settings',
+    'Result',
+    'Gaussians',
+    'load_result',
+    'reconstruct',
+    'Reconstruction',
+    'FDK',
+    'SART',
+    'OSSART',
+    'SIRT',
+    'CGLS',
+    'ASDPOCS',
+    'Refined',
+    'project',
+    'voxelize',
+    'use_variant',
+    'InputError',
+]
+
 if TYPE_CHECKING:
     from lingo_mi.api.data import load, phantom, simulate
     from lingo_mi.api.fitting import fit
@@ -69,7 +96,6 @@ _PUBLIC = {
     'use_variant': 'lingo_mi.runtime',
     'InputError': 'lingo_mi.errors',
 }
-__all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str):

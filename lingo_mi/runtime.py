@@ -77,14 +77,6 @@ _COLOUR_SAMPLES = 95  # entries of Mitsuba's tables of colour matching functions
 _SHUTDOWN, _INIT, _WHOS = '_Z12jit_shutdowni', '_Z8jit_initj', '_Z12jit_var_whosv'
 
 
-def ensure_variant() -> str:
-    """The active variant of Mitsuba; where none is active yet, or none that differentiates, that of `use_variant()`."""
-    import mitsuba as mi
-
-    active = mi.variant()
-    return active if active is not None and 'ad' in active.split('_') else use_variant()
-
-
 def use_variant(name: str | None = None) -> str:
     """Activate a Mitsuba variant and return its name: `name`, else cuda_ad_mono, else llvm_ad_mono.
 

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import FAST
@@ -96,7 +95,7 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
         what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], settings.changed(**changes)
         fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
         found[kind] = (
-            fitted.stepper.volume(DeviceState(fitted.state)),
+            fitted.volume(),
             dict(ms_per_iteration=pace(fitted.history), seconds=fitted.info['seconds'] + fitted.seconds),
         )
     first = next(iter(scenes.values()))  # of the clean scan

@@ -42,11 +42,11 @@ class Gaussians(NamedTuple):
 class Result:
     """The result of `lm.fit`, or of `lm.load_result`. In a notebook it shows slices, views, curves and numbers.
 
-        result = lm.fit(data, 'fast')
-        result.volume()                     # float32 [x, y, z], density per mm
-        result.render(data.test.geometry)   # float32 [view, v, u], line integrals
-        result.metrics()['psnr_3d']
-        result.save('out/foot')
+    result = lm.fit(data, 'fast')
+    result.volume()                     # float32 [x, y, z], density per mm
+    result.render(data.test.geometry)   # float32 [view, v, u], line integrals
+    result.metrics()['psnr_3d']
+    result.save('out/foot')
     """
 
     def __init__(self, fitted: Fitted, recipe: str, data: Dataset | None = None, stored: dict | None = None):
@@ -88,7 +88,9 @@ class Result:
         """
         volume = self.fitted.volume(geometry)
         if volume is None:
-            raise InputError(f'{self.recipe}: opacities and radiances make no volume; complete the views and reconstruct')
+            raise InputError(
+                f'{self.recipe}: opacities and radiances make no volume; complete the views and reconstruct'
+            )
         return volume
 
     def render(self, geometry: Geometry | None = None) -> np.ndarray:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.api.result import Result
-from lingo_mi.errors import InputError
-from lingo_mi.progress import Progress
-from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined
-from lingo_mi.reconstruction import reconstruct as run
+from lingo_mi.reconstruction import Algorithm, Reconstruction
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Scan
 

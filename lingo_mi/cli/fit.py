@@ -108,9 +108,7 @@ def main():
             check()
 
         try:
-            fit = run(
-                scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT, args.resume
-            )
+            fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT)
         except KeyboardInterrupt:
             again = command_line('--resume', without=('--resume', '--force'))
             raise KeyboardInterrupt(f'go on with  {again}') from None

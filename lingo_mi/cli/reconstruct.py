@@ -98,7 +98,8 @@ def options(function, given: dict[str, str]) -> dict:
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.completion.two_stage import as_corrected, complete, fitted_views, load_cloud, without_effects
+    from lingo_mi.completion.clouds import load_cloud
+    from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
     from lingo_mi.files.volumes import first_voxel, write_volume
     from lingo_mi.geometry.base import CircularGeometry
     from lingo_mi.progress import Progress

@@ -52,4 +52,9 @@ class Average:
 
     def restore(self, arrays: dict):
         """Take over what `arrays` gave."""
-        self.values = upload({k.removeprefix(PREFIX): v for k, v in arrays.items() if k.startswith(PREFIX)}) or None
+        self.values = upload(values_of(arrays)) or None
+
+
+def values_of(arrays: dict) -> dict:
+    """The mean in the arrays of a checkpoint, by the parameters' names, float32 [N, components]; empty where there is none."""
+    return {k.removeprefix(PREFIX): v for k, v in arrays.items() if k.startswith(PREFIX)}

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from lingo_mi.fit.bounded import bounded
+from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.loop import bounded
-from lingo_mi.fit.model import linearised
-from lingo_mi.fit.point_starts import cuboid, random_points
+from lingo_mi.fit.measured import density_unit, linearised
 from lingo_mi.fit.r2_start import r2_initialise
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import start
-from lingo_mi.fit.step import Stepper, density_unit
+from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.lingo import initialise as lingo
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.reconstruction.fdk import fdk
@@ -44,9 +44,8 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     else:
 
         def render(points, density, spacing, views):
-            state = start(points, spacing, density / unit, settings)
-            stepper = Stepper(scan.subset(views[:1]), settings.changed(weights='equal'), unit)
-            return stepper.render(DeviceState(state), g.subset(views)) * g.scale
+            state = DeviceState(start(points, spacing, density / unit, settings))
+            return CloudModel(settings, g, unit).render(state, g.subset(views)) * g.scale
 
         chosen = settings.of_start()
         if chosen.density == 'fdk' and not is_circular(scan):

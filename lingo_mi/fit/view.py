@@ -91,17 +91,18 @@ def integrals(footprints, rays, settings: Settings, share=None) -> list:
     ]
 
 
-def differentiate(gaussians, target: Target, settings: Settings, batch: int, model=None, share=None):
+def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
     """Add the gradient of one view's loss to that of the Gaussians, which are leaves.
 
     batch   views of a step, over which the loss is a mean
-    model   `model.Model`, what the detector sees; None: line integrals
+    signal  `ExpectedSignal` of the detector; None: line integrals
+    share   of the second of two materials in every Gaussian, Float [N]; None: there is one
 
     Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
     footprint's place, and 1 where a Gaussian is seen.
     """
     s, view = settings, target.view
-    bundles = []  # of rays: one, or all those that the model takes a mean over
+    bundles = []  # of rays: one, or all those that the signal is a mean over
 
     def image_along(rays):
         footprints = footprints_of(gaussians, rays, s)
@@ -109,7 +110,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, mod
         bundles.append((footprints, leaf))
         return integrals(replace(footprints, values=leaf), rays, s, share)
 
-    image = image_along(view)[0] if model is None else model.image(image_along, view, target.scattered)
+    image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi import metrics
-from lingo_mi.fit.loop import Fitted
+from lingo_mi.fit.fitted import Fitted
 from lingo_mi.lingo.ipsd import ipsd, reverse_distance
 from lingo_mi.scan import Dataset
 
@@ -16,12 +16,12 @@ def quick_measure(dataset: Dataset, most: int = 4):
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)
 
-    def measure(stepper, state):
+    def measure(model, state):
         out = {}
         if test is not None and len(test):
-            rendered = comparable(stepper.render(state, test.geometry), test)
+            rendered = comparable(model.render(state, test.geometry), test)
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
-        if dataset.volume is not None and (volume := stepper.volume(state)) is not None:
+        if dataset.volume is not None and (volume := model.volume(state)) is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
         return out
 

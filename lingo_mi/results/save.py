@@ -16,8 +16,7 @@ from lingo_mi.files.images import write_exr
 from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fit.checkpoint import METRICS
-from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.loop import Fitted
+from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.state import activate, harmonics
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import measure
@@ -28,7 +27,7 @@ from lingo_mi.scan import Dataset
 def world_cloud(fitted: Fitted, geometry):
     """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities or opacities [N]."""
     centre, scale, rotation, amount = activate(fitted.state, fitted.settings)
-    unit = fitted.stepper.unit if fitted.settings.render == 'integral' else 1
+    unit = fitted.unit if fitted.settings.render == 'integral' else 1
     return centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation, amount * unit
 
 
@@ -41,8 +40,7 @@ def write_results(
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
     """
     geometry, test = dataset.train.geometry, dataset.test
-    state = DeviceState(fitted.state)
-    volume = fitted.stepper.volume(state)
+    volume = fitted.volume()
     cloud = world_cloud(fitted, geometry)
     if volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
@@ -50,13 +48,11 @@ def write_results(
         write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state))
     else:
         write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
-        share = fitted.stepper.shares(state)
-        write_ply(folder / 'gaussians.ply', *cloud, None if share is None else share.numpy())
-        effects = dataset.train.effects if fitted.stepper.model is not None else None
-        write_scene(folder / 'result.xml', fitted.stepper.corrected(), fitted.settings.extent, effects)
+        write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
+        write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.extent, fitted.effects)
     rendered = None
     if test is not None and len(test):
-        rendered = fitted.stepper.render(state, test.geometry)
+        rendered = fitted.render(test.geometry)
         views = folder / 'views'
         views.mkdir(exist_ok=True)
         for stale in views.glob('*.exr'):
@@ -102,13 +98,13 @@ def write_results(
 
 def _corrections(fitted) -> dict:
     """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
-    poses = fitted.stepper.poses
+    poses = fitted.poses
     return (
         {}
         if poses is None
         else dict(
             pose_turns_degrees=np.degrees(poses.turn).tolist(),
-            pose_shifts_mm=(poses.shift / fitted.stepper.geometry.scale).tolist(),
+            pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
         )
     )
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi import phantoms
+from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
+from lingo_mi.fit.measured import density_unit
 from lingo_mi.fit.settings import METHODS, VOLUMETRIC
 from lingo_mi.fit.state import start
-from lingo_mi.fit.step import Stepper
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.ipsd import ipsd
@@ -56,8 +57,8 @@ def initialisations(sizes: Sizes) -> list[dict]:
         for n in sizes.points:
             settings = fast.changed(n_points=n, **changes)
             cloud = initial_cloud(data.train, settings)
-            stepper = Stepper(data.train, settings)
-            state = DeviceState(start(cloud.points, cloud.spacing, cloud.density / stepper.unit, settings))
+            model = CloudModel(settings, data.train.geometry, density_unit(data.train, settings))
+            state = DeviceState(start(cloud.points, cloud.spacing, cloud.density / model.unit, settings))
             fitted = run(data.train, settings, cloud)
             born = fitted.state.values['centre'][fitted.state.born]
             rows.append(
@@ -66,7 +67,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
                     points=len(cloud),
                     seconds=cloud.info['seconds'],
                     ipsd=ipsd(fitted.initial, born) if len(born) else None,
-                    **quick_measure(data)(stepper, state),
+                    **quick_measure(data)(model, state),
                 )
             )
     return rows

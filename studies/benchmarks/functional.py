@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.functional import project
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.upload import uploaded
@@ -51,7 +52,9 @@ def measured(count: int, pixels: int, repeats: int) -> tuple[float, float]:
         rng.normal(size=(count, 4)),
         rng.uniform(0.01, 0.02, count),
     )
-    geometry = Geometry(500, 750, (pixels, pixels), (256 / pixels, 256 / pixels), (64,) * 3, (2.5,) * 3, circular(1))
+    geometry = CircularGeometry(
+        500, 750, (pixels, pixels), (256 / pixels, 256 / pixels), (64,) * 3, (2.5,) * 3, circular(1)
+    )
     upstream = np.float32(rng.normal(size=(pixels, pixels)))
     both = _native(cloud, geometry, upstream), _through_torch(cloud, geometry, upstream)
     turns = [[_seconds(f) for f in both] for _ in range(WARM + repeats)]

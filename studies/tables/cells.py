@@ -25,14 +25,15 @@ import numpy as np
 from skimage.transform import resize_local_mean
 
 from lingo_mi import metrics, phantoms
-from lingo_mi.completion.two_stage import filled
+from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.fit import checkpoint
 from lingo_mi.fit.checkpoint import CHECKPOINT
-from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import extensible, run
+from lingo_mi.fit.loop import run
+from lingo_mi.fit.resume import extensible
 from lingo_mi.fit.settings import Settings, settings_of
 from lingo_mi.interrupts import between_steps
 from lingo_mi.paths import replacing
@@ -258,10 +259,8 @@ class Cells:
                 bar.update(iteration, **fields)
                 check()
 
-            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved, cloud is None)
-        state = DeviceState(fitted.state)
-        rendered = fitted.stepper.render(state, dataset.test.geometry)
-        found = measure(fitted, dataset, fitted.stepper.volume(state), rendered)
+            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
+        found = measure(fitted, dataset, fitted.volume(), fitted.render(dataset.test.geometry))
         return found | dict(method=cell.method, settings=asdict(settings), initial=fitted.info)
 
     def _begin(self, settings, saved: Path):
@@ -275,18 +274,16 @@ class Cells:
             with replacing(saved) as temporary:
                 temporary.write_bytes(whole.read_bytes())
 
-    def _cloud(self, fit: Fit):
-        """A stored fit's stepper, and its state on the device; without its whole checkpoint, it is fitted again."""
+    def _cloud(self, fit: Fit) -> Fitted:
+        """A stored fit; without its whole checkpoint, it is fitted again."""
         settings, saved = recipe(fit, self.scale), self.path(fit).with_name(CHECKPOINT)
         if _iterations(saved) != settings.iterations:  # fewer where fitting it again was interrupted
             self.compute(fit, f'{fit}, again')
-        fitted = run(self._measured(fit).train, settings, None, self.seed, path=saved, resume=True)
-        return fitted.stepper, DeviceState(fitted.state)
+        return run(self._measured(fit).train, settings, None, self.seed, path=saved)
 
     def _completed(self, fit: Fit) -> Scan:
         """The fitted views, completed from the cloud."""
-        stepper, state = self._cloud(fit)
-        return filled(self._measured(fit).train, COMPLETED, lambda geometry: stepper.render(state, geometry))
+        return insert_views(self._measured(fit).train, COMPLETED, self._cloud(fit).render)
 
     def _volume(self, cell: Volume, path: Path, label: str) -> dict:
         function, options = ALGORITHMS[cell.algorithm]
@@ -296,8 +293,7 @@ class Cells:
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
         total = sum(n for name, n in _options(cell.algorithm).items() if name.endswith('niter')) or len(views)
         if function is refined:
-            stepper, state = self._cloud(cell.fit)
-            options = options | dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
+            options = options | dict(completed=views, sample=self._cloud(cell.fit).volume)
             views = dataset.train
         with Progress(label, total) as bar:
 

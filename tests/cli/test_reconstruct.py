@@ -11,14 +11,8 @@ import pytest
 from helpers.effect_parts import detector, tube
 from helpers.effects import physics
 from helpers.script import FIT, SCENE, fit, run
-from lingo_mi.completion.two_stage import (
-    as_corrected,
-    complete,
-    fitted_views,
-    load_cloud,
-    missing_angles,
-    without_effects,
-)
+from lingo_mi.completion.clouds import load_cloud
+from lingo_mi.completion.views import as_corrected, complete, fitted_views, missing_angles, without_effects
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError

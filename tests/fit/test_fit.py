@@ -10,13 +10,16 @@ import pytest
 
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
+from lingo_mi.fit import checkpoint
+from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS, VOLUMETRIC
 from lingo_mi.fit.state import activate
 from lingo_mi.fit.state import start as start_state
-from lingo_mi.fit.step import Stepper
+from lingo_mi.fit.total_variation import random_cube_variation
 from lingo_mi.scan import Scan
 
 
@@ -54,7 +57,7 @@ def test_progress_and_measure_are_called(scan):
         scan,
         SHORT.changed(iterations=8),
         some_points(scan.geometry),
-        measure=lambda stepper, state: measured.append(len(state)) or {'psnr2d': 1.0},
+        measure=lambda model, state: measured.append(len(state)) or {'psnr2d': 1.0},
         progress=lambda done, loss, gaussians, **rest: steps.append((done, loss(), gaussians, rest)),
     )
     assert [s[0] for s in steps] == list(range(1, 9)) and all(np.isfinite(s[1]) for s in steps)
@@ -78,7 +81,7 @@ def test_each_method(method, scan):
     fitted = run(scan, settings, start)
     assert len(fitted.state) > 0 and np.isfinite(error_of(fitted, scan))
     assert fitted.history[-1]['iteration'] == 8
-    volume = fitted.stepper.volume(DeviceState(fitted.state))
+    volume = fitted.volume()
     assert volume.shape == scan.geometry.nVoxel and volume.max() > 0
 
 
@@ -102,15 +105,15 @@ def test_fan_beam_stays_in_its_plane(mode, birth):
 def test_total_variation_is_of_every_nth_voxel(scan, stride):
     """With so many samples that they fit in one place only, between the first and the last voxels."""
     g = replace(scan.geometry, nVoxel=(13, 13, 7), dVoxel=(20.0, 20.0, 36.0))
-    stepper = Stepper(replace(scan, geometry=g), SHORT.changed(tv_stride=stride, tv_size=13, extent=6.0))
-    start = some_points(g)
-    state = DeviceState(start_state(start.points.astype(np.float32), start.spacing, start.density, stepper.settings))
-    gaussians = state.gaussians(stepper.settings)
+    settings = SHORT.changed(tv_stride=stride, tv_size=13, extent=6.0)
+    model, start = CloudModel(settings, g, 0.5), some_points(g)
+    state = DeviceState(start_state(start.points.astype(np.float32), start.spacing, start.density, settings))
+    gaussians = state.gaussians(settings)
     dr.enable_grad(gaussians)
-    found = stepper._total_variation(gaussians, np.random.default_rng(0))[0]
-    volume = stepper.volume(state)[::stride, ::stride, ::stride] / stepper.unit
+    found = random_cube_variation(gaussians, g, settings, np.random.default_rng(0))[0]
+    volume = model.volume(state)[::stride, ::stride, ::stride] / model.unit
     wanted = np.concatenate([np.diff(volume, axis=i).ravel() for i in range(3)])
-    np.testing.assert_allclose(found, stepper.settings.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
+    np.testing.assert_allclose(found, settings.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -124,7 +127,7 @@ def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(stop))
-    fitted = run(scan, SHORT, None, seed=3, path=path, resume=True)
+    fitted = run(scan, SHORT, None, seed=3, path=path)
     if variant.startswith('llvm'):
         assert_equal_states(fitted.state, whole.state)
     else:
@@ -137,7 +140,7 @@ def test_resuming_a_finished_fit_changes_nothing(scan, tmp_path):
     path = tmp_path / 'fit.npz'
     settings = SHORT.changed(iterations=3)
     done = run(scan, settings, some_points(scan.geometry), path=path)
-    assert_equal_states(run(scan, settings, None, path=path, resume=True).state, done.state)
+    assert_equal_states(run(scan, settings, None, path=path).state, done.state)
 
 
 @pytest.fixture
@@ -150,7 +153,7 @@ def stored(scan, tmp_path):
 @pytest.mark.parametrize('change', [dict(extent=4.0), dict(iterations=40), dict(rate_scale=(1e-2, 1e-3))])
 def test_checkpoint_of_other_settings_is_refused(scan, stored, change):
     with pytest.raises(InputError, match=next(iter(change))):
-        run(scan, SHORT.changed(iterations=2).changed(**change), None, path=stored, resume=True)
+        run(scan, SHORT.changed(iterations=2).changed(**change), None, path=stored)
 
 
 def test_checkpoint_of_another_scan_is_refused(scan, stored):
@@ -161,9 +164,9 @@ def test_checkpoint_of_another_scan_is_refused(scan, stored):
         (replace(scan, projections=scan.projections * np.float32(1.01)), 'the projections'),
     ):
         with pytest.raises(InputError, match=f'other values of .*{what}'):
-            run(other, settings, None, path=stored, resume=True)
+            run(other, settings, None, path=stored)
     almost = replace(scan, projections=scan.projections * np.float32(1 + 1e-6))  # simulated on another machine
-    run(almost, settings, None, path=stored, resume=True)
+    run(almost, settings, None, path=stored)
 
 
 def test_a_full_disk_leaves_the_earlier_checkpoint(scan, stored, monkeypatch):
@@ -175,7 +178,7 @@ def test_a_full_disk_leaves_the_earlier_checkpoint(scan, stored, monkeypatch):
 
     monkeypatch.setattr(np, 'savez', savez)
     with pytest.raises(InputError, match='fit.npz: cannot be written'):
-        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+        run(scan, SHORT.changed(iterations=2), None, path=stored)
     assert stored.read_bytes() == before and [p.name for p in stored.parent.iterdir()] == [stored.name]
 
 
@@ -184,7 +187,7 @@ def test_truncated_checkpoint_is_refused(scan, stored, share):
     content = stored.read_bytes()
     stored.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(InputError, match='not a checkpoint'):
-        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+        run(scan, SHORT.changed(iterations=2), None, path=stored)
 
 
 def test_damaged_checkpoint_is_refused(scan, stored):
@@ -192,12 +195,12 @@ def test_damaged_checkpoint_is_refused(scan, stored):
     content[len(content) // 3] ^= 0xFF
     stored.write_bytes(bytes(content))
     with pytest.raises(InputError, match='not a checkpoint'):
-        run(scan, SHORT.changed(iterations=2), None, path=stored, resume=True)
+        run(scan, SHORT.changed(iterations=2), None, path=stored)
 
 
 def test_absent_checkpoint_is_refused(scan, tmp_path):
     with pytest.raises(InputError, match='no checkpoint'):
-        run(scan, SHORT, None, path=tmp_path / 'fit.npz', resume=True)
+        run(scan, SHORT, None, path=tmp_path / 'fit.npz')
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -272,3 +275,59 @@ def test_all_gaussians_in_one_place(scan):
 def test_several_views_a_step(scan):
     fitted = run(scan, SHORT.changed(iterations=6, batch=3), some_points(scan.geometry))
     assert fitted.history[-1]['loss'] < fitted.history[0]['loss']
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Results without their scan
+# ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('changes', [{}, dict(average=0.8), dict(rate_pose=(2e-3, 2e-4), effects='ignore')])
+def test_a_checkpoint_is_the_fit(scan, tmp_path, changes):
+    path = tmp_path / 'fit.npz'
+    done = run(scan, SHORT.changed(iterations=8, **changes), some_points(scan.geometry), seed=3, path=path)
+    again = Fitted.from_checkpoint(path)
+    assert_equal_states(again.state, done.state)
+    assert (again.settings, again.unit, again.seed, again.history) == (done.settings, done.unit, 3, done.history)
+    np.testing.assert_array_equal(again.initial, done.initial)
+    np.testing.assert_allclose(again.volume(), done.volume(), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(again.render(scan.geometry), done.render(scan.geometry), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(again.corrected.rays().source, done.corrected.rays().source, atol=1e-9)
+    assert (again.corrected is again.geometry) == ('rate_pose' not in changes)
+    np.testing.assert_allclose(again.cloud().density.numpy(), done.cloud().density.numpy(), rtol=1e-6)
+    finer = replace(scan.geometry, nVoxel=(16, 16, 16), dVoxel=(16.0, 16.0, 16.0))
+    assert again.volume(finer).shape == (16, 16, 16)
+
+
+def test_an_unfinished_fit_is_its_mean_so_far(scan, tmp_path):
+    path = tmp_path / 'fit.npz'
+    settings, measured = SHORT.changed(average=0.8, densify_from=100), []
+    with pytest.raises(KeyboardInterrupt):
+        run(
+            scan,
+            settings,
+            some_points(scan.geometry),
+            measure=lambda model, state: measured.append(state.host()) or {},
+            progress=stop_at(8),  # one of the iterations that are measured
+            path=path,
+        )
+    for name, values in Fitted.from_checkpoint(path).state.values.items():
+        np.testing.assert_array_equal(values, measured[-1].values[name])
+
+
+def test_files_that_are_no_fit(scan, stored):
+    with pytest.raises(InputError, match='no such file'):
+        Fitted.from_checkpoint(stored.with_name('none.npz'))
+    state, extra, arrays = checkpoint.load(stored)
+    for damaged, message in (
+        (extra | dict(effects=True), 'modelled effects'),
+        ({k: v for k, v in extra.items() if k != 'unit'}, 'by this version'),
+        (extra | dict(settings=extra['settings'] | dict(renamed=1)), 'by this version'),
+    ):
+        checkpoint.save(stored, state, damaged, arrays)
+        with pytest.raises(InputError, match=message) as caught:
+            Fitted.from_checkpoint(stored)
+        assert '\n' not in str(caught.value)
+    del extra['effects']  # as earlier versions wrote it
+    checkpoint.save(stored, state, extra, arrays)
+    assert len(Fitted.from_checkpoint(stored).state) == len(state)

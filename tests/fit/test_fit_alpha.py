@@ -13,12 +13,13 @@ from helpers.script import FIT, fit
 from helpers.script import run as run_script
 from lingo_mi.errors import InputError
 from lingo_mi.fit import checkpoint
+from lingo_mi.fit.bounded import scene_radius
 from lingo_mi.fit.densify import clone, prune, reset_opacity, split
 from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import run, scene_radius
-from lingo_mi.fit.point_starts import cuboid, random_points
+from lingo_mi.fit.loop import run
 from lingo_mi.fit.settings import METHODS, R2
 from lingo_mi.fit.state import activate, harmonics, start
+from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.projectors.radiance import seen
 from lingo_mi.projectors.view import View, vector64
 
@@ -40,11 +41,6 @@ SHORT = dict(
 def settings_of(method):
     """A fit of 40 steps, with rates that get somewhere in as many."""
     return METHODS[method].changed(**SHORT, rate_opacity=(5e-2, 5e-2), rate_radiance=(2e-2, 2e-2))
-
-
-@pytest.fixture(scope='module')
-def scan():
-    return tiny_scan(geometry())
 
 
 @pytest.fixture(scope='module', params=ALPHA)
@@ -202,7 +198,7 @@ def test_the_fit_descends(scan, whole):
     assert error_of(fitted, scan) < 0.7 * error_of(before, scan)
     assert fitted.state.born.any() and len(fitted.state) <= 400
     assert all(np.isfinite(v).all() for v in fitted.state.values.values())
-    assert fitted.stepper.volume(None) is None
+    assert fitted.volume() is None and fitted.cloud() is None
 
 
 @pytest.mark.parametrize('stop', [14, 15, 33])
@@ -212,7 +208,7 @@ def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, settings, initial_cloud(scan, settings), seed=3, path=path, progress=stop_at(stop))
-    resumed = run(scan, settings, None, seed=3, path=path, resume=True)
+    resumed = run(scan, settings, None, seed=3, path=path)
     if variant.startswith('llvm'):
         assert_equal_states(resumed.state, fitted.state)
     else:
@@ -225,7 +221,7 @@ def test_checkpoint_of_another_method_is_refused(scan, tmp_path):
     run(scan, settings, initial_cloud(scan, settings), path=path)
     for other in (R2.changed(iterations=1), settings.changed(sh_degree=0)):
         with pytest.raises(InputError, match='render|sh_degree'):
-            run(scan, other, None, path=path, resume=True)
+            run(scan, other, None, path=path)
 
 
 def test_degrees_join_one_by_one(scan):
@@ -346,7 +342,8 @@ def test_mitsuba_reads_the_cloud_as_3dgs(result, scene):
 
 
 def test_missing_views_come_from_the_checkpoint(result, scene, tmp_path):
-    from lingo_mi.completion.two_stage import complete, fitted_views, load_cloud
+    from lingo_mi.completion.clouds import load_cloud
+    from lingo_mi.completion.views import complete, fitted_views
     from lingo_mi.scene.load import load_scene
     from lingo_mi.scene.simulate import take_scan
 
@@ -369,7 +366,7 @@ def test_missing_views_come_from_the_checkpoint(result, scene, tmp_path):
 
 
 def test_checkpoints_that_complete_nothing(scan, tmp_path):
-    from lingo_mi.completion.two_stage import load_cloud
+    from lingo_mi.completion.clouds import load_cloud
 
     with pytest.raises(InputError, match='no such file'):
         load_cloud(tmp_path / 'no.npz')

@@ -50,7 +50,7 @@ def test_measurements_are_of_the_mean():
         AVERAGED,
         some_points(scan.geometry),
         seed=3,
-        measure=lambda stepper, state: measured.append(state.host()) or {},
+        measure=lambda model, state: measured.append(state.host()) or {},
     )
     assert_equal_states(measured[-1], fitted.state)
 
@@ -63,7 +63,7 @@ def test_a_resumed_fit_has_the_same_mean(tmp_path, stop):
     with pytest.raises(KeyboardInterrupt):
         loop.run(scan, AVERAGED, some_points(scan.geometry), seed=3, path=path, progress=stop_at(stop))
     for _ in range(2):  # the second time a fit that is done
-        assert_equal_states(loop.run(scan, AVERAGED, None, seed=3, path=path, resume=True).state, whole.state)
+        assert_equal_states(loop.run(scan, AVERAGED, None, seed=3, path=path).state, whole.state)
 
 
 @pytest.mark.parametrize('average', [-0.1, 1.0])

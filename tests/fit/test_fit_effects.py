@@ -18,13 +18,15 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube
 from lingo_mi.errors import InputError
 from lingo_mi.files.images import read_exr
-from lingo_mi.fit import losses, step
-from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit import losses
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.loss_scale import loss_scale
-from lingo_mi.fit.model import weights_of
+from lingo_mi.fit.measured import weights_of
+from lingo_mi.fit.poses import gathered, place
 from lingo_mi.fit.step import Stepper
+from lingo_mi.fit.view import evaluate
+from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.splat import splat
 from lingo_mi.reconstruction.effects_correction import linearised
@@ -53,7 +55,7 @@ def plain_view(self, gaussians, target, batch):
     """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
     s, view = self.settings, target.view
     footprints = project(*gaussians, view, s.extent)
-    leaf = step.leaves(footprints.values)
+    leaf = leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
@@ -64,8 +66,8 @@ def plain_view(self, gaussians, target, batch):
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         seen = dr.select(footprints.row_end > footprints.row_begin, mi.Float(1), 0)
-    step.pass_on(footprints.values, map(dr.grad, leaf))
-    step.evaluate(gaussians)
+    pass_on(footprints.values, map(dr.grad, leaf))
+    evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, seen
 
 
@@ -118,13 +120,13 @@ def test_the_fit_sees_what_the_integrator_renders(name, tmp_path):
     """The cloud written as result.xml, rendered through Mitsuba, is what the fit compares with its scan."""
     effects = EFFECTS[name]()
     stepper, state = stepper_of(effects)
-    expected = stepper.render(state, stepper.geometry)
+    expected = stepper.model.render(state, stepper.geometry)
     for image, wanted in zip(rendered_from_files(stepper, state, effects, tmp_path), expected, strict=True):
         np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-4 * expected.max())
     plain, _ = stepper_of(None)
-    plain.unit = stepper.unit
-    assert np.abs(plain.render(state, stepper.geometry) - expected).max() > 5e-4 * expected.max()
-    assert name != 'two materials' or 0 < stepper.shares(state).numpy().mean() < 1
+    plain.model.unit = stepper.model.unit
+    assert np.abs(plain.model.render(state, stepper.geometry) - expected).max() > 5e-4 * expected.max()
+    assert name != 'two materials' or 0 < stepper.model.shares(state).numpy().mean() < 1
 
 
 @physics
@@ -133,20 +135,20 @@ def test_derivatives_by_differences(name):
     """Of the loss by densities, scales and centres, through the model."""
     stepper, state = stepper_of(EFFECTS[name](), lambda_tv=0.0)
     target = stepper.targets[1]
-    stepper.share = stepper.shares(state)
+    stepper.share = stepper.model.shares(state)
 
     def loss(values):
         state.values = values
-        return float(stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
+        return float(stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
 
     values = dict(state.values)
     for v in values.values():
         dr.enable_grad(v)
     state.values = values
     gaussians = state.gaussians(stepper.settings)
-    leaf = step.leaves(gaussians)
+    leaf = leaves(gaussians)
     stepper._view(leaf, target, 1)
-    step.pass_on(gaussians, map(dr.grad, leaf))
+    pass_on(gaussians, map(dr.grad, leaf))
     rng = np.random.default_rng(1)
     for key, h in (('density', 2e-2), ('scale', 2e-2), ('centre', 4e-3)):
         plain = dr.detach(values[key])
@@ -167,9 +169,9 @@ def test_derivatives_by_the_pose_through_bundles():
     for size in (0.0, 1e-3):
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
-        step.place(target.view, target.frames)
-        stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)
-        found.append(np.concatenate(list(step.gathered(target.view).values())))
+        place(target.view, target.frames)
+        stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)
+        found.append(np.concatenate(list(gathered(target.view).values())))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
 
 
@@ -205,7 +207,7 @@ def test_the_volume_is_at_the_reference_energy():
     for scan, change in ((clean, 'model'), (hard, 'model'), (hard, 'ignore')):
         settings = SHORT.changed(iterations=60, effects=change, densify_from=1000, init='lingo', n_points=100)
         fitted = run(scan, settings, initial_cloud(scan, settings), seed=3)
-        volumes.append(fitted.stepper.volume(DeviceState(fitted.state)))
+        volumes.append(fitted.volume())
     errors = [np.linalg.norm(v - volumes[0]) / np.linalg.norm(volumes[0]) for v in volumes[1:]]
     assert errors[0] < 0.3 * errors[1] and errors[1] > 0.03
 
@@ -262,7 +264,7 @@ def test_saturated_pixels_pull_only_from_above():
     linear = linearised(scan, effects).projections
     np.testing.assert_array_equal(linear[~dark], 0)
     np.testing.assert_array_equal(linear[dark], scan.projections[dark])
-    model, view = Stepper(scan, SHORT).model, Stepper(scan, SHORT).targets[0].view
+    model, view = Stepper(scan, SHORT).model.signal, Stepper(scan, SHORT).targets[0].view
     factor = model.factor.numpy()[0]
     for shift, slope in ((-0.01, 0), (0.01, 1)):
         p = mi.Float(((least + shift) / factor).ravel())
@@ -281,7 +283,7 @@ def test_resumed_fit_is_the_same_fit(tmp_path, variant):
     whole, path = run(scan, SHORT, some_points(scan.geometry), seed=3), tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(15))
-    again = run(scan, SHORT, None, seed=3, path=path, resume=True)
+    again = run(scan, SHORT, None, seed=3, path=path)
     if variant.startswith('llvm'):
         assert_equal_states(again.state, whole.state)
 

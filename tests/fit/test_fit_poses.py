@@ -17,6 +17,7 @@ from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
 from lingo_mi.geometry.base import Geometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors.backprop import leaves
 from lingo_mi.scan import Scan
 
 MOVING = SHORT.changed(rate_pose=(2e-3, 2e-4), lambda_tv=0.0)
@@ -48,7 +49,7 @@ def test_derivatives_by_differences(mode):
     def loss(move):
         frames = here.moved(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
         place(target.view, frames)
-        leaf = step.leaves(state.gaussians(settings))
+        leaf = leaves(state.gaussians(settings))
         return float(stepper._view(leaf, target, 1)[0][0])
 
     loss(np.zeros(6))
@@ -87,17 +88,14 @@ def recovered(views, iterations, points):
         run(scan, settings.changed(rate_pose=rate), some_points(g, points), seed=3)
         for rate in ((0.0, 0.0), (2e-3, 2e-4))
     ]
-    poses = fits[1].stepper.poses
+    poses = fits[1].poses
 
     def rms(x):
         return float(np.sqrt(np.mean(np.square(x))))
 
     before = np.degrees(rms(turn)), rms(shift)
     after = np.degrees(rms(poses.turn - turn)), rms(poses.shift / g.scale - shift)
-    errors = [
-        rms(f.stepper.render(DeviceState(f.state), f.stepper.corrected()) - scan.projections) / rms(scan.projections)
-        for f in fits
-    ]
+    errors = [rms(f.render(f.corrected) - scan.projections) / rms(scan.projections) for f in fits]
     return before, after, errors, fits
 
 
@@ -106,11 +104,10 @@ def test_errors_of_a_millimetre_and_half_a_degree_are_found():
     assert before[0] > 0.4 and before[1] > 0.8  # the means are taken off: no scan tells them
     assert after[0] < 0.3 * before[0] and after[1] < 0.5 * before[1]
     assert errors[1] < 0.4 * errors[0]
-    assert off.stepper.corrected() is off.stepper.geometry
-    corrected = on.stepper.corrected()
+    assert off.corrected is off.geometry
+    corrected = on.corrected
     assert (
-        isinstance(corrected, PosedGeometry)
-        and np.abs(corrected.rays().source - on.stepper.geometry.rays().source).max() > 0.5
+        isinstance(corrected, PosedGeometry) and np.abs(corrected.rays().source - on.geometry.rays().source).max() > 0.5
     )
 
 
@@ -121,10 +118,10 @@ def test_checkpoints_keep_the_poses(tmp_path):
     path = tmp_path / 'checkpoint.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, settings, some_points(scan.geometry), seed=3, progress=stop_at(7), path=path)
-    again = run(scan, settings, None, seed=3, path=path, resume=True)
-    for name, values in whole.stepper.poses.arrays().items():
-        np.testing.assert_array_equal(again.stepper.poses.arrays()[name], values)
-    assert whole.stepper.poses.turn.any() and whole.stepper.poses.shift.any()
+    again = run(scan, settings, None, seed=3, path=path)
+    for name, values in whole.poses.arrays().items():
+        np.testing.assert_array_equal(again.poses.arrays()[name], values)
+    assert whole.poses.turn.any() and whole.poses.shift.any()
 
 
 def test_poses_left_alone_compile_nothing_new(monkeypatch):

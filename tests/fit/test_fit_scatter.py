@@ -14,11 +14,11 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.files.ply import write_ply
-from lingo_mi.fit import step
-from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit import loop
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
-from lingo_mi.fit.scatter import RENEWED, Scattered
+from lingo_mi.fit.scattered_light import RENEWED, ScatteredLight
+from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.objects import GridInCube
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.results.scene_file import write_scene
@@ -54,12 +54,12 @@ def effects_of(scatter=FEW, **changes):
 def test_the_fit_sees_what_the_integrator_renders(effects, tmp_path):
     """The cloud written as result.xml, rendered through Mitsuba, scatters as in the fit."""
     stepper, state = stepper_of(effects)
-    g, expected = stepper.geometry, stepper.render(state, stepper.geometry)
+    g, expected = stepper.geometry, stepper.model.render(state, stepper.geometry)
     for image, wanted in zip(rendered_from_files(stepper, state, effects, tmp_path), expected, strict=True):
         # A path that just meets an electron on one way to round may miss it on the other.
         np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-3 * expected.max())
     plain, _ = stepper_of(replace(effects, scatter=None))
-    assert np.abs(plain.render(state, g) - expected).max() > 0.05 * expected.max()
+    assert np.abs(plain.model.render(state, g) - expected).max() > 0.05 * expected.max()
 
 
 def test_the_light_is_a_constant_to_the_derivatives():
@@ -69,19 +69,19 @@ def test_the_light_is_a_constant_to_the_derivatives():
     found = {}
     for lit in (False, True):
         if lit:
-            stepper.scatter(state)
+            stepper.renew_light(state)
             target.scattered = 40 * target.scattered  # as in a thick object
         state.values['density'] = mi.Float(plain)
         dr.enable_grad(state.values['density'])
         gaussians = state.gaussians(stepper.settings)
-        leaf = step.leaves(gaussians)
+        leaf = leaves(gaussians)
         stepper._view(leaf, target, 1)
-        step.pass_on(gaussians, map(dr.grad, leaf))
+        pass_on(gaussians, map(dr.grad, leaf))
         found[lit] = dr.grad(state.values['density']).numpy()
 
     def loss(values):
         state.values['density'] = values
-        return float(stepper._view(step.leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
+        return float(stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
 
     way = mi.Float(np.abs(np.random.default_rng(1).normal(size=len(state))).astype(np.float32) * np.sign(found[True]))
     expected = (loss(plain + 0.02 * way) - loss(plain - 0.02 * way)) / 0.04
@@ -95,17 +95,23 @@ def test_the_light_is_a_constant_to_the_derivatives():
 def test_when_it_is_estimated(monkeypatch):
     """A handful of times, and at once for coarse and fine views."""
     scan = replace(tiny_scan(geometry(3)), effects=effects_of())
-    seen, estimate = [], Scattered.estimate
+    seen, steppers, estimate = [], [], ScatteredLight.estimate
 
     def counted(self, cloud, g):
         seen.append(dr.width(cloud.density))
         return estimate(self, cloud, g)
 
-    monkeypatch.setattr(Scattered, 'estimate', counted)
+    class Kept(loop.Stepper):
+        def __init__(self, *args):
+            super().__init__(*args)
+            steppers.append(self)
+
+    monkeypatch.setattr(ScatteredLight, 'estimate', counted)
+    monkeypatch.setattr(loop, 'Stepper', Kept)
     fitted = run(scan, SHORT.changed(iterations=32, coarse_share=0.5), some_points(scan.geometry), seed=3)
     assert len(seen) == len(RENEWED) and seen[0] == 60 and len(fitted.state) > 60
-    stepper = fitted.stepper
-    for fine, coarse in zip(stepper.targets, stepper.coarse):
+    [stepper] = steppers
+    for fine, coarse in zip(stepper.targets, stepper.coarse, strict=True):
         image = fine.scattered.numpy().reshape(16, 2, 16, 2)
         assert image.min() > 1e-4
         np.testing.assert_allclose(coarse.scattered.numpy().reshape(16, 16), image.mean((1, 3)), rtol=1e-6)
@@ -118,7 +124,7 @@ def test_resumed_fit_is_the_same_fit(tmp_path, variant):
     whole, path = run(scan, SHORT, some_points(scan.geometry), seed=3), tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(11))
-    again = run(scan, SHORT, None, seed=3, path=path, resume=True)
+    again = run(scan, SHORT, None, seed=3, path=path)
     if variant.startswith('llvm'):
         assert_equal_states(again.state, whole.state)
 
@@ -174,6 +180,6 @@ def test_a_fit_that_models_it_finds_the_volume(scans):
             iterations=60, densify_from=1000, init='lingo', init_density='fdk', n_points=200, effects=change
         )
         fitted = run(scan, settings, initial_cloud(scan, settings), seed=3)
-        volumes.append(fitted.stepper.volume(DeviceState(fitted.state)))
+        volumes.append(fitted.volume())
     errors = [np.linalg.norm(v - volumes[0]) / np.linalg.norm(volumes[0]) for v in volumes[1:]]
     assert errors[0] < 0.4 * errors[1] and errors[1] > 0.05

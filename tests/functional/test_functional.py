@@ -11,7 +11,8 @@ from helpers import oracle
 from helpers.oracle import Pose, random_cloud, relative
 from lingo_mi.errors import InputError
 from lingo_mi.functional import project, voxelize
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.upload import uploaded_tensor
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.studies.closed_form import image_and_gradients
@@ -25,7 +26,7 @@ BEAMS = 'cone', 'parallel'
 
 def scan(mode='cone', nVoxel=(11, 9, 10)):
     """Three views of a small panel, and an off-centre grid."""
-    return Geometry(
+    return CircularGeometry(
         DSO=500,
         DSD=750,
         nDetector=(24, 31),
@@ -263,7 +264,7 @@ def test_within_a_jitted_function_of_jax():
 def test_a_training_loop_in_torch():
     """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
     torch = framework('torch')
-    g = Geometry(500, 750, (32, 32), (6, 6), (16,) * 3, (8,) * 3, circular(8))
+    g = CircularGeometry(500, 750, (32, 32), (6, 6), (16,) * 3, (8,) * 3, circular(8))
     rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
     measured = torch.tensor(project(*truth, g, extent=8.0), device=_device())
     grid = voxelize(*truth, g, extent=8.0)

@@ -37,14 +37,14 @@ def rendered_from_files(stepper, state, effects, folder):
     from lingo_mi.fit.state import activate
     from lingo_mi.results.scene_file import write_scene
 
-    g, share = stepper.geometry, stepper.shares(state)
+    g, share = stepper.geometry, stepper.model.shares(state)
     centre, scale, rotation, density = activate(state.host(), stepper.settings)
     write_ply(
         folder / 'gaussians.ply',
         centre / g.scale,
         scale / g.scale,
         rotation,
-        density * stepper.unit,
+        density * stepper.model.unit,
         None if share is None else share.numpy(),
     )
     write_scene(folder / 'result.xml', g, 7, effects)

@@ -3,9 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.settings import R2
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
@@ -62,13 +60,8 @@ def some_points(g, n=60, seed=1):
     return InitialCloud(points, np.full(n, 0.1), np.full(n, 0.08))
 
 
-@pytest.fixture(scope='module')
-def scan():
-    return tiny_scan(geometry())
-
-
 def error_of(fitted, scan):
-    image = fitted.stepper.render(DeviceState(fitted.state), scan.geometry)
+    image = fitted.render(scan.geometry)
     return np.linalg.norm(image - scan.projections) / np.linalg.norm(scan.projections)
 
 

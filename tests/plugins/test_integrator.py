@@ -14,13 +14,12 @@ from helpers.oracle import Cloud, relative
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, transform, values_of
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
+from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import start
-from lingo_mi.fit.step import Stepper
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.sensors import view_of
-from lingo_mi.scan import Scan
 
 FILM = dict(
     type='hdrfilm', width=26, height=19, rfilter=dict(type='box'), component_format='float32', pixel_format='luminance'
@@ -380,10 +379,10 @@ def test_axes(axis, mode, offset):
     settings = Settings(extent=6.0, scale_min=1e-4, scale_max=0.5)
     normalised = (point - g.offOrigin) * g.scale
     state = DeviceState(start(normalised[None], np.array([4 * g.scale]), np.array([0.1]), settings))
-    stepper = Stepper(Scan(g, np.ones((2, *g.nDetector))), settings)
-    np.testing.assert_allclose(stepper.render(state, g), images, rtol=2e-4, atol=1e-5)
+    model = CloudModel(settings, g, 1.0)
+    np.testing.assert_allclose(model.render(state, g), images, rtol=2e-4, atol=1e-5)
 
-    volume = stepper.volume(state)
+    volume = model.volume(state)
     assert volume.shape == g.nVoxel
     mean = [(volume * i).sum() / volume.sum() for i in np.indices(volume.shape)]
     np.testing.assert_allclose(mean, (point - g.offOrigin) / 4 + np.array(g.nVoxel) / 2 - 0.5, atol=0.01)

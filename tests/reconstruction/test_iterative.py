@@ -14,7 +14,7 @@ from helpers.algorithms import ALGORITHMS
 from helpers.grids import scan as small
 from helpers.matrices import matrix
 from lingo_mi import phantoms
-from lingo_mi.completion.two_stage import complete
+from lingo_mi.completion.views import complete
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular

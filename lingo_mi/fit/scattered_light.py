@@ -17,7 +17,7 @@ from lingo_mi.projectors.view import View
 RENEWED = 0, 1 / 16, 1 / 8, 1 / 4, 1 / 2
 
 
-class Scattered:
+class ScatteredLight:
     """What a cloud in the volume of a scan scatters (`effects.scatter`).
 
     A view's random numbers are always the same, so an estimate changes with the cloud alone.
@@ -48,6 +48,6 @@ class Scattered:
         )
 
 
-def light(found: np.ndarray, geometry: Geometry) -> np.ndarray:
+def light_at_pixels(found: np.ndarray, geometry: Geometry) -> np.ndarray:
     """The scattered signal over the open beam's at all pixels, float32 [view, v, u], from what `estimate` gave."""
     return np.stack([smoothed(*view, *geometry.nDetector) for view in found.swapaxes(0, 1)]).astype(np.float32)

@@ -1,0 +1,104 @@
+"""Clouds that a fit has left behind, loaded from its files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lingo_mi.effects.forward import Effects, find_effects
+from lingo_mi.errors import InputError
+from lingo_mi.fit.checkpoint import METRICS
+from lingo_mi.fit.fitted import Fitted
+from lingo_mi.fit.poses import Poses
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.objects import Ellipsoids, find_objects
+from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.simulate import render_objects
+
+WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or xgaussian'
+
+
+@dataclass(frozen=True)
+class FittedCloud:
+    """A cloud of Gaussians as the scene of a fit (result.xml) keeps it.
+
+    gaussians   densities in 1/mm
+    geometry    of the scan that it was fitted to
+    corrected   the same with its views where the fit has put them: `geometry` itself, where it left them alone
+    extent      cut-off in standard deviations
+    effects     that the fit has modelled; None where it took the projections for line integrals
+    seed        of the fit, and of the noise that it has seen in a simulated scan; None where that is not known
+    """
+
+    gaussians: Ellipsoids
+    geometry: Geometry
+    corrected: Geometry
+    extent: float
+    effects: Effects | None
+    seed: int | None
+
+    def render(self, geometry: Geometry) -> np.ndarray:
+        """Line integrals in any views, float32 [view, v, u]."""
+        return render_objects([self.gaussians], geometry, self.extent)
+
+
+def load_cloud(path: Path | str) -> FittedCloud | Fitted:
+    """The cloud of a scene such as a fit's result.xml; or the fit by alpha compositing that a checkpoint (.npz) keeps.
+
+    Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError where there is anything else.
+    """
+    if Path(path).suffix == '.npz':
+        return _composited(path)
+    loaded = load_scene(Path(path))
+    objects = find_objects(loaded.scene)
+    quality = getattr(loaded.scene.integrator(), 'quality', None)
+    if quality is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
+        raise InputError(f'{path}: is no cloud of Gaussians; {WANTED}')
+    corrected, record = loaded.scanner.geometry, _record(path)
+    return FittedCloud(
+        objects[0],
+        _as_given(corrected, record, path),
+        corrected,
+        quality.extent,
+        find_effects(loaded.scene, loaded.scanner),
+        record.get('seed'),
+    )
+
+
+def _record(path) -> dict:
+    """What the fit has noted beside its result.xml; nothing where there is no such file."""
+    file = Path(path).with_name(METRICS)
+    if not file.exists():
+        return {}
+    try:
+        record = json.loads(file.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise InputError(f'{file}: cannot be read ({type(error).__name__}); fit again, or remove it') from None
+    return record if isinstance(record, dict) else {}
+
+
+def _as_given(geometry: Geometry, record: dict, path) -> Geometry:
+    """The geometry that the fit was given, from the corrected one of its result.xml."""
+    if 'pose_turns_degrees' not in record:
+        return geometry
+    poses = Poses(len(geometry))
+    try:
+        turn, shift = (np.array(record[name], float) for name in ('pose_turns_degrees', 'pose_shifts_mm'))
+    except (KeyError, TypeError, ValueError):
+        turn = shift = np.empty(0)
+    if turn.shape != poses.turn.shape or shift.shape != poses.shift.shape:
+        raise InputError(f'{path}: the poses in the {METRICS} beside it are of another fit')
+    poses.turn, poses.shift = np.radians(turn), shift * geometry.scale
+    return poses.undone().corrected(geometry)
+
+
+def _composited(path) -> Fitted:
+    if not Path(path).exists():
+        raise InputError(f'{path}: no such file; {WANTED}')
+    fitted = Fitted.from_checkpoint(path)
+    if fitted.settings.render != 'alpha':
+        raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
+    return fitted

@@ -1,0 +1,110 @@
+"""Views that were not measured: which they are, and a scan completed by rendering them from a fitted cloud."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lingo_mi.completion.clouds import FittedCloud
+from lingo_mi.errors import InputError
+from lingo_mi.fit.fitted import Fitted
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import spread
+from lingo_mi.reconstruction.effects_correction import corrected
+from lingo_mi.reconstruction.views import gaps, require_circle
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.checks import check_memory
+from lingo_mi.scene.description import MOST_VIEWS
+
+
+def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
+    """The measured views of a data set whose rays are those of `geometry`, in its order, to a hundredth of a pixel.
+
+    Angles do not tell views: a helix comes back to them at other heights. Where views repeat each other, they are those that
+    `geometry.base.spread` chooses, else the first of them that are left. Raises InputError where a view is missing.
+    """
+    scan = dataset.train
+    reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()
+    there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
+    allowed = 0.01 * min(scan.geometry.dDetector)
+    missing = InputError(
+        f'the cloud was fitted to {len(geometry)} views, not all of which are among the '
+        f'{len(scan)} of this scan: give the scan that it was fitted to'
+    )
+    if len(scan) < len(geometry) or scan.geometry.mode != geometry.mode:
+        raise missing
+    chosen = spread(len(scan), len(geometry))
+    if np.abs(there[chosen] - wanted).max() > allowed:
+        left = np.ones(len(scan), bool)
+        for i, view in enumerate(wanted):
+            same = left & (np.abs(there - view).max(1) <= allowed)
+            if not same.any():
+                raise missing
+            chosen[i] = np.argmax(same)
+            left[chosen[i]] = False
+    return scan.subset(chosen)
+
+
+def _corners(geometry: Geometry, reach: float) -> np.ndarray:
+    """What tells views apart, [view, 12] in mm: the source, or how far a beam goes sideways in `reach`, and three corners of
+    the panel."""
+    f, (rows, columns) = geometry.rays(), geometry.nDetector
+    source = f.source * reach if f.parallel else f.source
+    return np.concatenate([source, f.corner, f.corner + columns * f.u, f.corner + rows * f.v], 1)
+
+
+def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
+    """The `fitted_views` with their poses as the fit has corrected them; as they are, where it left them alone."""
+    if cloud.corrected is cloud.geometry:
+        return scan
+    g = scan.geometry
+    return replace(scan, geometry=replace(cloud.corrected, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin))
+
+
+def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
+    """Angles (radians) of the views - len(angles) views that spread `views` as evenly as the given ones allow.
+
+    The widest step is divided first, until there are enough views; an arc that is open stays as long as it is.
+    """
+    order, gap, is_open = gaps(replace(geometry, angles=angles), 2 * np.pi)
+    parts = np.ones(len(gap), int)
+    for _ in range(views - len(angles)):
+        parts[np.argmax(gap / parts - 1e-9 * np.arange(len(gap)))] += 1
+    return np.concatenate([angles[i] + g * np.arange(1, k) / k for i, g, k in zip(order, gap, parts)])
+
+
+def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
+    """The line integrals of measured views, `corrected` by the cloud for the effects that its fit has modelled; where it has
+    modelled none, the projections themselves."""
+    return scan if cloud.effects is None else corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
+
+
+def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
+    """A scan of `views` views: the measured ones, `as_corrected` and `without_effects`, and those between them rendered from
+    the cloud.
+
+    Raises InputError where fewer views are asked for than were measured or more than a scan may have, and for a scan that is
+    no circle about z.
+    """
+    require_circle(scan, 'the completion of a scan')
+    if views > MOST_VIEWS:
+        raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
+    check_memory(scan.geometry, views=views)
+    return insert_views(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
+
+
+def insert_views(scan: Scan, views: int, render, circle: Geometry | None = None) -> Scan:
+    """A scan of `views` views: the given ones and those between them, by `render`, a function of their geometry.
+
+    circle   where the views should be, if a fit has found them to be beside it (default: where they are)
+
+    Raises InputError where fewer views are asked for than are given.
+    """
+    geometry = circle or scan.geometry
+    if views < len(scan):
+        raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
+    if views == len(scan):
+        return scan
+    rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
+    return Scan(scan.geometry.joined(rendered), np.concatenate([scan.projections, render(rendered)]))
