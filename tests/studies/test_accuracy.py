@@ -10,17 +10,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers import oracle
-from helpers.oracle import random_cloud, relative
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.accuracy import PRESETS
-from lingo_mi.studies import alternatives
+from lingo_mi.studies import alternatives, oracle
 from lingo_mi.studies.accuracy import Sizes, measure
 from lingo_mi.studies.accuracy.compare import by_function, by_integrator, compare, deviation
 from lingo_mi.studies.accuracy.report import BACKWARD, GRADIENTS, TITLES, insert, make_tables, write
 from lingo_mi.studies.accuracy.workload import Workload
 from lingo_mi.studies.closed_form import NAMES, image_and_gradients, rays_and_gradients
+from lingo_mi.studies.oracle import random_cloud, relative
 
 ROOT = Path(__file__).parents[2]
 TINY = Sizes(

@@ -9,9 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers.oracle import random_cloud
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
+from lingo_mi.studies.oracle import random_cloud
 
 SCRIPT = Path(__file__).parent.parent / 'scripts' / 'gradcheck.py'
 XML = """<scene version="3.0.0">
