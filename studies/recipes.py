@@ -109,12 +109,10 @@ def table(results: Results) -> str:
 
 def draw(results: Results, figure: Path) -> None:
     """The picture of all histories: PSNR of held-out views and of the volume against seconds, a column a scene."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second that the fits need not wait for
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # half a second that the fits need not wait for
 
     scenes = list(dict.fromkeys(scene for scene, _ in results))
     fig = Figure(figsize=(5 * len(scenes), 7), layout='constrained')
-    FigureCanvasAgg(fig)
     axes = fig.subplots(2, len(scenes), squeeze=False)
     for (scene, method), metrics in results.items():
         for row, (key, what) in enumerate(dict(psnr_2d='held-out views', psnr_3d='volume').items()):

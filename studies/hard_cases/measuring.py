@@ -27,11 +27,11 @@ from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import oracle
-from lingo_mi.studies.closed_form import rays_and_gradients
+from lingo_mi.studies.closed_form import NAMES, rays_and_gradients
 from lingo_mi.studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
 from lingo_mi.studies.oracle import Cloud, Pose
 
-PARAMETERS = 'centre', 'scale', 'rotation', 'density'
+PARAMETERS = tuple(NAMES)
 EXTENT = 8.0  # leaves e^-32 of a Gaussian out, 1e-14
 FLOOR = 1e-6
 TINY = 1e-30
