@@ -4,7 +4,9 @@ With W = diag(1/s) R^T, w = W (p - o), d = W D, m = w.d / |d|^2 and r = w - m d,
 
     integral = rho sqrt(2 pi) |D| / |d| exp(-|r|^2 / 2),    d ln(integral) = -r . dw + (m r - d / |d|^2) . dd
 
-Independent of the projector: the general form on explicit rays, no footprint, differentiated by hand.
+Independent of the projector: the general form on explicit rays, no footprint, differentiated by hand. Integrals run along the
+whole line; `lingo_mi.studies.oracle`, by differences and Gaussian by Gaussian, has those that end at the source or the panel and
+says why both are needed.
 """
 
 from __future__ import annotations

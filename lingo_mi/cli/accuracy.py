@@ -1,10 +1,11 @@
 """Measure what accuracy costs: error, time and memory of every way to compute the same projections, scaling, and fits.
 
-    python scripts/accuracy.py
-    python scripts/accuracy.py --quick
+    lingo-mi accuracy
+    lingo-mi accuracy --quick
+    lingo-mi accuracy --docs docs
 
-Writes accuracy.json and accuracy.md to --out. The full run (6 to 15 minutes on two cores) also renews docs/figures/ and
-the tables in docs/accuracy.md; --quick (under 3 minutes) leaves them alone, without --docs, and writes its plots to --out.
+Writes accuracy.json, accuracy.md and the plots to --out, and to accuracy.provenance.json how they were made. The full run takes
+6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go there and the tables into a page there, too.
 """
 
 import argparse
@@ -12,36 +13,34 @@ import sys
 import time
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, docs_arguments, docs_of
 from lingo_mi.runtime import use_variant
-
-DOCS = Path('docs')
 
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
-    p.add_argument('--docs', action='store_true', help='renew docs/ after a quick run, too')
-    p.add_argument(
-        '--figures', type=Path, metavar='DIR', help='folder of the plots (default: docs/figures, or --out if quick)'
-    )
+    docs_arguments(p, 'accuracy.md', 'figures')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
 
 def main():
     args = arguments()
+    document, figures = docs_of(args)
     use_variant(args.variant)
     from lingo_mi.studies.accuracy import FULL, QUICK, measure
     from lingo_mi.studies.accuracy.report import write
+    from lingo_mi.studies.accuracy.tables import TITLES
+    from lingo_mi.studies.markdown import check_places
 
+    if document:
+        check_places(document, TITLES)
     begun = time.perf_counter()
     found = measure(
         QUICK if args.quick else FULL,
         lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr),
     )
-    renew = args.docs or not args.quick
-    figures = args.figures or (DOCS / 'figures' if renew else args.out)
-    write(found, args.out, figures, DOCS / 'accuracy.md' if renew else None)
+    write(found, args.out, figures, document)
     print(f'{args.out}/: accuracy.json, accuracy.md; {figures}/: pareto.png, scaling.png, fits.png')

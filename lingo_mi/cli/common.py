@@ -114,6 +114,44 @@ def read_input(args, scene, views: int | None, seed: int = 0):
     return take_scan(scene, views or 0, volume, seed)
 
 
+def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str) -> None:
+    """Add the arguments that say which documentation to renew: --docs, --document, --figures; see `docs_of`.
+
+    document, figures   where in the folder --docs the Markdown page and the folder of the pictures are, unless named
+    """
+    parser.add_argument(
+        '--docs', type=Path, metavar='DIR', help='renew the documentation in DIR (default: nothing outside --out)'
+    )
+    parser.add_argument(
+        '--document',
+        type=Path,
+        metavar='FILE',
+        help=f'Markdown page whose tables to renew, between <!-- table NAME --> and <!-- end NAME --> '
+        f'(default: {document} in --docs)',
+    )
+    parser.add_argument(
+        '--figures', type=Path, metavar='DIR', help=f'folder of the pictures (default: {figures} in --docs, else --out)'
+    )
+    parser.set_defaults(in_docs=(document, figures))
+
+
+def docs_of(args) -> tuple[Path | None, Path]:
+    """The page to renew, if any, and the folder of the pictures, of the arguments that `docs_arguments` added.
+
+    Raises InputError where --docs is no folder, or where the results in --out might overwrite the page.
+    """
+    document, figures = args.document, args.figures or args.out
+    if args.docs is not None:
+        if not args.docs.is_dir():
+            raise InputError(f'--docs {args.docs}: there is no such folder')
+        document, figures = args.document or args.docs / args.in_docs[0], args.figures or args.docs / args.in_docs[1]
+    if document and document.resolve().parent == args.out.resolve():
+        raise InputError(
+            f'--out {args.out}: is the folder of {document}, which results could overwrite; choose another'
+        )
+    return document, figures
+
+
 def definitions(pairs) -> dict[str, str]:
     """The NAME=VALUE arguments of -D as a dictionary."""
     out = {}

@@ -1,20 +1,20 @@
 """Measure what modelling the effects of real projections is worth: fits that ignore them against fits that model them.
 
-    python scripts/effects.py
-    python scripts/effects.py --only hardening psf
+    lingo-mi effects
+    lingo-mi effects --only hardening psf
+    lingo-mi effects --docs docs
 
-Simulates each scene of scenes/effects/ with its effect, fits a cloud that ignores it and one that models it, and a third to a
-scan without it. Writes effects.json to --out, where results of other effects are kept, the pictures to docs/figures/effects/,
-and the table into docs/effects.md.
+Simulates each of the shipped scenes effects/NAME with its effect, fits a cloud that ignores it and one that models it, and a
+third to a scan without it. Writes effects.json to --out, where results of other effects are kept, with the table effects.md and
+a picture of each effect, and to effects.provenance.json how they were made. With --docs, the pictures go there and the table
+into a page there, too.
 """
 
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, docs_arguments, docs_of
 from lingo_mi.runtime import use_variant
-
-DOCS = Path('docs')
 
 
 def arguments():
@@ -23,15 +23,25 @@ def arguments():
         '--only', nargs='+', metavar='NAME', help='these effects, by the names of their scenes (default: all)'
     )
     p.add_argument('--out', type=Path, default=Path('out/effects'), metavar='D', help='folder of the results')
+    docs_arguments(p, 'effects.md', 'figures/effects')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
 
 def main():
     args = arguments()
+    document, figures = docs_of(args)
     use_variant(args.variant)
-    from lingo_mi.studies.effects import EXPERIMENTS, make_table, measure, write
+    from lingo_mi.studies.effects.experiments import EXPERIMENTS, experiment_of, measure
+    from lingo_mi.studies.effects.report import TABLE, make_table, write
+    from lingo_mi.studies.markdown import check_places
 
-    for name in args.only or EXPERIMENTS:
-        numbers = write({name: measure(name)}, args.out, DOCS / 'figures' / 'effects', DOCS / 'effects.md')
+    names = args.only or list(EXPERIMENTS)
+    for name in names:
+        experiment_of(name)
+    if document:
+        check_places(document, [TABLE])
+    numbers = {}
+    for name in names:
+        numbers = write({name: measure(name)}, args.out, figures, document)
     print(make_table(numbers))

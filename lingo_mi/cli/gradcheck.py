@@ -1,7 +1,7 @@
 """Check the derivatives of a scene's image against differences: a table of AD, differences and their relative error.
 
-    python scripts/gradcheck.py scenes/gaussians.xml
-    python scripts/gradcheck.py my_scene.xml -n 20 --variant llvm_ad_rgb
+    lingo-mi gradcheck gaussians
+    lingo-mi gradcheck my_scene.xml -n 20 --variant llvm_ad_rgb
 
 The exit code is 1 where an error is above 1e-4, and 2 for a scene that cannot be checked.
 """
@@ -15,7 +15,9 @@ from lingo_mi.scene.shipped import scene_path
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray')
+    p.add_argument(
+        'scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray, or the name of a shipped one'
+    )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument(
         '--step',
@@ -38,9 +40,9 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.studies.gradients import TOLERANCE, check, load, table
+    from lingo_mi.studies.gradient_check import TOLERANCE, check_gradients, load_scene_file, table
 
-    rows = check(load(scene_path(args.scene)), args.step, args.count)
+    rows = check_gradients(load_scene_file(scene_path(args.scene)), args.step, args.count)
     worst = max(row.error for row in rows)
     print(table(rows))
     print(f'largest error {worst:.1e}, tolerance {TOLERANCE:.0e}')

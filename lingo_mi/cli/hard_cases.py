@@ -1,11 +1,11 @@
-"""Measure the hard cases of the tests: a Markdown table of their errors, refusals and warnings.
+"""Measure the hard cases: a Markdown table of their errors, refusals and warnings.
 
-    python scripts/hard_cases.py
-    python scripts/hard_cases.py --markdown hard_cases.md
+    lingo-mi hard-cases
+    lingo-mi hard-cases --markdown hard_cases.md
 
-Every line is a case that tests/test_hard_cases.py asserts: relative errors of the image, and of the derivatives by the
-Gaussians' parameters, in float32 against float64 (tests/hard_cases.py says how they are counted). The exit code is 1
-where a case misses its tolerance.
+Every line is a case that the tests assert: relative errors of the image, and of the derivatives by the Gaussians' parameters,
+in float32 against float64 (`lingo_mi.studies.hard_cases.measuring` says how they are counted). The exit code is 1 where a case
+misses its tolerance. Beside the page that --markdown names, FILE.provenance.json says how it was made.
 """
 
 import argparse
@@ -26,19 +26,18 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    sys.path.insert(0, str(Path('tests').resolve()))
-    from helpers.hard_cases import cases, check, markdown, measure
+    from lingo_mi.studies.hard_cases.cases import all_cases
+    from lingo_mi.studies.hard_cases.measuring import measure, miss
+    from lingo_mi.studies.hard_cases.table import markdown
+    from lingo_mi.studies.provenance import write_provenance
 
-    results, missed = [], 0
-    for case in cases(steps=10_000):
-        try:
-            results.append((case, check(case)))
-        except AssertionError:
-            results.append((case, measure(case)))
-            print(f'missed its tolerance: {case.name}', file=sys.stderr)
-            missed += 1
+    results = [(case, measure(case)) for case in all_cases(steps=10_000)]
+    missed = [(case, wrong) for case, result in results if (wrong := miss(case, result))]
+    for case, wrong in missed:
+        print(f'missed its tolerance: {case.name}: {wrong}', file=sys.stderr)
     table = markdown(results)
     print(table, end='')
     if args.markdown:
-        args.markdown.write_text(table)
-    return int(missed > 0)
+        args.markdown.write_text(table, encoding='utf-8')
+        write_provenance(args.markdown)
+    return int(bool(missed))

@@ -1,11 +1,12 @@
 """What accuracy costs: error, time and memory of every way to compute the same projections, and of fits.
 
-`measure` runs it all on fixed seeds in this process and gives plain numbers; `report` makes tables and plots of them.
+`measure` runs it all on fixed seeds in this process and gives plain numbers; `report.write` makes tables and plots of them.
+
+    report.write(measure(QUICK), Path('out/accuracy'), figures=Path('out/accuracy'))
 """
 
 from __future__ import annotations
 
-import platform
 from dataclasses import asdict
 
 import drjit as dr
@@ -14,6 +15,7 @@ import mitsuba as mi
 from lingo_mi.studies.accuracy import fits, images, scaling
 from lingo_mi.studies.accuracy.sizes import FULL, QUICK, Sizes
 from lingo_mi.studies.accuracy.workload import Workload
+from lingo_mi.studies.provenance import machine
 
 __all__ = ['FULL', 'QUICK', 'Sizes', 'measure']
 
@@ -41,11 +43,3 @@ def measure(sizes: Sizes, progress=None) -> dict:
             progress(name)
         out[name] = part()
     return out
-
-
-def machine() -> str:
-    """The processor's name, as far as the system tells."""
-    try:
-        return next(line.split(':')[1].strip() for line in open('/proc/cpuinfo') if line.startswith('model name'))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

@@ -1,1 +1,1 @@
-"""Times beside those of a kernel written by hand (`limit.cpp`), of Mitsuba's tree, and of other packages."""
+"""Times against others: the integrator against a hand-written kernel and Mitsuba's tree, voxels against RTK and diffct."""

@@ -45,9 +45,9 @@ from lingo_mi.reconstruction.refined import refined
 from lingo_mi.reconstruction.sart import sart
 from lingo_mi.reconstruction.system import options_of
 from lingo_mi.results.measure import measure
-from lingo_mi.results.save import versions
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
+from lingo_mi.studies.provenance import provenance
 
 PHANTOMS = 'foot', 'chest'
 VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
@@ -227,7 +227,7 @@ class Cells:
             seed=self.seed,
             scale=asdict(self.scale),
             variant=mi.variant(),
-            versions=versions(),
+            provenance=provenance(),
         )
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')

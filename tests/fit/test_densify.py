@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from lingo_mi.fit.densify import SHRINK, clone, densify, halve, prune, split
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import PARAMETERS, State, activate, start
+from lingo_mi.studies.oracle import whiten
 
 SETTINGS = Settings(densify_threshold=1.0, split_size=0.1)
 HALF = np.ones(3)
@@ -126,8 +127,6 @@ def test_children_are_drawn_from_their_parent():
     )
     after = split(many, np.ones(n, bool), SETTINGS, rng)
     centre, scale, rotation, _ = (x[0] for x in activate(state, SETTINGS))
-    from helpers.oracle import whiten
-
     offset = whiten(scale, rotation, activate(after, SETTINGS)[0] - centre)
     assert np.abs(offset.mean(0)).max() < 5 / np.sqrt(2 * n)
     np.testing.assert_allclose(np.cov(offset.T), np.eye(3), atol=0.08)

@@ -9,8 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers import oracle
-from helpers.oracle import Cloud, relative
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, transform, values_of
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
@@ -20,6 +18,8 @@ from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.sensors import view_of
+from lingo_mi.studies import oracle
+from lingo_mi.studies.oracle import Cloud, relative
 
 FILM = dict(
     type='hdrfilm', width=26, height=19, rfilter=dict(type='box'), component_format='float32', pixel_format='luminance'

@@ -7,9 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers import oracle
-from helpers.hard_cases import PARAMETERS, host, on_device
-from helpers.oracle import Cloud, Pose, random_cloud, relative
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
@@ -17,6 +14,9 @@ from lingo_mi.projectors.exponential import exp2_of_negative
 from lingo_mi.projectors.footprint import NAMES, project
 from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.view import View
+from lingo_mi.studies import oracle
+from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
+from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
 
 EXTENT = 6.0
 POSE = 'source', 'corner', 'u', 'v'

@@ -5,11 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers import oracle
-from helpers.hard_cases import PARAMETERS, host, on_device
-from helpers.oracle import Cloud, random_cloud, relative
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.studies import oracle
+from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
+from lingo_mi.studies.oracle import Cloud, random_cloud, relative
 
 EXTENT = 6.0
 

@@ -7,13 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers import rtk
 from helpers.balls import BALL, centres, ellipsoids, geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.cgls import cgls
 from lingo_mi.reconstruction.fdk import fdk
 from lingo_mi.reconstruction.sart import sweep
 from lingo_mi.reconstruction.system import System
+from lingo_mi.studies.benchmarks import rtk_bridge as rtk
 
 itk = pytest.importorskip('itk', reason="RTK is not installed: pip install -e '.[reference]'")
 if not hasattr(itk, 'RTK'):

@@ -7,7 +7,8 @@ import pytest
 
 from lingo_mi.errors import InputError
 from lingo_mi.scene.shipped import scenes
-from lingo_mi.studies.effects import EXPERIMENTS, FITS, SETTINGS, measure, quality, write
+from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, SETTINGS, measure, quality
+from lingo_mi.studies.effects.report import write
 
 TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12')
 
@@ -31,11 +32,12 @@ def test_an_experiment(tmp_path):
     volumes = [result[kind]['volume'] for kind in FITS]
     assert all(v.shape == (16, 16, 16) and np.isfinite(v).all() for v in volumes)
     assert not np.allclose(volumes[0], volumes[1]) and not np.allclose(volumes[1], volumes[2])
-    document = tmp_path / 'effects.md'
+    document, out = tmp_path / 'effects.md', tmp_path / 'out'
     document.write_text('<!-- table worth -->\n<!-- end worth -->\n')
-    write({'psf': result}, tmp_path, tmp_path / 'figures', document)
+    write({'psf': result}, out, tmp_path / 'figures', document)
     assert f'{result["model"]["psnr_3d"]:.2f}' in document.read_text()
-    assert (
-        json.loads((tmp_path / 'effects.json').read_text())['psf']['ignore']['psnr_3d'] == result['ignore']['psnr_3d']
-    )
+    found = json.loads((out / 'effects.json').read_text())['psf']
+    assert found['ignore']['psnr_3d'] == result['ignore']['psnr_3d'] and found['provenance']['date']
+    assert (out / 'effects.md').read_text().count('|') == document.read_text().count('|')
+    assert all((folder / 'effects.provenance.json').exists() for folder in (out, tmp_path))
     assert (tmp_path / 'figures' / 'psf.png').stat().st_size > 10_000

@@ -1,15 +1,14 @@
-"""Which fits scripts/recipes.py runs, and which results it takes for them; the fits themselves are not run."""
+"""Which fits `lingo-mi recipes` runs, and which results it takes for them; the fits themselves are not run."""
 
 import json
 import runpy
-import subprocess
 import sys
 from pathlib import Path
-from unittest import mock
 
 import pytest
 
 from helpers.script import FIT
+from lingo_mi.studies import recipes as study
 
 METRICS = dict(
     psnr_2d=30.0,
@@ -45,14 +44,14 @@ def fits(monkeypatch):
     """The commands of the fits that were asked for; each ends at once."""
     commands = []
 
-    def fit(command, **_):
+    def fit(command):
         commands.append(command[2:])
         out = Path(command[command.index('--out') + 1])
         out.mkdir(parents=True)
         (out / 'metrics.json').write_text(json.dumps(METRICS))
-        return mock.Mock(returncode=0)
+        return 0
 
-    monkeypatch.setattr(subprocess, 'run', fit)
+    monkeypatch.setattr(study, 'run_command', fit)
     return commands
 
 
@@ -70,6 +69,19 @@ def test_a_fit_of_other_settings_is_another(recipes, fits, tmp_path):
     assert asked('--methods', 'r2', '-D', 'iterations=9') == [['iterations=9']]
     assert asked('--methods', 'r2', '--views', '3') == [['iterations=5000']]
     assert (tmp_path / 'recipes.png').exists()
+    assert '| a | r2 |' in (tmp_path / 'recipes.md').read_text()
+    assert 'recipes.py a.xml' in json.loads((tmp_path / 'recipes.provenance.json').read_text())['command']
+
+
+def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypatch, tmp_path):
+    commands = []
+    monkeypatch.setattr(study, 'run_command', lambda command: commands.append(command) or 3)
+    folder = tmp_path / 'a_25_fast'
+    folder.mkdir()
+    (folder / 'checkpoint.npz').touch()
+    code, _, err = recipes('--methods', 'fast')
+    assert code == 2 and '--resume' in commands[0]
+    assert err.splitlines()[-1] == 'error: a.xml: lingo-mi fit --method fast failed with exit code 3'
 
 
 @pytest.mark.parametrize('method', ['nerf', 'r2:V=1', 'r2:V_S'])

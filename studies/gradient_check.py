@@ -1,4 +1,4 @@
-"""Derivatives of a scene's image by `lingo_xray`, against differences.
+"""The gradient check: derivatives of a scene's image by `lingo_xray`, against differences.
 
 The function is L = sum(weights * image) with fixed random weights, normal about zero. Its derivatives by automatic
 differentiation are compared with
@@ -9,23 +9,26 @@ differentiation are compared with
                  in a grid, so that this large step has no error but rounding
 
 For a scene in transmission, I = exp(-p), both use dL = -sum(weights * I * dp).
+
+    rows = check_gradients(load_scene_file('scene.xml'))
+    print(table(rows))
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import erf
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.scene.load import plain
+from lingo_mi.studies.oracle import Pose, one_integral
 
 EXTENT = 8.0
 COLUMNS = {'centre': slice(0, 3), 'scale': slice(3, 6), 'rotation': slice(6, 10)}  # of an ellipsoids' `data`
@@ -34,8 +37,13 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Row:
-    """One derivative. `error` is |ad - fd| over the length of the gradient that it is a component of: all of one kind's
-    components of a Gaussian, or all voxels that were drawn."""
+    """One derivative.
+
+    parameter   its name
+    ad, fd      by automatic differentiation; by differences
+    error       |ad - fd| over the length of the gradient that it is a component of: all of one kind's components of a
+                Gaussian, or all voxels that were drawn
+    """
 
     parameter: str
     ad: float
@@ -43,17 +51,17 @@ class Row:
     error: float
 
 
-def load(path):
-    """A scene from a file. Raises InputError, in one line, for whatever Mitsuba finds wrong."""
+def load_scene_file(path):
+    """Any Mitsuba scene, with or without a scanner. Raises InputError, in one line, for whatever Mitsuba finds wrong."""
     if not Path(path).is_file():
         raise InputError(f'{path}: there is no such file')
     try:
-        return mi.load_file(str(path), parallel=False)  # as in `scanning.load_scene`
+        return mi.load_file(str(path), parallel=False)  # as in `scene.load.load_scene`
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
         raise InputError(f'{path}: {plain(error)}') from None
 
 
-def check(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
+def check_gradients(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
     """Compare derivatives of a scene's image in its first sensor.
 
     step    of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the
@@ -73,13 +81,13 @@ def check(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]
     transmission, rng = integrator.output == 'transmission', np.random.default_rng(seed)
     line = mi.load_dict(dict(type='lingo_xray', extent=EXTENT))
     exact = mi.load_dict(dict(type='lingo_xray', extent=EXTENT, output=integrator.output))
-    image = line.render(scene)
-    weights = rng.normal(size=image.shape).astype(np.float32)
+    rendered = line.render(scene)
+    weights = rng.normal(size=rendered.shape).astype(np.float32)
 
     params = mi.traverse(scene)
-    clouds = [k.removesuffix('.density') for k in params.keys() if k.endswith('.density')]
+    clouds = [k.removesuffix('.density') for k in params.keys() if k.endswith('.density')]  # noqa: SIM118 - no dict
     clouds = [name for name in clouds if f'{name}.data' in params]
-    grids = [k for k in params.keys() if k.endswith('sigma_t.data')]
+    grids = [k for k in params.keys() if k.endswith('sigma_t.data')]  # noqa: SIM118
     keys = [f'{name}.{part}' for name in clouds for part in ('data', 'density')] + grids
     if not keys:
         raise InputError('the scene has neither ellipsoids nor grids: there is no derivative to check')
@@ -94,18 +102,31 @@ def check(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]
 
     slope = weights.sum(-1, dtype=float).ravel()
     if transmission:
-        slope = -slope * np.exp(-np.array(image, float)[..., 0].ravel())
-    rows, rays = [], _rays(view_of(scene.sensors()[0]))
+        slope = -slope * np.exp(-np.array(rendered, float)[..., 0].ravel())
+    view = view_of(scene.sensors()[0])
+    pose = Pose.of_view(view)
+    rays = *pose.rays(), *pose.ends(view.panel)
+
+    def loss(values):
+        """That of one Gaussian alone, (centre, scale, quaternion, density)."""
+        return slope @ one_integral(values[:3], values[3:6], values[6:10], values[10], *rays)
+
+    def image():
+        return np.array(line.render(scene), float)[..., 0].ravel()
+
+    rows = []
     for name in clouds:
-        rows += _cloud(name, params, gradients, rays, slope, step, count, rng)
+        drawn = _draw(gradients[f'{name}.density'], count, rng)
+        rows += _of_cloud(name, params, gradients, drawn, loss, step)
     for key in grids:
-        rows += _grid(key, params, gradients[key], lambda: line.render(scene), slope, count, rng)
+        drawn = _draw(gradients[key].ravel(), count, rng)
+        rows += _of_grid(key, params, gradients[key], drawn, image, slope)
     if not rows:
         raise InputError('the image shows neither ellipsoids nor grids: there is no derivative to check')
     return rows
 
 
-def table(rows) -> str:
+def table(rows: list[Row]) -> str:
     """The rows as text, one a line."""
     width = max(len(row.parameter) for row in rows)
     lines = [f'{"parameter":{width}s} {"AD":>14s} {"differences":>14s} {"error":>9s}']
@@ -113,68 +134,44 @@ def table(rows) -> str:
     return '\n'.join(lines)
 
 
-def _rays(view):
-    """Starts, directions [pixels, 3] and the ends t0, t1 of all rays, float64."""
-    source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
-    y, x = np.divmod(np.arange(view.height * view.width), view.width)
-    pixel = corner + (x + 0.5)[:, None] * u + (y + 0.5)[:, None] * v
-    if view.parallel:
-        return pixel, np.broadcast_to(source, pixel.shape), -np.inf, np.inf
-    return np.broadcast_to(source, pixel.shape), pixel - source, 0.0, 1.0 if view.panel else np.inf
+def _draw(gradient, count, rng):
+    """Indices of up to `count` parameters that the image shows."""
+    return np.sort(rng.permutation(np.flatnonzero(gradient))[:count])
 
 
-def _integrals(data, density, start, direction, t0, t1):
-    """Line integrals [rays] through one Gaussian, data = (centre, scale, quaternion)."""
-    whiten = Rotation.from_quat(data[6:]).as_matrix() / data[3:6]
-    w, d = (data[:3] - start) @ whiten, direction @ whiten
-    dd = (d * d).sum(1)
-    middle, k = (w * d).sum(1) / dd, np.sqrt(dd / 2)
-    off = (np.cross(w, d) ** 2).sum(1) / dd
-    part = erf((t1 - middle) * k) - erf((t0 - middle) * k)
-    return np.sqrt(np.pi / 2 / dd) * density * np.linalg.norm(direction, axis=1) * np.exp(-off / 2) * part
-
-
-def _draw(shown, count, rng):
-    return np.sort(rng.permutation(np.flatnonzero(shown))[:count])
-
-
-def _cloud(name, params, gradients, rays, slope, step, count, rng):
+def _of_cloud(name: str, params, gradients: dict, drawn, loss: Callable, step: float) -> list[Row]:
+    """The derivatives of the drawn Gaussians of a cloud, by differences of a Gaussian's `loss`."""
     data = np.array(params[f'{name}.data'], float).reshape(-1, 10)
     density = np.array(params[f'{name}.density'], float)
     by_data, by_density = gradients[f'{name}.data'].reshape(-1, 10), gradients[f'{name}.density']
     rows = []
-    for i in _draw(by_density, count, rng):
-
-        def loss(values, i=i):
-            return slope @ _integrals(values[:10], values[10], *rays)
-
+    for i in drawn:
         values = np.append(data[i], density[i])
         size = np.append(np.full(6, data[i, 3:6].min()), np.full(4, np.linalg.norm(data[i, 6:])))
         size = step * np.append(size, max(abs(density[i]), 1.0))
         fd = np.array([(loss(values + h) - loss(values - h)) / (2 * h.sum()) for h in np.diag(size)])
         ad = np.append(by_data[i], by_density[i])
         for kind, columns in (*COLUMNS.items(), ('density', slice(10, 11))):
-            rows += _compare(
-                ad[columns], fd[columns], [f'{name}.{kind}[{i}]' + f'.{c}' * (kind != 'density') for c in 'xyzw']
-            )
+            names = [f'{name}.{kind}[{i}]' + f'.{c}' * (kind != 'density') for c in 'xyzw']
+            rows += _compare(ad[columns], fd[columns], names)
     return rows
 
 
-def _grid(key, params, gradient, render, slope, count, rng):
+def _of_grid(key: str, params, gradient, drawn, image: Callable, slope) -> list[Row]:
+    """The derivatives of the drawn voxels of a grid, by differences of the scene's `image` [pixels]."""
     tensor = mi.TensorXf(params[key])  # a copy: setting a parameter overwrites the object in place
     flat = gradient.ravel()
-    drawn = _draw(flat, count, rng)
 
-    def image(values):
+    def image_of(values):
         params[key] = mi.TensorXf(values, tensor.shape)
         params.update()
-        return np.array(render(), float)[..., 0].ravel()
+        return image()
 
     try:
         # Images are subtracted before they are summed: pixels that the voxel does not reach cancel to the last bit.
         unit = np.eye(1, len(flat), dtype=np.float32)[0]
-        empty = image(0 * unit)
-        fd = [slope @ (image(np.roll(unit, i)) - empty) for i in drawn]
+        empty = image_of(0 * unit)
+        fd = [slope @ (image_of(np.roll(unit, i)) - empty) for i in drawn]
     finally:
         params[key] = tensor
         params.update()
@@ -182,6 +179,6 @@ def _grid(key, params, gradient, render, slope, count, rng):
     return _compare(flat[drawn], np.array(fd), [key + name for name in names])
 
 
-def _compare(ad, fd, names):
+def _compare(ad, fd, names) -> list[Row]:
     length = max(np.linalg.norm(fd), np.linalg.norm(ad), np.finfo(float).tiny)
     return [Row(name, a, b, abs(a - b) / length) for name, a, b in zip(names, ad, fd)]

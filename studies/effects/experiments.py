@@ -1,10 +1,8 @@
-"""What modelling an effect is worth: scans with it, reconstructed by fits that ignore it and that model it."""
+"""Scans with an effect, reconstructed by fits that ignore it and that model it."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,12 +14,10 @@ from lingo_mi.fit.settings import FAST
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import psnr_3d_absolute
 from lingo_mi.projectors.objects import find_objects
-from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import render_objects, take_scan
-from lingo_mi.studies.accuracy.report import insert, table
 
 # Small, so that a fit takes about a minute.
 SETTINGS = FAST.changed(iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
@@ -71,6 +67,13 @@ EXPERIMENTS = dict(
 )
 
 
+def experiment_of(name: str) -> Experiment:
+    """The experiment of a name. Raises InputError where there is none."""
+    if name not in EXPERIMENTS:
+        raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
+    return EXPERIMENTS[name]
+
+
 def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: int = 0) -> dict:
     """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
 
@@ -81,9 +84,7 @@ def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: 
     ms_per_iteration (over the second half of the steps, when all is compiled), seconds (of start and steps), volume; also
     truth [x, y, z], 1/mm, and spacing, mm. Raises InputError for an unknown name.
     """
-    if name not in EXPERIMENTS:
-        raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
-    experiment = EXPERIMENTS[name]
+    experiment = experiment_of(name)
     scenes, found = {}, {}
     for kind, changes in dict(
         clean={}, ignore=dict(effects='ignore') | experiment.ignore, model=experiment.model
@@ -162,78 +163,3 @@ def pace(history) -> float:
     last = history[-1]
     first = next(h for h in history if 2 * h['iteration'] >= last['iteration'] or h is history[-2])
     return 1e3 * (last['seconds'] - first['seconds']) / (last['iteration'] - first['iteration'])
-
-
-def write(found: dict, folder: Path, figures: Path, document: Path | None = None) -> dict:
-    """Write effects.json into `folder`, a picture of every experiment into `figures`, and the table into `document`.
-
-    found   what `measure` gave, by the experiments' names; effects.json keeps what it holds of others
-
-    Returns what effects.json holds.
-    """
-    for path in (folder, figures):
-        path.mkdir(parents=True, exist_ok=True)
-    for name, result in found.items():
-        draw(result, figures / f'{name}.png')
-    numbers = {
-        name: {k: v for k, v in result.items() if k not in ('truth', *FITS)}
-        | {kind: {k: v for k, v in result[kind].items() if k != 'volume'} for kind in FITS}
-        for name, result in found.items()
-    }
-    path = folder / 'effects.json'
-    known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
-    numbers = {name: known[name] for name in EXPERIMENTS if name in known}
-    path.write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
-    if document:
-        text = document.read_text(encoding='utf-8')
-        document.write_text(insert(text, dict(worth=make_table(numbers)), document), encoding='utf-8')
-    return numbers
-
-
-def make_table(numbers: dict) -> str:
-    """The Markdown table of effects.json."""
-
-    def cell(kind):
-        return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
-
-    columns = [
-        ('effect', lambda r: r['title']),
-        ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
-        *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
-        ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
-        ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
-        ('extra, s', lambda r: f'{r["model"]["seconds"] - r["ignore"]["seconds"]:+.0f}'),
-    ]
-    return table(columns, numbers.values())
-
-
-def draw(result: dict, path: Path):
-    """A picture of what `measure` gave: axial slices of the truth and of both fits on one grey scale, 1/mm, and the errors
-    of all three fits below on one scale of their own."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    truth, spacing = result['truth'], np.array(result['spacing'])
-    index, extent = richest(truth, 2), plane_extent(truth.shape, spacing, np.zeros(3), 2)
-    wanted = plane(truth, 2, index)
-    slices = {kind: plane(result[kind]['volume'], 2, index) for kind in FITS}
-    limit = max(np.percentile(np.abs(slices[kind] - wanted), 99) for kind in FITS)
-    with matplotlib.rc_context(STYLE):
-        fig = Figure(figsize=(10, 6.6), layout='constrained')
-        fig.get_layout_engine().set(**PADS)
-        fig.suptitle(f'{result["title"]}: slice at z = {(index + 0.5 - truth.shape[2] / 2) * spacing[2]:.3g} mm')
-        grid = fig.subplots(2, 3, sharex=True, sharey=True)
-        above = [('truth', wanted), *((FITS[kind], slices[kind]) for kind in ('ignore', 'model'))]
-        for ax, (title, image) in zip(grid[0], above):
-            grey = ax.imshow(image, origin='lower', extent=extent, cmap='gray', vmin=0, vmax=1.1 * wanted.max())
-            ax.set_title(title)
-        for ax, (kind, title) in zip(grid[1], FITS.items()):
-            error = ax.imshow(
-                slices[kind] - wanted, origin='lower', extent=extent, cmap='RdBu_r', vmin=-limit, vmax=limit
-            )
-            ax.set(title=f'error, {title}: {result[kind]["psnr_3d"]:.2f} dB', xlabel='x [mm]')
-        for ax in grid[:, 0]:
-            ax.set_ylabel('y [mm]')
-        fig.colorbar(grey, ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
-        fig.colorbar(error, ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
-        fig.savefig(path, dpi=90)

@@ -1,12 +1,20 @@
-"""Runs RTK on scans of this package (needs the `reference` extra).
+"""RTK on scans of this package. Needs the extra `reference`, of which every function takes the module `itk`.
 
 RTK rotates about y: (x, y, z) there is (y, z, x) here, its gantry angle is ours. ITK arrays are indexed backwards.
+
+    import itk
+    volume = reconstruct('FDK', scan, itk)
 """
+
+from __future__ import annotations
 
 import numpy as np
 
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.scan import Scan
 
-def gantry(geometry, itk):
+
+def gantry(geometry: Geometry, itk):
     """RTK's geometry object."""
     out = itk.RTK.ThreeDCircularProjectionGeometry.New()
     for angle in np.degrees(geometry.angles):
@@ -14,7 +22,7 @@ def gantry(geometry, itk):
     return out
 
 
-def volume_image(volume, geometry, itk):
+def volume_image(volume: np.ndarray, geometry: Geometry, itk):
     """A volume [x, y, z] as an ITK image (y, z, x)."""
     image = itk.image_from_array(np.ascontiguousarray(volume.transpose(0, 2, 1), np.float32))
     order = [1, 2, 0]
@@ -24,7 +32,7 @@ def volume_image(volume, geometry, itk):
     return image
 
 
-def projection_image(projections, geometry, itk):
+def projection_image(projections: np.ndarray, geometry: Geometry, itk):
     """Projections [view, v, u] as an ITK stack; rows upwards."""
     image = itk.image_from_array(np.ascontiguousarray(projections[:, ::-1], np.float32))
     (dv, du), (nv, nu) = geometry.dDetector, geometry.nDetector
@@ -33,15 +41,16 @@ def projection_image(projections, geometry, itk):
     return image
 
 
-def array(image, itk):
+def array(image, itk) -> np.ndarray:
     """A volume image as [x, y, z]."""
     return itk.array_from_image(image).transpose(0, 2, 1)
 
 
-def reconstruct(kind, scan, itk, **settings):
-    """Volume [x, y, z] of one of RTK's filters, set up by its Set... methods.
+def reconstruct(kind: str, scan: Scan, itk, **settings) -> np.ndarray:
+    """Volume [x, y, z] of one of RTK's filters.
 
-    kind   'FDK', 'SART' or 'ConjugateGradient'
+    kind       'FDK', 'SART' or 'ConjugateGradient'
+    settings   arguments of the filter's Set... methods, such as NumberOfIterations=1
     """
     image = itk.Image[itk.F, 3]
     geometry = scan.geometry
@@ -59,7 +68,7 @@ def reconstruct(kind, scan, itk, **settings):
     return array(reconstruction.GetOutput(), itk).copy()
 
 
-def project(volume, geometry, itk):
+def project(volume: np.ndarray, geometry: Geometry, itk) -> np.ndarray:
     """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
     zeros = np.zeros((len(geometry), *geometry.nDetector))
     found = _filter(
@@ -72,7 +81,7 @@ def project(volume, geometry, itk):
     return itk.array_from_image(found)[:, ::-1]
 
 
-def backproject(scan, itk):
+def backproject(scan: Scan, itk) -> np.ndarray:
     """Volume [x, y, z] of a scan by the transpose of that projector."""
     geometry = scan.geometry
     found = _filter(

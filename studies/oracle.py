@@ -1,10 +1,22 @@
-"""Float64 oracle of clouds of Gaussians: NumPy, written to be obviously right rather than fast.
+"""Line integrals, densities and derivatives of a cloud of Gaussians in float64 NumPy, written to be obviously right.
 
     sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2)
 
 Along a ray o + t D every term is a Gaussian in t. With w = W(p - o), d = W D and m = w.d / |d|^2 it is
 rho exp(-1/2 |w - m d|^2) exp(-1/2 |d|^2 (t - m)^2), which integrates to the error function.
+
+Derivatives are differences by a five-point stencil. `lingo_mi.studies.closed_form` differentiates by hand instead. Both are
+needed: rays that end at a source or a panel, densities at points and derivatives by the pose are here alone; Gaussians so small
+that differences are too coarse, whole images of thousands of Gaussians and means over pixels are there alone. Each is tested
+against the other.
+
+    rng = np.random.default_rng(0)
+    frames = geometry.rays()                       # of a lingo_mi.geometry.base.Geometry
+    pose = Pose.of(frames, 0, *geometry.nDetector)
+    image = line_integrals(random_cloud(rng, 5), pose, *pose.ends())
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
@@ -23,7 +35,7 @@ class Cloud:
     density: np.ndarray
 
     def __post_init__(self):
-        for f in fields(self):  # what a test says is what float32 holds of it: rounding the input is no error
+        for f in fields(self):  # rounded to what float32 holds, so that rounding the input counts as no error
             object.__setattr__(self, f.name, np.array(getattr(self, f.name), np.float32).astype(float))
 
     def __len__(self):
@@ -35,11 +47,12 @@ class Cloud:
     def __add__(self, other):
         return Cloud(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
-    def changed(self, **columns):
+    def changed(self, **columns) -> Cloud:
+        """The cloud with other columns, such as density=np.ones(len(cloud))."""
         return replace(self, **columns)
 
 
-def random_cloud(rng, n, spread=0.6, size=0.08, centre=(0.0, 0.0, 0.0)):
+def random_cloud(rng, n, spread=0.6, size=0.08, centre=(0.0, 0.0, 0.0)) -> Cloud:
     """n Gaussians with centres in a cube of half side `spread`, scales around `size`, any rotation and length of it."""
     return Cloud(
         np.array(centre) + rng.uniform(-spread, spread, (n, 3)),
@@ -51,7 +64,7 @@ def random_cloud(rng, n, spread=0.6, size=0.08, centre=(0.0, 0.0, 0.0)):
 
 @dataclass(frozen=True)
 class Pose:
-    """One view as in `lingo_mi.geometry.base.Rays`: `source` is a point, or the beam's unit direction where parallel."""
+    """One view as in `lingo_mi.geometry.rays.Rays`: `source` is a point, or the beam's unit direction where parallel."""
 
     source: np.ndarray
     corner: np.ndarray
@@ -62,7 +75,8 @@ class Pose:
     parallel: bool = False
 
     @staticmethod
-    def of(frames, index, height, width):
+    def of(frames, index, height, width) -> Pose:
+        """View `index` of a `lingo_mi.geometry.rays.Rays`, for an image of height x width pixels."""
         return Pose(
             *(np.array(a[index], float) for a in (frames.source, frames.corner, frames.u, frames.v)),
             height,
@@ -70,7 +84,17 @@ class Pose:
             frames.parallel,
         )
 
-    def rays(self):
+    @staticmethod
+    def of_view(view) -> Pose:
+        """A `lingo_mi.projectors.view.View`."""
+        vectors = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
+        return Pose(*vectors, view.height, view.width, view.parallel)
+
+    def ends(self, panel: bool = True) -> tuple[float, float]:
+        """Where integrals begin and end, in t: at the source and, if `panel`, at the panel; those of a parallel beam nowhere."""
+        return (-np.inf, np.inf) if self.parallel else (0.0, 1.0 if panel else np.inf)
+
+    def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Starts and directions [height * width, 3] through the pixel centres, row by row; t = 1 is on the panel."""
         y, x = np.divmod(np.arange(self.height * self.width), self.width)
         on_panel = self.corner + (x + 0.5)[:, None] * self.u + (y + 0.5)[:, None] * self.v
@@ -103,6 +127,7 @@ def line_integrals(cloud, pose, t0=-np.inf, t1=np.inf):
 
 
 def rows(cloud):
+    """The Gaussians one by one: centre, scale, rotation, density."""
     return zip(cloud.centre, cloud.scale, cloud.rotation, cloud.density)
 
 
@@ -119,7 +144,7 @@ def gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
 
 
 def values_at(cloud, points):
-    """sigma at points [M, 3]."""
+    """sigma [M] at points [M, 3]."""
     return sum(_value(*row, points) for row in rows(cloud))
 
 

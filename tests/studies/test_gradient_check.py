@@ -5,15 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from helpers.oracle import random_cloud
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
+from lingo_mi.studies import gradient_check
+from lingo_mi.studies.gradient_check import check_gradients, load_scene_file, table
+from lingo_mi.studies.oracle import random_cloud
 
-SCRIPT = Path(__file__).parent.parent / 'scripts' / 'gradcheck.py'
+SCRIPT = Path(__file__).parents[2] / 'scripts' / 'gradcheck.py'
 XML = """<scene version="3.0.0">
     <integrator type="lingo_xray"><string name="output" value="{output}"/></integrator>
     {sensor}
@@ -62,11 +65,9 @@ def script(*arguments):
 @pytest.mark.parametrize('sensor', SENSORS)
 @pytest.mark.parametrize('output', ['line_integral', 'transmission'])
 def test_right_derivatives_pass(tmp_path, sensor, output):
-    from lingo_mi.studies.gradients import check, load, table
-
-    scene = load(scene_file(tmp_path, sensor, output))
+    scene = load_scene_file(scene_file(tmp_path, sensor, output))
     before = np.array(mi.render(scene))
-    rows = check(scene, count=3)
+    rows = check_gradients(scene, count=3)
     assert len(rows) == 3 * (3 + 3 + 4 + 1) + 3
     assert max(row.error for row in rows) < 1e-5
     assert all(row.ad != 0 for row in rows)
@@ -79,10 +80,6 @@ def test_right_derivatives_pass(tmp_path, sensor, output):
 @pytest.mark.parametrize('part, kind', [('data', 'scale'), ('density', 'density')])
 def test_wrong_derivatives_are_found(tmp_path, monkeypatch, part, kind):
     """A cloud whose gradient is off by a thousandth in one place."""
-    import drjit as dr
-
-    from lingo_mi.studies import gradients as gradcheck
-
     honest = dr.grad
 
     def wrong(value, *args, **kwargs):
@@ -90,9 +87,9 @@ def test_wrong_derivatives_are_found(tmp_path, monkeypatch, part, kind):
         size = {'data': 50, 'density': 5}[part]
         return gradient * 1.001 if isinstance(gradient, mi.Float) and dr.width(gradient) == size else gradient
 
-    monkeypatch.setattr(gradcheck.dr, 'grad', wrong)
-    rows = gradcheck.check(gradcheck.load(scene_file(tmp_path)), count=2)
-    assert max(row.error for row in rows if kind in row.parameter) > gradcheck.TOLERANCE
+    monkeypatch.setattr(dr, 'grad', wrong)
+    rows = check_gradients(load_scene_file(scene_file(tmp_path)), count=2)
+    assert max(row.error for row in rows if kind in row.parameter) > gradient_check.TOLERANCE
     assert max(row.error for row in rows if 'box' in row.parameter) < 1e-5
 
 
@@ -113,17 +110,15 @@ def test_script_refuses_bad_input(tmp_path):
 
 
 def test_refusals(tmp_path):
-    from lingo_mi.studies.gradients import check, load
-
-    scene = load(scene_file(tmp_path))
+    scene = load_scene_file(scene_file(tmp_path))
     for values in (dict(count=0), dict(step=0.0), dict(step=1.0), dict(step=float('nan'))):
         with pytest.raises(InputError, match='count must be at least 1'):
-            check(scene, **values)
+            check_gradients(scene, **values)
     with pytest.raises(InputError, match='lingo_xray'):
-        check(mi.load_dict(dict(type='scene', integrator=dict(type='path'))))
+        check_gradients(mi.load_dict(dict(type='scene', integrator=dict(type='path'))))
     sensor = dict(type='ct_scanner', DSO=5, DSD=7, nDetector='4', dDetector='1', nVoxel='4', dVoxel='1')
     mesh = dict(type='cube', bsdf=dict(type='null'), interior=dict(type='homogeneous', sigma_t=1.0))
     with pytest.raises(InputError, match='no derivative to check'):
-        check(mi.load_dict(dict(type='scene', integrator=dict(type='lingo_xray'), sensor=sensor, mesh=mesh)))
+        check_gradients(mi.load_dict(dict(type='scene', integrator=dict(type='lingo_xray'), sensor=sensor, mesh=mesh)))
     with pytest.raises(InputError, match='nothing that attenuates'):
-        check(mi.load_dict(dict(type='scene', integrator=dict(type='lingo_xray'), sensor=sensor)))
+        check_gradients(mi.load_dict(dict(type='scene', integrator=dict(type='lingo_xray'), sensor=sensor)))

@@ -1,0 +1,178 @@
+"""Reconstruction on voxels timed against RTK and diffct on the CPU: projector, transpose, FDK, one SART iteration.
+
+The Shepp-Logan phantom on size^3 voxels, views of size x size pixels over a full turn. In every repeat each operation is run by
+each package in turn, on the same cores, from arrays in memory to an array in memory. The deviation is the relative RMS
+difference from our result, without the outermost voxels, whose outer halves RTK leaves out. It is not small where methods
+differ: diffct projects voxels that are constant (Siddon), ours and RTK's interpolate (Joseph); RTK's SART backprojects by
+interpolating the panel, ours by the matched transpose.
+
+    result = measure(size=64, views=50, repeats=3)
+    result['operations']['FDK']['RTK']['ratio']
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi import phantoms
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.sart import blocks, sweep
+from lingo_mi.reconstruction.system import System
+from lingo_mi.scan import Scan
+from lingo_mi.studies.benchmarks import rtk_bridge
+
+Operations = dict[str, Callable[[], np.ndarray]]  # by name: projector, transpose, FDK, SART
+
+
+def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = print) -> dict:
+    """Times of all packages, `compare`d, with what they were measured on.
+
+    size      voxels and pixels along a side
+    repeats   rounds; the first one, which compiles, comes on top
+    say       called with a line for each package that is not installed
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    dr.set_thread_count(cores)
+    volume = phantoms.make('shepp_logan', size).data
+    geometry = CircularGeometry(1000.0, 1500.0, (size, size), 512 / size, volume.shape, 256 / size, circular(views))
+    empty = Scan(geometry, np.zeros((views, size, size), np.float32))
+    scan = Scan(geometry, ours(empty, volume)['projector']())
+    packages = dict(ours=ours(scan, volume))
+    for name, make in (('RTK', rtk), ('diffct', diffct)):
+        functions = make(scan, volume, cores)
+        if functions is None:
+            say(f'{name}: not installed, left out')
+        else:
+            packages[name] = functions
+    return dict(size=size, views=views, cores=cores, repeats=repeats, operations=compare(packages, repeats))
+
+
+def describe(result: dict) -> Iterator[str]:
+    """What `measure` found, line by line."""
+    side = result['size']
+    yield (
+        f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, {result["cores"]} cores, medians of '
+        f'{result["repeats"]} repeats'
+    )
+    for operation, found in result['operations'].items():
+        parts = [f'{operation:9} ours {found["ours"]["seconds"]:8.3f} s']
+        parts += [
+            f'{name} {x["seconds"]:8.3f} s, ratio {x["ratio"]:6.2f}, deviation {x["deviation"]:.2g}'
+            for name, x in found.items()
+            if name != 'ours'
+        ]
+        yield '   '.join(parts)
+
+
+def ours(scan: Scan, volume: np.ndarray) -> Operations:
+    """Our operations. volume   [x, y, z], what the projector projects; the others begin with the scan"""
+    geometry = scan.geometry
+    joseph, views = Joseph(geometry), np.arange(len(geometry))
+
+    def project():
+        x = mi.Float(volume.ravel())
+        images = joseph.forward(x, views)[0].numpy()
+        return images.reshape(len(views), *geometry.nDetector[::-1]).transpose(0, 2, 1)
+
+    def transpose():
+        return joseph.adjoint(joseph.images(scan.projections), views).numpy().reshape(geometry.nVoxel)
+
+    def sart():
+        system = System(scan)
+        x = sweep(system, system.start(None), 1.0, blocks(geometry.angles, 1, 'ordered', None), True)
+        dr.eval(x)
+        return system.volume(x)
+
+    return dict(projector=project, transpose=transpose, FDK=lambda: fdk(scan), SART=sart)
+
+
+def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
+    """RTK's operations, or None where it is not installed."""
+    try:
+        import itk
+
+        itk.RTK  # noqa: B018 - loads it
+    except (ImportError, AttributeError):
+        return None
+    geometry = scan.geometry
+    itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(cores)
+    return dict(
+        projector=lambda: rtk_bridge.project(volume, geometry, itk),
+        transpose=lambda: rtk_bridge.backproject(scan, itk),
+        FDK=lambda: rtk_bridge.reconstruct('FDK', scan, itk),
+        SART=lambda: rtk_bridge.reconstruct(
+            'SART', scan, itk, NumberOfIterations=1, NumberOfProjectionsPerSubset=1, Lambda=1.0, EnforcePositivity=True
+        ),
+    )
+
+
+def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
+    """diffct's operations (PyTorch backend), or None where it is not installed."""
+    try:
+        import torch
+        from diffct import Projector
+        from diffct import fdk as their_fdk
+    except ImportError:
+        return None
+    torch.set_num_threads(cores)
+    geometry = scan.geometry
+    frames = geometry.rays()
+    pixel, voxel = geometry.dDetector[::-1], geometry.dVoxel[::-1]
+    place = [frames.source, frames.centre(geometry.nDetector), frames.u / pixel[0], frames.v / pixel[1]]
+    trajectory = tuple(torch.tensor(np.ascontiguousarray(x), dtype=torch.float32) for x in place)
+    shapes = dict(detector_spacing=pixel, voxel_spacing=voxel, backend='torch')
+    projector = Projector(trajectory, geometry.nVoxel[::-1], geometry.nDetector[::-1], **shapes)
+
+    def views():
+        return torch.from_numpy(np.ascontiguousarray(scan.projections.transpose(0, 2, 1)))
+
+    def project():
+        found = projector.project(torch.from_numpy(np.ascontiguousarray(volume.transpose(2, 1, 0))))
+        return found.numpy().transpose(0, 2, 1)
+
+    def reconstruct():
+        angles = torch.tensor(geometry.angles, dtype=torch.float32)
+        return their_fdk(views(), trajectory, geometry.nVoxel[::-1], angles, **shapes).numpy().transpose(2, 1, 0)
+
+    return dict(
+        projector=project, transpose=lambda: projector.backproject(views()).numpy().transpose(2, 1, 0), FDK=reconstruct
+    )
+
+
+def compare(packages: dict[str, Operations], repeats: int) -> dict:
+    """By operation and package, medians over the repeats: seconds and, of packages other than 'ours', ratio (their time over
+    ours: above 1 they are slower) and deviation (relative RMS difference from our result)."""
+    seconds, deviation = {}, {}
+    for turn in range(repeats + 1):
+        for operation in packages['ours']:
+            for name, functions in packages.items():
+                if operation not in functions:
+                    continue
+                begun = time.perf_counter()
+                found = functions[operation]()
+                if turn:
+                    seconds.setdefault((operation, name), []).append(time.perf_counter() - begun)
+                    continue
+                if operation != 'projector':
+                    found = found[1:-1, 1:-1, 1:-1]
+                if name == 'ours':
+                    reference = found.copy()
+                else:
+                    deviation[operation, name] = float(np.linalg.norm(found - reference) / np.linalg.norm(reference))
+    out = {}
+    for (operation, name), taken in seconds.items():
+        entry = out.setdefault(operation, {})[name] = dict(seconds=float(np.median(taken)))
+        if name != 'ours':
+            entry |= dict(
+                ratio=entry['seconds'] / out[operation]['ours']['seconds'], deviation=deviation[operation, name]
+            )
+    return out

@@ -1,0 +1,97 @@
+"""What the experiments of effects found, written down: numbers, a table, a picture of each, and how they were made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
+from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS
+from lingo_mi.studies.markdown import insert_into, table
+from lingo_mi.studies.provenance import provenance, write_provenance
+
+TABLE = 'worth'  # its name in the document
+
+
+def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | None = None) -> dict[str, dict]:
+    """Write effects.json and effects.md into `folder`, a picture of every experiment into `figures`, and the table into a
+    document.
+
+    found      what `experiments.measure` gave, by the experiments' names; effects.json keeps what it holds of others, each with
+               its own `provenance`
+    document   a Markdown file with a place for the table `worth`; None: no document
+
+    `provenance` is written beside effects.md and beside the document. Returns what effects.json holds.
+    """
+    for path in (folder, figures):
+        path.mkdir(parents=True, exist_ok=True)
+    for name, result in found.items():
+        draw(result, figures / f'{name}.png')
+    numbers = {
+        name: {k: v for k, v in result.items() if k not in ('truth', *FITS)}
+        | {kind: {k: v for k, v in result[kind].items() if k != 'volume'} for kind in FITS}
+        | dict(provenance=provenance())
+        for name, result in found.items()
+    }
+    path = folder / 'effects.json'
+    known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
+    numbers = {name: known[name] for name in EXPERIMENTS if name in known}
+    path.write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
+    text = make_table(numbers)
+    (folder / 'effects.md').write_text(f'# What modelling an effect is worth\n\n{text}\n', encoding='utf-8')
+    write_provenance(folder / 'effects.md')
+    if document:
+        insert_into(document, {TABLE: text})
+        write_provenance(document)
+    return numbers
+
+
+def make_table(numbers: dict) -> str:
+    """The Markdown table of effects.json."""
+
+    def cell(kind):
+        return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
+
+    columns = [
+        ('effect', lambda r: r['title']),
+        ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
+        *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
+        ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
+        ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
+        ('extra, s', lambda r: f'{r["model"]["seconds"] - r["ignore"]["seconds"]:+.0f}'),
+    ]
+    return table(columns, numbers.values())
+
+
+def draw(result: dict, path: Path) -> None:
+    """A picture of what `experiments.measure` gave: axial slices of the truth and of both fits on one grey scale, 1/mm, and
+    the errors of all three fits below on one scale of their own."""
+    import matplotlib  # half a second that the fits need not wait for
+    from matplotlib.figure import Figure
+
+    truth, spacing = result['truth'], np.array(result['spacing'])
+    index, extent = richest(truth, 2), plane_extent(truth.shape, spacing, np.zeros(3), 2)
+    wanted = plane(truth, 2, index)
+    slices = {kind: plane(result[kind]['volume'], 2, index) for kind in FITS}
+    limit = max(np.percentile(np.abs(slices[kind] - wanted), 99) for kind in FITS)
+    with matplotlib.rc_context(STYLE):
+        fig = Figure(figsize=(10, 6.6), layout='constrained')
+        fig.get_layout_engine().set(**PADS)
+        fig.suptitle(f'{result["title"]}: slice at z = {(index + 0.5 - truth.shape[2] / 2) * spacing[2]:.3g} mm')
+        grid = fig.subplots(2, 3, sharex=True, sharey=True)
+        above = [('truth', wanted), *((FITS[kind], slices[kind]) for kind in ('ignore', 'model'))]
+        for ax, (title, image) in zip(grid[0], above):
+            grey = ax.imshow(image, origin='lower', extent=extent, cmap='gray', vmin=0, vmax=1.1 * wanted.max())
+            ax.set_title(title)
+        for ax, (kind, title) in zip(grid[1], FITS.items()):
+            error = ax.imshow(
+                slices[kind] - wanted, origin='lower', extent=extent, cmap='RdBu_r', vmin=-limit, vmax=limit
+            )
+            ax.set(title=f'error, {title}: {result[kind]["psnr_3d"]:.2f} dB', xlabel='x [mm]')
+        for ax in grid[:, 0]:
+            ax.set_ylabel('y [mm]')
+        fig.colorbar(grey, ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
+        fig.colorbar(error, ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
+        fig.savefig(path, dpi=90)

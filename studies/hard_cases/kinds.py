@@ -1,0 +1,68 @@
+"""The three kinds of hard cases: a cloud in a view, a cloud on voxels, something done with a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.studies.oracle import Cloud
+
+IMAGE, GRADIENT = 1e-6, 1e-5  # what a case may show unless it says otherwise
+
+
+@dataclass(frozen=True)
+class ViewCase:
+    """A cloud in one view.
+
+    image, gradient   largest errors allowed
+    panel             whether integrals end at the panel
+    copies            how often the cloud is there, at the same place
+    warned            whether an AccuracyWarning must come with it
+    analytic          whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64
+                      are too coarse; only for Gaussians far from the ends of the rays
+    note              what limits the accuracy, where it is less than usual
+    """
+
+    name: str
+    cloud: Cloud
+    frames: Rays
+    shape: tuple[int, ...]
+    image: float = IMAGE
+    gradient: float = GRADIENT
+    panel: bool = True
+    copies: int = 1
+    warned: bool = False
+    analytic: bool = False
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class VoxelCase:
+    """A cloud on a grid of voxels. The errors are those of the densities at the voxels' centres."""
+
+    name: str
+    cloud: Cloud
+    corner: np.ndarray
+    step: np.ndarray
+    shape: tuple[int, ...]
+    image: float = IMAGE
+    gradient: float = GRADIENT
+    warned: bool = False
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class ScanCase:
+    """Something done with a scan or a scene: `act()` must be refused with words of `refused`, or end well.
+
+    warned   whether an AccuracyWarning must come with it
+    """
+
+    name: str
+    act: Callable[[], object]
+    refused: str = ''
+    warned: bool = False
+    note: str = ''

@@ -1,0 +1,62 @@
+"""How a table was made: the command, the commit, the date, the machine and the versions, as JSON beside it."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import platform
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import lingo_mi
+from lingo_mi.files.paths import replacing
+from lingo_mi.results.save import versions
+
+
+def provenance() -> dict:
+    """How what is measured now is made.
+
+    command    this process's command line
+    commit     the commit of the checkout that `lingo_mi` runs from; None where it is installed
+    date       now, UTC, ISO 8601
+    machine    the processor's name
+    versions   of Python and of the packages that numbers depend on
+    """
+    return dict(
+        command=' '.join([sys.argv[0], *map(shlex.quote, sys.argv[1:])]),
+        commit=commit(),
+        date=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
+        machine=machine(),
+        versions={name: number for name, number in versions().items() if name != 'date'},
+    )
+
+
+def write_provenance(table: Path) -> Path:
+    """Write `provenance` beside a table, as NAME.provenance.json for NAME.md; returns where."""
+    path = Path(table).with_suffix('.provenance.json')
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(provenance(), indent=1) + '\n', encoding='utf-8')
+    return path
+
+
+def commit() -> str | None:
+    """The commit of the checkout that `lingo_mi` runs from, or None where it runs from no checkout of its own."""
+    root = Path(lingo_mi.__file__).resolve().parents[1]
+    if not (root / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
+        return None
+    try:
+        done = subprocess.run(['git', 'rev-parse', 'HEAD'], cwd=root, capture_output=True, text=True)
+    except OSError:  # there is no git
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def machine() -> str:
+    """The processor's name, as far as the system tells."""
+    try:
+        with open('/proc/cpuinfo', encoding='utf-8') as lines:
+            return next(line.split(':')[1].strip() for line in lines if line.startswith('model name'))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

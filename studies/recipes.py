@@ -1,0 +1,128 @@
+"""Recipes compared: quality against time of fits of some scenes, as curves and as a Markdown table.
+
+Each fit is a process of its own, `lingo-mi fit`, whose folder is named after its settings. A fit that has a result there is not
+run again; an interrupted one goes on.
+
+    comparison = Comparison(Path('out/recipes'), views=25, iterations=5000)
+    results = comparison.results(['x3d_foot'], ['fast', 'r2:V_S=1'])
+    print(table(results))
+    draw(results, Path('out/recipes/recipes.png'))
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from lingo_mi.errors import InputError
+from lingo_mi.fit.settings import settings_of
+
+Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
+
+# metric -> title, format
+COLUMNS = dict(
+    psnr_2d=('views, dB', '{:.2f}'),
+    psnr_2d_r2=('views (R2), dB', '{:.2f}'),
+    ssim_2d=('SSIM', '{:.4f}'),
+    psnr_3d=('volume, dB', '{:.2f}'),
+    ssim_3d=('SSIM 3D', '{:.4f}'),
+    ipsd=('IPSD', '{:.4f}'),
+    ipsd_targets=('born', '{:,}'),
+    gaussians=('Gaussians', '{:,}'),
+    iterations=('iterations', '{}'),
+    seconds_init=('init, s', '{:.1f}'),
+    seconds_fit=('fit, s', '{:.0f}'),
+)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the fits of a comparison have in common.
+
+    folder       of their folders
+    views        fitted
+    iterations   of all methods but `fast`, which keeps its own number, and those that name it themselves
+    changes      'name=value', settings of every fit or parameters of its scene
+    """
+
+    folder: Path
+    views: int = 25
+    iterations: int = 5000
+    changes: tuple[str, ...] = ()
+
+    def results(self, scenes: Iterable, methods: Iterable[str]) -> Results:
+        """The metrics of all fits; those that are missing are run first.
+
+        scenes    files of scenes, or names of shipped ones
+        methods   names of METHODS, or `name:setting=value,...`
+
+        Raises InputError for an unknown method, before any fit, and where a fit fails.
+        """
+        methods = list(methods)
+        for method in methods:
+            settings_of(method)
+        return {(Path(scene).stem, method): self.result(scene, method) for scene in scenes for method in methods}
+
+    def result(self, scene, method: str) -> dict:
+        """The metrics of one fit, run now unless they are there."""
+        folder, command = self.plan(scene, method)
+        if not (folder / 'metrics.json').exists():
+            if (folder / 'checkpoint.npz').exists():
+                command.append('--resume')
+            print(' '.join(command), file=sys.stderr)
+            if code := run_command(command):
+                raise InputError(f'{scene}: lingo-mi fit --method {method} failed with exit code {code}')
+        return json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
+
+    def plan(self, scene, method: str) -> tuple[Path, list[str]]:
+        """The folder of a fit, and the command that fills it."""
+        name, _, own = method.partition(':')
+        changes = [*self.changes, *filter(None, own.split(','))]
+        if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
+            changes.append(f'iterations={self.iterations}')
+        folder = self.folder / '_'.join([Path(scene).stem, str(self.views), name, *changes])
+        program = [sys.executable, '-m', 'lingo_mi', 'fit', str(scene)]
+        options = ['--method', name, '--views', str(self.views), '--out', str(folder)]
+        return folder, program + options + [word for change in changes for word in ('-D', change)]
+
+
+def run_command(command: list[str]) -> int:
+    """Run a command to its end; its exit code."""
+    return subprocess.run(command).returncode
+
+
+def table(results: Results) -> str:
+    """The Markdown table."""
+    lines = [
+        '| scene | method | ' + ' | '.join(title for title, _ in COLUMNS.values()) + ' |',
+        '|---|---|' + '---:|' * len(COLUMNS),
+    ]
+    for (scene, method), metrics in results.items():
+        cells = (form.format(metrics[k]) if metrics[k] is not None else '–' for k, (_, form) in COLUMNS.items())
+        lines.append(f'| {scene} | {method} | ' + ' | '.join(cells) + ' |')
+    return '\n'.join(lines)
+
+
+def draw(results: Results, figure: Path) -> None:
+    """The picture of all histories: PSNR of held-out views and of the volume against seconds, a column a scene."""
+    from matplotlib.figure import Figure  # half a second that the fits need not wait for
+
+    scenes = list(dict.fromkeys(scene for scene, _ in results))
+    fig = Figure(figsize=(5 * len(scenes), 7), layout='constrained')
+    axes = fig.subplots(2, len(scenes), squeeze=False)
+    for (scene, method), metrics in results.items():
+        for row, (key, what) in enumerate(dict(psnr_2d='held-out views', psnr_3d='volume').items()):
+            axis = axes[row, scenes.index(scene)]
+            points = [(e['seconds'], e[key]) for e in metrics['history'] if e.get(key) is not None]
+            if not points:  # 3dgs and xgaussian make no volume
+                continue
+            axis.semilogx(*zip(*points), '.-', label=f'{method}, {metrics["iterations"]} iterations')
+            axis.set(title=scene if row == 0 else None, xlabel='time in steps [s]', ylabel=f'PSNR, {what} [dB]')
+            axis.grid(alpha=0.3, which='both')
+            axis.legend()
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(figure, dpi=90)
