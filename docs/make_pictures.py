@@ -70,7 +70,7 @@ def lingo_steps(data, start, fitted, settings):
 
     half = geometry.half
     scatter(points, start.points, start.density, half)
-    points.set_title(f'4  initial cloud\n{len(start):,} points, densities of an FDK volume')
+    points.set_title(f'4  initial cloud\n{len(start):,} points, FDK densities')
     centre, _, _, density = activate(fitted.state, fitted.settings)
     scatter(cloud, centre, density, half)
     cloud.set_title(f'5  fitted cloud\n{len(centre):,} Gaussians after {settings.iterations} steps')
@@ -131,27 +131,27 @@ def state_of(fitted):
 
 
 def depth(index, grid):
-    """Cells along the y axis, as an image with z upwards."""
+    """Cells along the x axis, as an image with z upwards."""
     full = np.zeros(np.prod(grid))
     full[index] = 1
-    return full.reshape(grid).sum(1).T[::-1]
+    return full.reshape(grid).sum(0).T[::-1]
 
 
 def scatter(axes, points, density, half):
-    """Points seen along the y axis, coloured by density, the dense ones in front."""
+    """Points seen along the x axis, coloured by density, the dense ones in front."""
     order = np.argsort(density)
     axes.set_facecolor('black')
-    axes.scatter(points[order, 0], points[order, 2], c=density[order], s=0.25, cmap='inferno', linewidths=0)
-    axes.set(xlim=(-half[0], half[0]), ylim=(-half[2], half[2]), aspect='equal')
+    axes.scatter(points[order, 1], points[order, 2], c=density[order], s=0.4, cmap='inferno', linewidths=0)
+    axes.set(xlim=(-half[1], half[1]), ylim=(-half[2], half[2]), aspect='equal')
 
 
 def sagittal(volume):
-    """The slice of a volume [x, y, z] through the middle of y, z upwards."""
-    return volume[:, volume.shape[1] // 2].T[::-1]
+    """The slice of a volume [x, y, z] through the middle of x, z upwards."""
+    return volume[volume.shape[0] // 2].T[::-1]
 
 
 def save(figure, name: str):
-    figure.tight_layout()
+    figure.tight_layout(h_pad=1.5)
     figure.savefig(FIGURES / f'{name}.png', dpi=110)
     plt.close(figure)
 
