@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import lingo_mi
+from lingo_mi import errors
 from lingo_mi.files.paths import replacing
 from lingo_mi.results.save import versions
 
@@ -43,7 +43,7 @@ def write_provenance(table: Path) -> Path:
 
 def commit() -> str | None:
     """The commit of the checkout that `lingo_mi` runs from, or None where it runs from no checkout of its own."""
-    root = Path(lingo_mi.__file__).resolve().parents[1]
+    root = Path(errors.__file__).resolve().parents[1]
     if not (root / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
         return None
     try:

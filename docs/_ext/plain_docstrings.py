@@ -1,0 +1,83 @@
+"""Turns this project's plain docstrings into reStructuredText for autodoc.
+
+What is plain in them, and what it becomes:
+
+    name   what it is             a list of names and meanings, where two or more spaces follow a name;
+           and goes on            further lines are indented
+        code = example()          a block of Python, where a paragraph is indented and is no list of names
+    |A x - b|, rate_*             characters of reStructuredText, which lose their meaning outside of `backticks`
+
+A docstring that holds directives or roles is reStructuredText already and stays as it is.
+"""
+
+import ast
+import inspect
+import re
+
+_NAME = r'`?[A-Za-z_|][\w.|/=\'-]*`?'
+ENTRY = re.compile(rf'^({_NAME}(?:, {_NAME})*)(?:\s{{2,}}|\s+:\s+)(\S.*)$')
+RST = re.compile(r'^\s*\.\. |:\w+:`|^:param|^:return|^>>>', re.MULTILINE)
+QUOTED = re.compile(r'(``.+?``|`[^`\n]+`)')
+
+
+def to_rst(text: str) -> str:
+    """reStructuredText of a plain docstring, indentation removed."""
+    text = inspect.cleandoc(text)
+    if RST.search(text):
+        return text
+    blocks = [block for block in re.split(r'\n\s*\n', text) if block.strip()]
+    return '\n\n'.join(_block(block.splitlines()) for block in blocks) + '\n'
+
+
+def _block(lines: list[str]) -> str:
+    """A paragraph, a list of names, or code."""
+    indent = min(len(line) - len(line.lstrip()) for line in lines)
+    bare = [line[indent:] for line in lines]
+    starts = [i for i, line in enumerate(bare) if ENTRY.match(line)]
+    if starts and all(i in starts or bare[i].startswith('  ') for i in range(starts[0], len(bare))):
+        before = [escaped(' '.join(line.strip() for line in bare[: starts[0]])), ''] if starts[0] else []
+        entries = [bare[i:j] for i, j in zip(starts, [*starts[1:], len(bare)])]
+        return '\n'.join(before + [_entry(entry) for entry in entries])
+    if indent:
+        language = 'python' if _is_python('\n'.join(bare)) else 'text'
+        return f'.. code-block:: {language}\n\n' + '\n'.join(f'    {line}' for line in bare)
+    if all(line.startswith('- ') or line.startswith('  ') for line in bare):
+        return '\n'.join(escaped(line) for line in bare)
+    head = next((i for i, line in enumerate(bare) if line.startswith('    ')), len(bare))
+    text = escaped('\n'.join(line.strip() for line in bare[:head]))
+    return text if head == len(bare) else f'{text}\n\n{_block(bare[head:])}'
+
+
+def _entry(lines: list[str]) -> str:
+    """One name, or several, and what is said of it."""
+    names, first = ENTRY.match(lines[0]).groups()
+    meaning = escaped(' '.join([first, *(line.strip() for line in lines[1:])]))
+    title = ', '.join(f'``{name.strip("`")}``' for name in names.split(', '))
+    return f'{title}\n    {meaning}\n'
+
+
+def _is_python(text: str) -> bool:
+    try:
+        ast.parse(text)
+    except SyntaxError:
+        return False
+    return True
+
+
+def escaped(text: str) -> str:
+    """Text in which only `backticks` mark anything up."""
+    parts = QUOTED.split(text)
+    return ''.join(part if i % 2 else re.sub(r'([*|\\])|_(?=\W|$)', _escape, part) for i, part in enumerate(parts))
+
+
+def _escape(match) -> str:
+    return '\\' + match.group(0)
+
+
+def process(app, what, name, thing, options, lines):
+    lines[:] = [*to_rst('\n'.join(lines)).splitlines(), '']
+
+
+def setup(app):
+    app.connect('autodoc-process-docstring', process)
+    return {'parallel_read_safe': True}

@@ -1,0 +1,66 @@
+"""Sphinx's settings: `python -m sphinx -W -b html docs build/site` builds the site, warnings being errors."""
+
+import os
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS / '_ext'), str(DOCS.parent)]
+os.environ.setdefault('COLUMNS', '100')  # width of the command line's help
+
+import lingo_mi  # noqa: E402 - from the folder above
+
+project = 'lingo_mi'
+author = 'the authors of lingo_mi'
+copyright = f'2026, {author}'  # noqa: A001 - Sphinx's name
+try:
+    release = version('lingo_mi')
+except PackageNotFoundError:
+    release = lingo_mi.__version__
+
+extensions = [
+    'myst_parser',
+    'sphinx.ext.autodoc',
+    'sphinx.ext.mathjax',
+    'sphinx_gallery.gen_gallery',
+    'plain_docstrings',
+    'plugin_pages',
+    'command_help',
+]
+exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
+# The page of the public API needs it; a list of modules stands in for it where `lingo_mi` does not offer it.
+exclude_patterns.append('api_modules.rst' if hasattr(lingo_mi, 'simulate') else 'api.rst')
+
+myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence', 'attrs_inline', 'attrs_block']
+myst_heading_anchors = 3
+default_role = 'py:obj'  # `name` links to what it names, where that is documented
+autodoc_typehints = 'signature'
+autodoc_member_order = 'bysource'
+autodoc_preserve_defaults = True
+add_module_names = False
+python_maximum_signature_line_length = 100
+
+examples = sorted((DOCS.parent / 'examples').glob('[0-9][0-9]_*.py'))
+sphinx_gallery_conf = {
+    'examples_dirs': '../examples',
+    'gallery_dirs': 'gallery',
+    'filename_pattern': r'[/\\]\d\d_',
+    'ignore_pattern': r'__init__\.py|conftest\.py',
+    'download_all_examples': False,
+    'show_memory': False,
+    'show_signature': False,
+    'remove_config_comments': True,
+    'within_subsection_order': 'FileNameSortKey',
+    'image_scrapers': ('matplotlib',),
+    'plot_gallery': 'True',
+    'abort_on_example_error': True,
+}
+
+html_theme = 'furo'
+html_title = 'lingo_mi'
+html_static_path = ['_static']
+html_css_files = ['site.css']
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {'sidebar_hide_name': False, 'navigation_with_keys': True}
