@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from lingo_mi import errors
-from lingo_mi.files.paths import replacing
+from lingo_mi.paths import replacing
 from lingo_mi.results.save import versions
 
 
