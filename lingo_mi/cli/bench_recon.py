@@ -97,9 +97,9 @@ def diffct(geometry, scan, volume, cores):
     except ImportError:
         return None
     torch.set_num_threads(cores)
-    frames = geometry.rays()
+    rays = geometry.rays()
     pixel, voxel = geometry.dDetector[::-1], geometry.dVoxel[::-1]
-    place = [frames.source, frames.centre(geometry.nDetector), frames.u / pixel[0], frames.v / pixel[1]]
+    place = [rays.source, rays.centre(geometry.nDetector), rays.u / pixel[0], rays.v / pixel[1]]
     trajectory = tuple(torch.tensor(np.ascontiguousarray(x), dtype=torch.float32) for x in place)
     shapes = dict(detector_spacing=pixel, voxel_spacing=voxel, backend='torch')
     projector = Projector(trajectory, geometry.nVoxel[::-1], geometry.nDetector[::-1], **shapes)

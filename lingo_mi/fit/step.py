@@ -73,14 +73,14 @@ class Stepper:
         for view in views:
             target = targets[view]
             if self.poses is not None:
-                frames = self.poses.correct(target.frames, view)
-                place(target.view, frames)
+                rays = self.poses.correct(target.rays, view)
+                place(target.view, rays)
             loss, norm, visible = self._view(leaf, target, len(views))
             total += loss
             state.gradient += norm
             state.seen += visible
             if self.poses is not None:
-                self.poses.step(view, frames, gathered(target.view), s.rate('pose', iteration), s)
+                self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s)
         if s.lambda_tv > 0:
             total += self._total_variation(leaf, rng)
         pass_on(gaussians, map(dr.grad, leaf))
@@ -102,7 +102,7 @@ class Stepper:
     def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
         """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
         the expected signal where the fit models effects. Grey images of alpha compositing are taken for line integrals."""
-        frames, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        rays, (height, width) = geometry.normalised_rays(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
         scattered = [None] * len(geometry)
@@ -115,7 +115,7 @@ class Stepper:
 
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
-            view = View.of(frames, i, height, width, panel=False)
+            view = View.of(rays, i, height, width, panel=False)
             image = along(view)[0] if self.model is None else self.model.image(along, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:
