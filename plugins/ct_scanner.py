@@ -107,11 +107,11 @@ class CTScanner(mi.Sensor):
             del props[name]
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
-        frames = self.geometry.rays()
-        self.frame = View.of(frames, self.index, *self.geometry.nDetector)
+        rays = self.geometry.rays()
+        self.frame = View.of(rays, self.index, *self.geometry.nDetector)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
-            np.linalg.norm(frames.corner[self.index])
+            np.linalg.norm(rays.corner[self.index])
             + np.linalg.norm(self.geometry.offOrigin)
             + np.linalg.norm(self.geometry.sVoxel)
         )

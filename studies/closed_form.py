@@ -20,11 +20,11 @@ NAMES = {'centre': 3, 'scale': 3, 'rotation': 4, 'density': 1}
 REACH = 9.0  # standard deviations: beyond, a Gaussian is below 3e-18 of its peak
 
 
-def image_and_gradients(gaussians, frames: Rays, shape, weights=None, order: int = 0):
+def image_and_gradients(gaussians, rays: Rays, shape, weights=None, order: int = 0):
     """One view of a cloud, float64 [v, u]; and derivatives of sum(weights * image) by name, float64 [N, ...].
 
     gaussians   centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N]
-    frames      the view is its first one
+    rays        the view is its first one
     shape       of the image, (v, u)
     weights     [v, u], or None for no derivatives
     order       0 for rays through the pixel centres; n for the mean over the pixels by n x n Gauss-Legendre points
@@ -38,14 +38,14 @@ def image_and_gradients(gaussians, frames: Rays, shape, weights=None, order: int
     at, weight = np.polynomial.legendre.leggauss(order) if order else (np.zeros(1), np.full(1, 2.0))
     # (x, y) in the pixel and the share of every ray
     samples = [((a + 1) / 2, (b + 1) / 2, u * v / 4) for a, u in zip(at, weight) for b, v in zip(at, weight)]
-    low, high = _boxes(gaussians[0], gaussians[1].max(1) * REACH, frames, shape)
+    low, high = _boxes(gaussians[0], gaussians[1].max(1) * REACH, rays, shape)
     for i in np.flatnonzero((low < high).all(1)):
         rows, columns = (np.arange(*ends) for ends in zip(low[i], high[i]))
         box = np.ix_(rows, columns)
         g = weights[box] if weights is not None else None
         one = [x[i] for x in gaussians]
         for x, y, share in samples:
-            start, direction = frames.through(0, *np.broadcast_arrays(columns + x, rows[:, None] + y))
+            start, direction = rays.through(0, *np.broadcast_arrays(columns + x, rows[:, None] + y))
             value, by_row = _gaussian(*one, start, direction, g)
             image[box] += share * value
             if by_row is not None:
@@ -66,21 +66,21 @@ def rays_and_gradients(gaussians, start, direction, weights):
     return total, {name: np.array(column) for name, column in zip(NAMES, zip(*rows))}
 
 
-def _boxes(centre, radius, frames, shape):
+def _boxes(centre, radius, rays, shape):
     """Pixels [low, high), each [N, 2] as (v, u), of images of balls."""
-    x, y = frames.project(centre, 0)
-    normal = np.cross(frames.u[0], frames.v[0])
-    if frames.parallel:
+    x, y = rays.project(centre, 0)
+    normal = np.cross(rays.u[0], rays.v[0])
+    if rays.parallel:
         stretch = np.ones(len(centre))
-        slant = np.linalg.norm(normal) / abs(normal @ frames.source[0])
+        slant = np.linalg.norm(normal) / abs(normal @ rays.source[0])
     else:
-        axis, to = frames.corner[0] - frames.source[0], centre - frames.source[0]
+        axis, to = rays.corner[0] - rays.source[0], centre - rays.source[0]
         depth = to @ normal
         near = np.abs(depth) - radius * np.linalg.norm(normal)
         # Generous: the ball's nearest plane, and the obliqueness of the ray.
         stretch = abs(axis @ normal) / near
         slant = np.linalg.norm(to, axis=1) * np.linalg.norm(normal) / np.abs(depth)
-    pixel = min(np.linalg.norm(frames.u[0]), np.linalg.norm(frames.v[0]))
+    pixel = min(np.linalg.norm(rays.u[0]), np.linalg.norm(rays.v[0]))
     half = radius * stretch * slant**2 / pixel
     middle = np.stack([y, x], 1)
     low, high = np.floor(middle - half[:, None]), np.ceil(middle + half[:, None]) + 1

@@ -49,19 +49,19 @@ class Poses:
         for name in self.arrays():
             setattr(self, name.removeprefix('poses.'), np.array(arrays[name]))
 
-    def correct(self, frames: Rays, view: int | None = None) -> Rays:
-        """The views, in the normalised frame, as corrected; only one of them where `view` is given, frames then being its
+    def correct(self, rays: Rays, view: int | None = None) -> Rays:
+        """The views, in the normalised frame, as corrected; only one of them where `view` is given, rays then being its
         own [1]."""
         chosen = slice(None) if view is None else [view]
-        return frames.moved(Rotation.from_rotvec(self.turn[chosen]).as_matrix(), self.shift[chosen])
+        return rays.moved(Rotation.from_rotvec(self.turn[chosen]).as_matrix(), self.shift[chosen])
 
     def corrected(self, geometry: Geometry) -> Geometry:
         """A scan's geometry, in mm, with its views as corrected."""
         g, centre = geometry, np.array(geometry.offOrigin)
         f = self.correct(g.normalised_rays())
         source = f.source if f.parallel else f.source / g.scale + centre
-        frames = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
-        return Geometry.from_poses(frames, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+        rays = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
+        return Geometry.from_poses(rays, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
     def undone(self) -> Poses:
         """What takes corrected views back to where they were."""
@@ -69,14 +69,14 @@ class Poses:
         back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
         return back
 
-    def step(self, view: int, frames: Rays, gradient: dict, rate: float, settings):
+    def step(self, view: int, rays: Rays, gradient: dict, rate: float, settings):
         """Move a view by one Adam step, then take off the mean motion of all.
 
-        frames     the view as corrected so far, [1]
+        rays       the view as corrected so far, [1]
         gradient   derivatives of the loss by its source, corner, u and v, [3] each
         """
-        turn = sum(np.cross(getattr(frames, name)[0], gradient[name]) for name in _NAMES)
-        shift = gradient['corner'] if frames.parallel else gradient['corner'] + gradient['source']
+        turn = sum(np.cross(getattr(rays, name)[0], gradient[name]) for name in _NAMES)
+        shift = gradient['corner'] if rays.parallel else gradient['corner'] + gradient['source']
         g = np.concatenate([turn, shift]) * self.free
         b1, b2 = settings.beta1, settings.beta2
         self.steps[view] += 1
@@ -94,10 +94,10 @@ class Poses:
         self.shift -= self.shift.mean(0)
 
 
-def place(view, frames: Rays):
-    """Put a `View` where its `frames` [1] are, ready to gather derivatives."""
+def place(view, rays: Rays):
+    """Put a `View` where its `rays` [1] are, ready to gather derivatives."""
     for name in _NAMES:
-        vector = vector64(getattr(frames, name)[0])
+        vector = vector64(getattr(rays, name)[0])
         dr.enable_grad(vector)
         setattr(view, name, vector)
 

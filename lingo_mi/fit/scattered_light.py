@@ -38,10 +38,10 @@ class ScatteredLight:
 
         cloud, geometry   in mm
         """
-        frames = geometry.rays()
+        rays = geometry.rays()
         return np.stack(
             [
-                self.scatter.estimate([cloud], self.tube, self.response, View.of(frames, i, *geometry.nDetector), i)
+                self.scatter.estimate([cloud], self.tube, self.response, View.of(rays, i, *geometry.nDetector), i)
                 for i in range(len(geometry))
             ],
             1,

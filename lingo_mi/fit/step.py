@@ -70,14 +70,14 @@ class Stepper:
         for view in views:
             target = targets[view]
             if self.poses is not None:
-                frames = self.poses.correct(target.frames, view)
-                place(target.view, frames)
+                rays = self.poses.correct(target.rays, view)
+                place(target.view, rays)
             loss, norm, visible = self._view(leaf, target, len(views))
             total += loss
             state.gradient += norm
             state.seen += visible
             if self.poses is not None:
-                self.poses.step(view, frames, gathered(target.view), s.rate('pose', iteration), s)
+                self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s)
         if s.lambda_tv > 0:
             total += random_cube_variation(leaf, self.geometry, s, rng)
         pass_on(gaussians, map(dr.grad, leaf))

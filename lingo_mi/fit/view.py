@@ -32,7 +32,7 @@ class Target:
     pixels     Float [height * width], normalised line integrals over the fit's unit of density
     weights    Float, what they were multiplied by and images are before they are compared; None: nothing
     valid      Bool, which of them are valid; None: all
-    frames     the geometry's `Rays` of the view alone
+    rays       the geometry's `Rays` of the view alone
     scattered  Float, the scattered light that is expected in them; None: none
     """
 
@@ -40,14 +40,14 @@ class Target:
     pixels: object
     weights: object = None
     valid: object = None
-    frames: object = None
+    rays: object = None
     scattered: object = None
 
     @staticmethod
     def of(scan: Scan, index: int, unit: float, weights=None) -> Target:
         """View `index` of a scan; weights float32 [view, v, u] or None."""
         height, width = scan.geometry.nDetector
-        frames = scan.geometry.normalised_rays()[[index]]
+        rays = scan.geometry.normalised_rays()[[index]]
         pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
         valid = None
         if weights is not None:
@@ -58,7 +58,7 @@ class Target:
             dr.make_opaque(valid)
         # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
         # panel would otherwise leave the fast path.
-        return Target(View.of(frames, 0, height, width, panel=False), uploaded(pixels), weights, valid, frames)
+        return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), weights, valid, rays)
 
     def seen(self, image):
         """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.

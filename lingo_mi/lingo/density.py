@@ -24,10 +24,10 @@ MODES = (*FACTORS, 'lsq', 'fdk')
 FAINTEST = 0.02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
 
 
-def mean_pixel(frames: Rays, projections, points, valid=None) -> np.ndarray:
+def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
-    frames       n views in the normalised frame
+    rays         n views in the normalised frame
     projections  [n, v, u]
     points       [N, 3]
     valid        bool [n, v, u], None: all pixels are valid
@@ -37,7 +37,7 @@ def mean_pixel(frames: Rays, projections, points, valid=None) -> np.ndarray:
     """
     points = np.ascontiguousarray(np.asarray(points, float).T)
     total, seen = np.zeros(points.shape[1]), np.zeros(points.shape[1])
-    for view, (matrix, image) in enumerate(zip(camera_matrices(frames), projections)):
+    for view, (matrix, image) in enumerate(zip(camera_matrices(rays), projections)):
         index, inside = pixels(matrix, points, image.shape)
         if valid is not None:
             inside &= valid[view].reshape(-1)[index]

@@ -101,19 +101,11 @@ def _outside(wanted: str, found) -> str:
 
 
 def initialise(
-    frames: Rays,
-    projections,
-    nVoxel,
-    half,
-    settings: Settings = Settings(),
-    rng=None,
-    render=None,
-    fdk=None,
-    valid=None,
+    rays: Rays, projections, nVoxel, half, settings: Settings = Settings(), rng=None, render=None, fdk=None, valid=None
 ) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
-    frames       n views in the normalised frame (`Geometry.normalised_rays`)
+    rays         n views in the normalised frame (`Geometry.normalised_rays`)
     projections  [n, v, u] normalised line integrals (`Scan.normalised`)
     nVoxel       V_d, the volume's voxels (x, y, z); a single slice (fan beam) is fine
     half         half the volume's sides in the normalised frame, [3] (`Geometry.half`)
@@ -140,10 +132,10 @@ def initialise(
 
     found = masks(projections, settings.low_factor, valid)
     outside = _outside(settings.outside, found)
-    P = occupancy(frames, found, half, nVoxel, settings.resolution, settings.misses, outside)
+    P = occupancy(rays, found, half, nVoxel, settings.resolution, settings.misses, outside)
     S = scale_factor(P, settings.V_S)
     grid = scaled_grid(nVoxel, S)
-    low, high = valid_voxels(frames, found, grid, half, settings.misses, outside)
+    low, high = valid_voxels(rays, found, grid, half, settings.misses, outside)
     if len(low) == 0:
         raise InputError(
             'no voxel lies in the low-density mask of every view: check the geometry and '
@@ -167,10 +159,10 @@ def initialise(
         density = sampled(fdk, points, half)
     else:
         unique, inverse = np.unique(cells, return_inverse=True)
-        density = mean_pixel(frames, projections, voxel_centres(grid, half, unique), valid)[inverse]
+        density = mean_pixel(rays, projections, voxel_centres(grid, half, unique), valid)[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
     if settings.density in ('lsq', 'fdk'):
-        n = len(frames)
+        n = len(rays)
         views = np.unique(np.arange(min(n, settings.lsq_views)) * n // min(n, settings.lsq_views))
         rendered = render(points, density, spacing, views)
         trusted = ... if valid is None else valid[views]

@@ -10,7 +10,7 @@ from lingo_mi.lingo.voxel_filter import valid_voxels
 
 
 def occupancy(
-    frames: Rays, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0, outside: str = 'invalid'
+    rays: Rays, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0, outside: str = 'invalid'
 ) -> float:
     """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
 
@@ -18,7 +18,7 @@ def occupancy(
     divided by the cells there are. The other arguments are those of `valid_voxels`.
     """
     coarse = np.minimum(resolution, nVoxel)
-    low, _ = valid_voxels(frames, masks, coarse, half, misses, outside)
+    low, _ = valid_voxels(rays, masks, coarse, half, misses, outside)
     return len(low) / float(np.prod(coarse))
 
 

@@ -93,10 +93,10 @@ def _over_corners(function, values):
     return values
 
 
-def valid_voxels(frames: Rays, masks: Masks, grid, half, misses: int = 0, outside: str = 'invalid'):
+def valid_voxels(rays: Rays, masks: Masks, grid, half, misses: int = 0, outside: str = 'invalid'):
     """The all-view intersections: flat cell indices (z fastest) of the low and the high valid set, sorted.
 
-    frames   n views in the normalised frame
+    rays     n views in the normalised frame
     masks    of the same n views
     grid     cells (x, y, z) over [-half, half]
     misses   a cell stays valid when up to this many views do not see it in their mask (paper: 0)
@@ -109,12 +109,12 @@ def valid_voxels(frames: Rays, masks: Masks, grid, half, misses: int = 0, outsid
     """
     if outside not in ('invalid', 'ignore'):
         raise InputError(f"outside must be 'invalid' or 'ignore', not {outside!r}")
-    if len(masks.low) != len(frames):
-        raise InputError(f'{len(masks.low)} masks were given for {len(frames)} views: one a view is needed')
+    if len(masks.low) != len(rays):
+        raise InputError(f'{len(masks.low)} masks were given for {len(rays)} views: one a view is needed')
     shape = masks.low.shape[1:]
-    low_images, high_images = masks.low.reshape(len(frames), -1), masks.high.reshape(len(frames), -1)
-    valid = None if masks.valid is None else masks.valid.reshape(len(frames), -1)
-    matrices = camera_matrices(frames)
+    low_images, high_images = masks.low.reshape(len(rays), -1), masks.high.reshape(len(rays), -1)
+    valid = None if masks.valid is None else masks.valid.reshape(len(rays), -1)
+    matrices = camera_matrices(rays)
     low, high = [], []
     total = int(np.prod(grid))
     cells = np.arange(total)

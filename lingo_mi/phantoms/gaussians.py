@@ -73,26 +73,26 @@ class Cloud:
         peak. Raises InputError if the source lies in or beside a Gaussian, where it has no outline on the
         panel.
         """
-        frames, whiten = geometry.rays(), self.whiten
+        rays, whiten = geometry.rays(), self.whiten
         spread = np.linalg.inv(np.swapaxes(whiten, 1, 2) @ whiten)
         panel = geometry.nDetector[::-1]
         out = np.zeros((len(geometry), *geometry.nDetector))
         for view in range(len(geometry)):
-            centre, low, high = _outlines(self.centres, spread, frames, view)
+            centre, low, high = _outlines(self.centres, spread, rays, view)
             low = np.clip(np.floor(low), 0, panel).astype(int)
             high = np.clip(np.ceil(high), 0, panel).astype(int)
             for i in np.flatnonzero((low < high).all(1)):
                 (x0, y0), (x1, y1) = low[i], high[i]
                 x, y = np.arange(x0, x1) + 0.5 - centre[i, 0], np.arange(y0, y1) + 0.5 - centre[i, 1]
-                shape = _footprint(x, y, frames, view, centre[i], self.centres[i], whiten[i])
+                shape = _footprint(x, y, rays, view, centre[i], self.centres[i], whiten[i])
                 out[view, y0:y1, x0:x1] += self.density[i] * shape
         return out.astype(np.float32)
 
 
-def _outlines(centres, spread, frames, view):
+def _outlines(centres, spread, rays, view):
     """Pixel positions [n, 2] of the projected centres, and the corners of the boxes around the outlines."""
-    source, corner, u, v = (a[view] for a in (frames.source, frames.corner, frames.u, frames.v))
-    if frames.parallel:
+    source, corner, u, v = (a[view] for a in (rays.source, rays.corner, rays.u, rays.v))
+    if rays.parallel:
         m = np.linalg.inv(np.stack([u, v, -source], 1))[:2]
         centre = (centres - corner) @ m.T
         half = _WINDOW * np.sqrt(np.einsum('ij,njk,ik->ni', m, spread, m))
@@ -109,19 +109,19 @@ def _outlines(centres, spread, frames, view):
     return h[:, :2] / h[:, 2:], middle - half, middle + half
 
 
-def _footprint(x, y, frames, view, pixel, centre, whiten):
+def _footprint(x, y, rays, view, pixel, centre, whiten):
     """Line integrals [y, x] of a Gaussian of density 1 at pixel offsets x, y from its projected centre."""
-    origin, ray = frames.through(view, *pixel)
-    a, b = whiten @ frames.u[view], whiten @ frames.v[view]
+    origin, ray = rays.through(view, *pixel)
+    a, b = whiten @ rays.u[view], whiten @ rays.v[view]
     d = whiten @ ray
     # w x d vanishes at the projected centre, and is linear in x and y.
-    if frames.parallel:
+    if rays.parallel:
         na, nb = np.cross(a, d), np.cross(b, d)
         ray2, d2 = ray @ ray, d @ d
     else:
         w = whiten @ (origin - centre)
         na, nb = np.cross(w, a), np.cross(w, b)
-        ray2 = _square(x, y, frames.u[view], frames.v[view], ray)
+        ray2 = _square(x, y, rays.u[view], rays.v[view], ray)
         d2 = _square(x, y, a, b, d)
     return np.sqrt(2 * np.pi * ray2 / d2) * np.exp(-0.5 * _square(x, y, na, nb, np.zeros(3)) / d2)
 

@@ -131,14 +131,14 @@ class Mesh:
         the panel once. The whole object must lie between source and panel.
         Raises InputError if part of it is behind the source.
         """
-        frames, faces = geometry.rays(), self.mesh.faces
+        rays, faces = geometry.rays(), self.mesh.faces
         nv, nu = geometry.nDetector
         out = np.zeros((len(geometry), nv, nu))
         for view in range(len(geometry)):
-            corners = np.stack(frames.project(self.mesh.vertices, view), -1)[faces]
+            corners = np.stack(rays.project(self.mesh.vertices, view), -1)[faces]
             if not np.isfinite(corners).all():
                 raise InputError(f'part of the mesh lies behind the source of view {view}: enlarge DSO')
-            add_lengths(out[view], corners, self.mesh.triangles, lambda x, y, view=view: frames.through(view, x, y))
+            add_lengths(out[view], corners, self.mesh.triangles, lambda x, y, view=view: rays.through(view, x, y))
         return out.astype(np.float32)
 
 

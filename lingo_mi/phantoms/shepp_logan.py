@@ -56,12 +56,12 @@ class Ellipsoids:
         A chord is what the whole line has in common with an ellipsoid: source and panel lie outside the
         object.
         """
-        frames = geometry.rays()
+        rays = geometry.rays()
         nv, nu = geometry.nDetector
         x, y = np.meshgrid(np.arange(nu) + 0.5, np.arange(nv) + 0.5)
         out = np.zeros((len(geometry), nv, nu), np.float32)
         for view in range(len(geometry)):
-            origin, direction = frames.through(view, x, y)
+            origin, direction = rays.through(view, x, y)
             length = np.linalg.norm(direction, axis=-1)
             total = np.zeros((nv, nu))
             for rho, c, m in zip(self.density, self.centre, self.whiten):

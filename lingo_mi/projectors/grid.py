@@ -215,19 +215,19 @@ def view_table(geometry: Geometry) -> np.ndarray:
     steps per pixel along u and v, the direction and its steps, then the smallest t. The origins lie on a
     plane through the volume's centre, computed in float64, so that float32 loses nothing to a distant source.
     """
-    frames, centre = geometry.rays(), np.array(geometry.offOrigin)
-    corner, source = frames.corner - centre, frames.source
-    normal = np.cross(frames.u, frames.v)
+    rays, centre = geometry.rays(), np.array(geometry.offOrigin)
+    corner, source = rays.corner - centre, rays.source
+    normal = np.cross(rays.u, rays.v)
     zero = np.zeros_like(corner)
-    if frames.parallel:
+    if rays.parallel:
         t = -np.sum(corner * source, 1, keepdims=True)
-        start = np.full((len(frames), 1), -np.inf)
-        rows = [corner + t * source, frames.u, frames.v, source, zero, zero, start]
+        start = np.full((len(rays), 1), -np.inf)
+        rows = [corner + t * source, rays.u, rays.v, source, zero, zero, start]
     else:
         source = source - centre
         axis = corner - source
         t = -np.sum(source * normal, 1, keepdims=True) / np.sum(axis * normal, 1, keepdims=True)
-        rows = [source + t * axis, t * frames.u, t * frames.v, axis, frames.u, frames.v, -t]
+        rows = [source + t * axis, t * rays.u, t * rays.v, axis, rays.u, rays.v, -t]
     return np.concatenate(rows, 1).astype(np.float32)
 
 

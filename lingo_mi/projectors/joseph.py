@@ -36,14 +36,14 @@ def column_table(geometry: Geometry) -> np.ndarray:
     panel is `c + e m` (parallel: 1), the path per slice is sqrt(g + h dz^2) mm with dz the height of the pixel
     over the source in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
     """
-    frames, n_u = geometry.rays(), geometry.nDetector[1]
+    rays, n_u = geometry.rays(), geometry.nDetector[1]
     voxel = np.array(geometry.dVoxel[:2])
     first = np.array(geometry.offOrigin[:2]) + (voxel - geometry.sVoxel[:2]) / 2
     column = np.arange(n_u)[:, None] + 0.5
-    pixel = frames.corner[:, None, :2] + column * frames.u[:, None, :2]  # [view, u, 2], mm
-    source = frames.source[:, None, :2]
-    direction = np.broadcast_to(source, pixel.shape) if frames.parallel else pixel - source
-    start = pixel if frames.parallel else source
+    pixel = rays.corner[:, None, :2] + column * rays.u[:, None, :2]  # [view, u, 2], mm
+    source = rays.source[:, None, :2]
+    direction = np.broadcast_to(source, pixel.shape) if rays.parallel else pixel - source
+    start = pixel if rays.parallel else source
     index, step = (start - first) / voxel, direction / voxel
     along_y = np.abs(direction[..., 1]) > np.abs(direction[..., 0])
 
@@ -59,7 +59,7 @@ def column_table(geometry: Geometry) -> np.ndarray:
     a = other(np.broadcast_to(index, step.shape)) + other(step) * c
     path = main(np.broadcast_to(voxel, step.shape)) / main(direction)
     g, h = path**2 * (direction**2).sum(-1), (path * geometry.dVoxel[2]) ** 2
-    if frames.parallel:
+    if rays.parallel:
         c, e, h = np.ones_like(c), np.zeros_like(c), np.zeros_like(c)
     return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
 
@@ -104,17 +104,17 @@ class Joseph(Stack):
                 f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
                 f'{half:.4g} mm from the axis; lower nVoxel or dVoxel'
             )
-        frames, voxel = geometry.rays(), geometry.dVoxel[2]
+        rays, voxel = geometry.rays(), geometry.dVoxel[2]
         first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
         self._columns = mi.Float(column_table(geometry).ravel())
-        source = 0.0 if frames.parallel else (frames.source[0, 2] - first) / voxel
-        top = (frames.corner[0, 2] + frames.v[0, 2] / 2 - first) / voxel
+        source = 0.0 if rays.parallel else (rays.source[0, 2] - first) / voxel
+        top = (rays.corner[0, 2] + rays.v[0, 2] / 2 - first) / voxel
         # Height of the source, of the first row over it, and between rows, in voxels.
-        self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, frames.v[0, 2] / voxel)]
+        self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
         self._matrix = mi.Float(self._column_matrix().ravel())
         # Rows whose hats cover a voxel, at most: where it is nearest to the source.
-        nearest = 1.0 if frames.parallel else (geometry.DSO - half) / geometry.DSD
-        rows = int(np.ceil(2 * voxel / (nearest * abs(frames.v[0, 2])) + 1e-3))
+        nearest = 1.0 if rays.parallel else (geometry.DSO - half) / geometry.DSD
+        rows = int(np.ceil(2 * voxel / (nearest * abs(rays.v[0, 2])) + 1e-3))
         self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
 
     def _column_matrix(self):

@@ -38,13 +38,13 @@ class View:
     panel: bool = True
 
     @staticmethod
-    def of(frames, index: int, height: int, width: int, panel: bool = True) -> View:
+    def of(rays, index: int, height: int, width: int, panel: bool = True) -> View:
         """View `index` of `lingo_mi.geometry.base.Rays`."""
         return View(
-            *(vector64(a[index]) for a in (frames.source, frames.corner, frames.u, frames.v)),
+            *(vector64(a[index]) for a in (rays.source, rays.corner, rays.u, rays.v)),
             width,
             height,
-            frames.parallel,
+            rays.parallel,
             panel,
         )
 

@@ -32,12 +32,12 @@ def require_pixels(scan: Scan, what: str):
 
 def require_rays(geometry: Geometry):
     """Raises InputError where a source is in the volume, and where no view's rays meet it."""
-    frames, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
-    if not frames.parallel and (np.abs(frames.source - centre) < half).all(1).any():
+    rays, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    if not rays.parallel and (np.abs(rays.source - centre) < half).all(1).any():
         raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
     corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector
     for view in range(len(geometry)):
-        x, y = frames.project(corners, view)
+        x, y = rays.project(corners, view)
         # NaN are corners behind the source, which hide how far the others' shadow goes.
         if 0 < np.isnan(x).sum() < len(x) or x.max() > 0 and x.min() < columns and y.max() > 0 and y.min() < rows:
             return

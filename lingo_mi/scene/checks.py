@@ -33,16 +33,16 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
 
 def warn_if_truncated(geometry: Geometry):
     """Say so where the volume's midplane is wider than what the panels see of it."""
-    frames, centre = geometry.rays(), np.array(geometry.offOrigin)
+    rays, centre = geometry.rays(), np.array(geometry.offOrigin)
     widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]
     cut = 0
-    for view in range(len(frames)):
-        across = frames.u[view] / np.linalg.norm(frames.u[view]) * widest / 2
-        x, _ = frames.project(np.stack([centre - across, centre + across]), view)
+    for view in range(len(rays)):
+        across = rays.u[view] / np.linalg.norm(rays.u[view]) * widest / 2
+        x, _ = rays.project(np.stack([centre - across, centre + across]), view)
         cut += not (x.min() >= -1e-4 * columns and x.max() <= columns * (1 + 1e-4))  # also where it is NaN
     if cut:
         warnings.warn(
-            f'the volume is {widest:g} mm wide, and the panel does not see all of it in {cut} of {len(frames)} '
+            f'the volume is {widest:g} mm wide, and the panel does not see all of it in {cut} of {len(rays)} '
             'views: projections may be truncated',
             stacklevel=2,
         )

@@ -104,9 +104,9 @@ def render_objects(objects, geometry, extent: float = 8.0) -> np.ndarray:
             elif same_box:  # skips empty margins, which rendering through the scene may not
                 total += grid.project(grid_values(thing), geometry, report)
             else:
-                frames = geometry.rays()
+                rays = geometry.rays()
                 for i in range(len(geometry)):
-                    view = View.of(frames, i, *geometry.nDetector)
+                    view = View.of(rays, i, *geometry.nDetector)
                     total[i] += thing.line_integrals(view, extent, True).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
@@ -116,10 +116,10 @@ def render_with(effects: Effects, objects, geometry, keys, seed, extent: float =
     """`render_objects` as a detector measures it; keys are those of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
-    frames = geometry.rays()
+    rays = geometry.rays()
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
-            view = View.of(frames, i, *geometry.nDetector)
+            view = View.of(rays, i, *geometry.nDetector)
             one = replace(effects, index=int(keys[i]))
             expected = one.line_integrals(objects, view, Quality(extent))
             out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])

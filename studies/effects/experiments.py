@@ -147,8 +147,8 @@ def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geom
     along each axis, degrees and mm. The mean motion, which no projection tells from the object's, is taken off."""
     turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
     turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
-    frames = geometry.rays().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
-    return Geometry.from_poses(frames, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+    rays = geometry.rays().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
+    return Geometry.from_poses(rays, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
 
 
 def quality(volume, truth) -> dict:

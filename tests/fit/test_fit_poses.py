@@ -44,7 +44,7 @@ def test_derivatives_by_differences(mode):
     state = DeviceState(start(points.points, points.spacing * 2, points.density, settings))
     target = stepper.targets[1]
     stepper.poses.turn[1], stepper.poses.shift[1] = [0.02, -0.03, 0.05], [0.01, 0.02, -0.03]
-    here = stepper.poses.correct(target.frames, 1)
+    here = stepper.poses.correct(target.rays, 1)
 
     def loss(move):
         frames = here.moved(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
