@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what accuracy costs: error, time and memory of every way to compute the same projections, scaling, and fits. The same as `lingo-mi accuracy`."""
+"""The command `lingo-mi accuracy`, to be run from a checkout: `python scripts/accuracy.py --help` describes it."""
 
 from lingo_mi.cli import run
 

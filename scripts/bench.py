@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Time the integrator, forward and backward, against a kernel written by hand for this job and against Mitsuba's tree. The same as `lingo-mi bench`."""
+"""The command `lingo-mi bench`, to be run from a checkout: `python scripts/bench.py --help` describes it."""
 
 from lingo_mi.cli import run
 

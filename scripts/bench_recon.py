@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Time reconstruction on voxels against RTK and diffct on the CPU: projector, transpose, FDK, one SART iteration. The same as `lingo-mi bench-recon`."""
+"""The command `lingo-mi bench-recon`, to be run from a checkout: `python scripts/bench_recon.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what modelling the effects of real projections is worth: fits that ignore them against fits that model them. The same as `lingo-mi effects`."""
+"""The command `lingo-mi effects`, to be run from a checkout: `python scripts/effects.py --help` describes it."""
 
 from lingo_mi.cli import run
 

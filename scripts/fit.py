@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Fit a cloud of 3D Gaussians to a CT scan, and make a volume and new views of it. The same as `lingo-mi fit`."""
+"""The command `lingo-mi fit`, to be run from a checkout: `python scripts/fit.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Check the derivatives of a scene's image against differences: a table of AD, differences and their relative error. The same as `lingo-mi gradcheck`."""
+"""The command `lingo-mi gradcheck`, to be run from a checkout: `python scripts/gradcheck.py --help` describes it."""
 
 from lingo_mi.cli import run
 

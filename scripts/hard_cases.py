@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the hard cases of the tests: a Markdown table of their errors, refusals and warnings. The same as `lingo-mi hard-cases`."""
+"""The command `lingo-mi hard-cases`, to be run from a checkout: `python scripts/hard_cases.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make a test object and, if asked, a noise-free scan of it. The same as `lingo-mi phantom`."""
+"""The command `lingo-mi phantom`, to be run from a checkout: `python scripts/phantom.py --help` describes it."""
 
 from lingo_mi.cli import run
 

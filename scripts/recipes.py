@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compare recipes: quality against time, for every scene and method, as curves and a table. The same as `lingo-mi recipes`."""
+"""The command `lingo-mi recipes`, to be run from a checkout: `python scripts/recipes.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Reconstruct a CT volume from projections, measured or simulated, or completed from a fitted cloud. The same as `lingo-mi reconstruct`."""
+"""The command `lingo-mi reconstruct`, to be run from a checkout: `python scripts/reconstruct.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Regenerate the paper's tables: new views, CT reconstruction in two stages, and the parts of LINGO. The same as `lingo-mi tables`."""
+"""The command `lingo-mi tables`, to be run from a checkout: `python scripts/tables.py --help` describes it."""
 
 from lingo_mi.cli import run
 

@@ -12,15 +12,15 @@ phantoms:
 {list}
 
 examples:
-  phantom.py foot --out foot.nii.gz
+  lingo-mi phantom foot --out foot.nii.gz
       the default object on 256^3 voxels of 1 mm
-  phantom.py foot --size 128 --out foot.nii.gz --projections foot.pickle --kind naf
+  lingo-mi phantom foot --size 128 --out foot.nii.gz --projections foot.pickle --kind naf
       and its scan in the format of NAF, SAX-NeRF and X3D
-  phantom.py mesh --out flange.ply
+  lingo-mi phantom mesh --out flange.ply
       the flange as a mesh, and bolts for its holes (flange_bolts.ply)
-  phantom.py gaussians --out cloud.ply
+  lingo-mi phantom gaussians --out cloud.ply
       the Gaussians themselves, for Mitsuba's `ellipsoids`
-  phantom.py chest --projections chest_scan --kind r2 --views 25
+  lingo-mi phantom chest --projections chest_scan --kind r2 --views 25
       a scan alone, as a folder for R2-Gaussian
 
 The scan is X3D's: a cone beam, DSD 1500 mm, DSO 1000 mm, 512 x 512 pixels of 1 mm (1.48 mm for the chest),

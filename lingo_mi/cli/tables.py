@@ -1,8 +1,8 @@
 """Regenerate the paper's tables: new views, CT reconstruction in two stages, and the parts of LINGO.
 
-    python scripts/tables.py views
-    python scripts/tables.py ct --objects foot chest --views 25
-    python scripts/tables.py ablation --scale paper
+    lingo-mi tables views
+    lingo-mi tables ct --objects foot chest --views 25
+    lingo-mi tables ablation --scale paper
 
 Objects are the phantoms foot and chest and the volumes aneurism, engine, teapot, tooth, chest_lidc0314, abdomen_ts, aorta_ts,
 head_fsrt and jaw_fsrt, as NAME.nii.gz in the folder that LINGO_MI_DATA names; those that are missing are skipped.
@@ -13,7 +13,8 @@ more for the ablation; half an hour (aneurism) to two hours (chest) an object. S
 and 30,000 iterations, and all objects; it is meant for a GPU.
 
 Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
-tables use what is there. The table, as Markdown and JSON, is renewed after every one of them.
+tables use what is there. The table, as Markdown and JSON, is renewed after every one of them, with TABLE.provenance.json beside
+it, which says how.
 """
 
 import argparse
@@ -75,7 +76,8 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells, available
+    from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells
+    from lingo_mi.studies.tables.objects import available
     from lingo_mi.studies.tables.report import groups, plan, write
 
     scale = replace(SCALES[args.scale], finer=args.finer)
@@ -113,7 +115,7 @@ def main():
     except KeyboardInterrupt:
         raise KeyboardInterrupt('the same command goes on from here') from None
     print(write(args.table, rows, objects, cells, args.scale))
-    print(f'{cells.folder}/: {args.table}.md, {args.table}.json')
+    print(f'{cells.folder}/: {args.table}.md, {args.table}.json, {args.table}.provenance.json')
     if failed:
         cell, error = next(iter(failed.items()))
         raise InputError(f'{len(failed)} of {len(missing)} cells failed, the first one ({cell}): {error}')

@@ -33,8 +33,8 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
         settings = replace(settings, max_gaussians=most, n_points=min(settings.n_points, most))
     if g.mode == 'parallel':
         return settings
-    frames = g.normalised_rays()
-    room = np.linalg.norm(frames.source, axis=1).min() - np.linalg.norm(g.half)
+    rays = g.normalised_rays()
+    room = np.linalg.norm(rays.source, axis=1).min() - np.linalg.norm(g.half)
     largest = 0.9 * room / settings.extent
     if largest <= settings.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
@@ -46,7 +46,7 @@ def scene_radius(geometry: Geometry) -> float:
 
     1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
     """
-    frames = geometry.normalised_rays()
-    if frames.parallel:
+    rays = geometry.normalised_rays()
+    if rays.parallel:
         return 1.0
-    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.0
+    return 1.1 * float(np.linalg.norm(rays.source - rays.source.mean(0), axis=1).max()) or 1.0

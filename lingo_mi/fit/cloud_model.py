@@ -40,7 +40,7 @@ class CloudModel:
 
         progress   called as progress(views done, views in all)
         """
-        frames, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        rays, (height, width) = geometry.normalised_rays(), geometry.nDetector
         gaussians, share = state.gaussians(self.settings), self.shares(state)
 
         scattered = [None] * len(geometry)
@@ -53,7 +53,7 @@ class CloudModel:
 
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
-            view = View.of(frames, i, height, width, panel=False)
+            view = View.of(rays, i, height, width, panel=False)
             image = along(view)[0] if self.signal is None else self.signal.image(along, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:

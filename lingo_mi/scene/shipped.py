@@ -17,12 +17,16 @@ def scenes() -> dict[str, Path]:
 def scene_path(scene) -> Path:
     """The file of a scene: `scene` itself if there is such a file, else the shipped scene of that name.
 
-    Raises InputError where there is neither.
+    A folder is no file: results in a folder `x3d_foot` do not hide the scene of that name.
+
+    Raises InputError where there is neither; a folder of another name is left to whoever reads it to refuse.
     """
     path = Path(scene)
-    if path.exists():
+    if path.is_file():
         return path
     known = scenes()
     if str(scene) in known:
         return known[str(scene)]
+    if path.exists():
+        return path
     raise InputError(f'{scene}: there is no such scene; name a file, or one of {", ".join(sorted(known))}')

@@ -5,7 +5,7 @@ folder that names its recipe and a hash of every setting: a cell that is whole i
 another cell. A fit keeps its checkpoint beside it, from which it goes on after an interruption, from which the next longer fit
 of the same recipe begins, and from which the views missing to a CT volume are rendered.
 
-Every object is scanned as in X3D's scenes (`phantoms.scanning`): 50 views over half a turn, of which a fit sees a few evenly
+Every object is scanned as in X3D's scenes (`phantoms.x3d_scan`): 50 views over half a turn, of which a fit sees a few evenly
 spaced ones, and 50 others held out. For a CT volume, the fitted views are completed to 100.
 """
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 import sys
 import time
 from dataclasses import asdict, dataclass, replace
@@ -22,12 +21,10 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from skimage.transform import resize_local_mean
 
-from lingo_mi import metrics, phantoms
+from lingo_mi import metrics
 from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
-from lingo_mi.files.volumes import read_volume
 from lingo_mi.fit import checkpoint
 from lingo_mi.fit.checkpoint import CHECKPOINT
 from lingo_mi.fit.fitted import Fitted
@@ -48,9 +45,8 @@ from lingo_mi.results.measure import measure
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.studies.provenance import provenance
+from lingo_mi.studies.tables.objects import PHANTOMS, VOLUMES, averaged, load_object
 
-PHANTOMS = 'foot', 'chest'
-VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
 NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # numbers of a fit's views; of a volume
 
@@ -127,54 +123,6 @@ def recipe(fit: Fit, scale: Scale) -> Settings:
     """The settings of a fit."""
     settings = settings_of(fit.method, n_points=scale.n_points)
     return settings if fit.iterations is None else settings.changed(iterations=fit.iterations)
-
-
-def available(names, say) -> list[str]:
-    """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
-
-    say   called with a line for each of VOLUMES that is missing
-
-    Raises InputError for a name that is neither, and where no object is left.
-    """
-    found = []
-    for name in names:
-        if name in PHANTOMS or (path := _file(name)) is not None and path.is_file():
-            found.append(name)
-        elif name in VOLUMES:
-            say(f'{name}: skipped, since there is no {name}.nii.gz in the folder that LINGO_MI_DATA names')
-        else:
-            raise InputError(
-                f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
-                'in the folder that LINGO_MI_DATA names'
-            )
-    if not found:
-        raise InputError(
-            f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}'
-        )
-    return found
-
-
-def _file(name: str) -> Path | None:
-    folder = os.environ.get('LINGO_MI_DATA')
-    return Path(folder) / f'{name}.nii.gz' if folder else None
-
-
-def load_object(name: str, size: int) -> phantoms.Phantom:
-    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
-    if name in PHANTOMS:
-        return phantoms.make(name, size)
-    volume = read_volume(_file(name))
-    return averaged(phantoms.Phantom(volume.data, volume.spacing, name), size)
-
-
-def averaged(thing: phantoms.Phantom, size: int) -> phantoms.Phantom:
-    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
-    shape = thing.data.shape
-    if max(shape) <= size:
-        return thing
-    smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
-    spacing = tuple(d * n / m for d, n, m in zip(thing.spacing, shape, smaller))
-    return phantoms.Phantom(resize_local_mean(thing.data, smaller).astype(np.float32), spacing, thing.name)
 
 
 class Cells:

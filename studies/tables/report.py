@@ -14,6 +14,8 @@ import numpy as np
 
 from lingo_mi.fit.settings import settings_of
 from lingo_mi.paths import replacing
+from lingo_mi.studies.provenance import write_provenance
+from lingo_mi.studies.tables import paper
 from lingo_mi.studies.tables.cells import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume
 
 TITLES = dict(
@@ -52,91 +54,6 @@ ABLATION = {
     '+ + +': 'lingo',
 }
 
-# PSNR, SSIM, IPSD by views, iterations and method.
-_PAPER_VIEWS = {
-    (5, 5000): {
-        '3dgs': (28.74, 0.8871, 0.1241),
-        'xgaussian': (28.88, 0.8899, 0.1236),
-        'r2': (32.90, 0.9449, 0.1228),
-        'lingo': (33.33, 0.9506, 0.0282),
-    },
-    (5, 15_000): {
-        '3dgs': (28.55, 0.8887, 0.1202),
-        'xgaussian': (29.05, 0.8933, 0.1192),
-        'r2': (33.23, 0.9466, 0.1184),
-        'lingo': (33.60, 0.9520, 0.0264),
-    },
-    (5, 30_000): {
-        '3dgs': (28.24, 0.8820, 0.1199),
-        'xgaussian': (28.73, 0.8877, 0.1190),
-        'r2': (33.41, 0.9466, 0.1182),
-        'lingo': (33.67, 0.9524, 0.0264),
-    },
-    (10, 5000): {
-        '3dgs': (33.64, 0.9387, 0.1251),
-        'xgaussian': (33.64, 0.9391, 0.1244),
-        'r2': (37.87, 0.9699, 0.1182),
-        'lingo': (38.85, 0.9747, 0.0275),
-    },
-    (10, 15_000): {
-        '3dgs': (34.12, 0.9425, 0.1211),
-        'xgaussian': (34.17, 0.9431, 0.1187),
-        'r2': (38.40, 0.9710, 0.1190),
-        'lingo': (39.37, 0.9755, 0.0259),
-    },
-    (10, 30_000): {
-        '3dgs': (34.28, 0.9418, 0.1208),
-        'xgaussian': (34.35, 0.9422, 0.1184),
-        'r2': (38.61, 0.9710, 0.1188),
-        'lingo': (39.55, 0.9756, 0.0258),
-    },
-    (25, 5000): {
-        '3dgs': (37.35, 0.9740, 0.1273),
-        'xgaussian': (39.38, 0.9740, 0.1303),
-        'r2': (43.82, 0.9883, 0.1152),
-        'lingo': (44.55, 0.9895, 0.0242),
-    },
-    (25, 15_000): {
-        '3dgs': (40.95, 0.9781, 0.1205),
-        'xgaussian': (40.99, 0.9781, 0.1246),
-        'r2': (45.49, 0.9897, 0.1130),
-        'lingo': (46.25, 0.9909, 0.0233),
-    },
-    (25, 30_000): {
-        '3dgs': (41.36, 0.9777, 0.1203),
-        'xgaussian': (41.26, 0.9777, 0.1242),
-        'r2': (46.09, 0.9899, 0.1129),
-        'lingo': (47.04, 0.9911, 0.0233),
-    },
-}
-
-# PSNR, SSIM by views, algorithm and what completed the views.
-_ORDER = 'none', '3dgs', 'xgaussian', 'r2', 'lingo'
-_PAPER_CT = {
-    key: dict(zip(_ORDER, values))
-    for key, values in {
-        (5, 'fdk'): ((12.63, 0.1183), (20.05, 0.2600), (20.11, 0.2621), (22.98, 0.3986), (23.29, 0.4139)),
-        (5, 'sart'): ((23.89, 0.6614), (21.38, 0.5602), (21.35, 0.5633), (24.61, 0.7025), (24.94, 0.7202)),
-        (5, 'asd-pocs'): ((23.38, 0.6486), (22.05, 0.6113), (22.18, 0.6194), (25.46, 0.7488), (25.78, 0.7643)),
-        (10, 'fdk'): ((16.13, 0.1745), (21.94, 0.3075), (21.98, 0.3101), (24.12, 0.4153), (24.37, 0.4246)),
-        (10, 'sart'): ((26.22, 0.7163), (24.53, 0.6480), (24.55, 0.6536), (27.28, 0.7614), (27.76, 0.7798)),
-        (10, 'asd-pocs'): ((25.64, 0.7215), (25.98, 0.7189), (26.04, 0.7214), (28.45, 0.8066), (28.90, 0.8252)),
-        (25, 'fdk'): ((20.81, 0.2973), (23.92, 0.3828), (23.91, 0.3825), (25.18, 0.4489), (25.21, 0.4503)),
-        (25, 'sart'): ((30.22, 0.8015), (28.90, 0.7717), (28.91, 0.7715), (31.45, 0.8467), (31.75, 0.8526)),
-        (25, 'asd-pocs'): ((29.43, 0.8233), (30.98, 0.8425), (31.00, 0.8422), (32.61, 0.8864), (32.91, 0.8924)),
-    }.items()
-}
-
-# Seconds to start, PSNR, SSIM, IPSD of new views; PSNR, SSIM of ASD-POCS; 25 views, 30 000 iterations.
-_PAPER_ABLATION = {
-    '- - -': ((1.42, 46.09, 0.9899, 0.1129), (32.61, 0.8864)),
-    '+ - -': ((1.42, 46.77, 0.9907, 0.0906), (32.78, 0.8883)),
-    '- + -': ((5.76, 46.28, 0.9899, 0.0526), (32.81, 0.8911)),
-    '+ + -': ((5.76, 46.74, 0.9907, 0.0321), (32.75, 0.8905)),
-    '- + +': ((0.47, 46.49, 0.9902, 0.0472), (32.67, 0.8894)),
-    '+ + +': ((0.47, 47.04, 0.9911, 0.0289), (32.91, 0.8924)),
-}
-
 
 @dataclass(frozen=True)
 class Column:
@@ -167,9 +84,7 @@ def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'vox
     last = iterations[-1]
     if table == 'views':
         return [
-            Group(
-                n, i, tuple(Column(m, _fit(n, m, i), NEW_VIEWS, _PAPER_VIEWS.get((n, i), {}).get(m)) for m in methods)
-            )
+            Group(n, i, tuple(Column(m, _fit(n, m, i), NEW_VIEWS, paper.VIEWS.get((n, i), {}).get(m)) for m in methods))
             for n in views
             for i in iterations
         ]
@@ -179,7 +94,7 @@ def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'vox
                 n,
                 a,
                 tuple(
-                    Column(m, _volume(n, m, last, a), CT, _PAPER_CT.get((n, a), {}).get(m)) for m in ('none', *methods)
+                    Column(m, _volume(n, m, last, a), CT, paper.CT.get((n, a), {}).get(m)) for m in ('none', *methods)
                 ),
             )
             for n in views
@@ -188,14 +103,14 @@ def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'vox
     out = []
     for n in views:
         for parts, method in ABLATION.items():
-            paper = _PAPER_ABLATION[parts] if (n, last) == (25, 30_000) else (None, None)
+            published = paper.ABLATION[parts] if (n, last) == (25, 30_000) else (None, None)
             out.append(
                 Group(
                     n,
                     parts,
                     (
-                        Column('fit', _fit(n, method, last), ('seconds_init', *NEW_VIEWS), paper[0]),
-                        Column('asd-pocs', _volume(n, method, last, 'asd-pocs'), CT, paper[1]),
+                        Column('fit', _fit(n, method, last), ('seconds_init', *NEW_VIEWS), published[0]),
+                        Column('asd-pocs', _volume(n, method, last, 'asd-pocs'), CT, published[1]),
                     ),
                 )
             )
@@ -290,7 +205,9 @@ def markdown(table: str, table_groups: list[Group], rows: list[dict]) -> str:
 
 
 def write(table: str, table_groups: list[Group], objects, cells: Cells, name: str) -> str:
-    """Write TABLE.json and TABLE.md, of the cells that there are, into their folder; returns the Markdown.
+    """Write TABLE.json, TABLE.md and TABLE.provenance.json, of the cells that there are, into their folder; returns the Markdown.
+
+    Each cell keeps its own provenance in its own file.
 
     name   of the scale
     """
@@ -308,4 +225,5 @@ def write(table: str, table_groups: list[Group], objects, cells: Cells, name: st
     for kind, content in (('json', json.dumps(rows, indent=1) + '\n'), ('md', text)):
         with replacing(cells.folder / f'{table}.{kind}') as temporary:
             temporary.write_text(content, encoding='utf-8')
+    write_provenance(cells.folder / f'{table}.md')
     return text

@@ -169,7 +169,7 @@ def test_derivatives_by_the_pose_through_bundles():
     for size in (0.0, 1e-3):
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
-        place(target.view, target.frames)
+        place(target.view, target.rays)
         stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)
         found.append(np.concatenate(list(gathered(target.view).values())))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())

@@ -18,7 +18,8 @@ from lingo_mi.files.volumes import write_volume
 from lingo_mi.fit.settings import METHODS
 from lingo_mi.phantoms import make
 from lingo_mi.studies.tables import cells as tables
-from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, available, load_object, recipe
+from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, recipe
+from lingo_mi.studies.tables.objects import available, load_object
 from lingo_mi.studies.tables.report import ABLATION, groups, markdown, plan, results
 
 TABLES = FIT.with_name('tables.py')
@@ -56,6 +57,8 @@ def test_new_views(out):
     assert rows[0]['columns']['fast'] == rows[2]['columns']['fast'] != rows[0]['columns']['r2']
     assert rows[0]['columns']['r2'] == rows[1]['columns']['r2'] != rows[2]['columns']['r2']
     assert '3 of 3 cells' in text and (out / 'views.md').read_text() in text
+    assert 'views' in json.loads((out / 'views.provenance.json').read_text())['command']
+    assert Cells(out, TINY).get(Fit('foot', 4, 'r2', 10))['provenance']['versions']['mitsuba']
     row = next(line for line in text.splitlines() if line.startswith('| 4 | 10 | foot |'))
     assert f' {rows[0]["columns"]["r2"]["psnr_2d_r2"]:.2f} ' in row
 
@@ -228,7 +231,7 @@ def test_killed(tmp_path):
     arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
     code = (
         'import runpy, sys\nimport lingo_mi\nfrom lingo_mi.runtime import use_variant\n'
-        f'use_variant({mi.variant()!r})\nfrom lingo_mi import tables\n'
+        f'use_variant({mi.variant()!r})\nfrom lingo_mi.studies.tables import cells as tables\n'
         'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,), ("foot",))\ntables.SCANNED = 25\n'
         'sys.argv = sys.argv[1:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n'
     )

@@ -1,0 +1,71 @@
+"""The objects of the paper's tables: phantoms, and volumes in the folder that LINGO_MI_DATA names."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from skimage.transform import resize_local_mean
+
+from lingo_mi import phantoms
+from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import read_volume
+
+PHANTOMS = 'foot', 'chest'
+VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
+
+
+def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
+    """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
+
+    say   called with a line for each of VOLUMES that is missing
+
+    Raises InputError for a name that is neither, and where no object is left.
+    """
+    found = []
+    for name in names:
+        if name in PHANTOMS or (path := _file(name)) is not None and path.is_file():
+            found.append(name)
+        elif name in VOLUMES:
+            say(f'{name}: skipped, since there is no {name}.nii.gz in the folder that LINGO_MI_DATA names')
+        else:
+            raise InputError(
+                f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
+                'in the folder that LINGO_MI_DATA names'
+            )
+    if not found:
+        raise InputError(
+            f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}'
+        )
+    return found
+
+
+def _file(name: str) -> Path | None:
+    folder = os.environ.get('LINGO_MI_DATA')
+    return Path(folder) / f'{name}.nii.gz' if folder else None
+
+
+def load_object(name: str, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers.
+
+    Raises InputError where its file cannot be read.
+    """
+    if name in PHANTOMS:
+        return phantoms.make(name, size)
+    path = _file(name)
+    if path is None:
+        raise InputError(f'object {name!r}: let LINGO_MI_DATA name the folder of {name}.nii.gz')
+    volume = read_volume(path)
+    return averaged(phantoms.Phantom(volume.data, volume.spacing, name), size)
+
+
+def averaged(thing: phantoms.Phantom, size: int) -> phantoms.Phantom:
+    """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
+    shape = thing.data.shape
+    if max(shape) <= size:
+        return thing
+    smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
+    spacing = tuple(d * n / m for d, n, m in zip(thing.spacing, shape, smaller))
+    return phantoms.Phantom(resize_local_mean(thing.data, smaller).astype(np.float32), spacing, thing.name)

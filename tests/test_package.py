@@ -1,0 +1,58 @@
+"""What an installation holds: every module, plugin, study and scene of the checkout."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PLACES = {
+    'lingo_mi': 'lingo_mi',
+    'plugins': 'lingo_mi/plugins',
+    'scenes': 'lingo_mi/scenes',
+    'studies': 'lingo_mi/studies',
+}
+KINDS = {'.py', '.xml', '.ply', '.cpp'}
+
+
+def files(folder: Path) -> set[str]:
+    """Paths of the source and data files below a folder, not those that links in it lead to."""
+    found = (path.relative_to(folder) for path in folder.rglob('*') if path.suffix in KINDS and path.is_file())
+    return {path.as_posix() for path in found if not any((folder / p).is_symlink() for p in path.parents)}
+
+
+@pytest.fixture(scope='module')
+def built(tmp_path_factory):
+    """The tree that a wheel is packed from, built from a copy of the checkout."""
+    pytest.importorskip('setuptools', '61', reason='building needs setuptools 61 or later')
+    folder = tmp_path_factory.mktemp('package')
+    for name in PLACES:
+        # In a checkout that is run without an installation, links lead from the package to the folders beside it.
+        links = shutil.ignore_patterns('__pycache__', *(PLACES if name == 'lingo_mi' else ()))
+        shutil.copytree(ROOT / name, folder / name, ignore=links)
+    for name in ('pyproject.toml', 'README.md'):
+        shutil.copy(ROOT / name, folder)
+    command = [sys.executable, '-c', 'from setuptools import setup; setup()', 'build_py', '--build-lib', 'built']
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder / 'built'
+
+
+def test_an_installation_holds_every_file(built):
+    expected = {f'{place}/{name}' for source, place in PLACES.items() for name in files(ROOT / source)}
+    held = files(built)
+    assert held == expected
+    assert {
+        'lingo_mi/scenes/x3d_foot.xml',
+        'lingo_mi/scenes/effects/psf.xml',
+        'lingo_mi/scenes/meshes/flange.ply',
+        'lingo_mi/plugins/lingo_xray.py',
+        'lingo_mi/studies/hard_cases/cases.py',
+        'lingo_mi/studies/benchmarks/limit.cpp',
+    } <= held
+
+
+def test_neither_tests_nor_scripts_are_installed(built):
+    assert [path.name for path in built.iterdir()] == ['lingo_mi']
