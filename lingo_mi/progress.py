@@ -1,7 +1,7 @@
 """Live progress of long loops, on standard error.
 
 On a terminal: a bar with the time gone and left. Elsewhere (a file, a pipe, a batch system): one plain line
-about every 10 % or 10 seconds, without control characters.
+about every 10 % or 10 seconds, one line in all for a loop of less than a second, without control characters.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ LABELS = {
     'gaussians': '{:,} Gaussians',
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal
+PAUSE = 1.0  # seconds between two plain lines at least, but for the last
 LINE = 10.0  # seconds between two plain lines, where 10 % takes longer
 
 
@@ -70,7 +71,8 @@ class Progress:
         if self._bar:
             due = now - self._drawn >= REDRAW
         else:
-            due = now - self._drawn >= LINE or (iteration - self._shown) * 10 >= self.total
+            tenth = (iteration - self._shown) * 10 >= self.total
+            due = now - self._drawn >= (PAUSE if tenth else LINE)
         if due or iteration == self.total:
             self._draw(now)
 

@@ -66,7 +66,7 @@ def simulate(
             return x3d_scan(source, views or 50, seed, lambda done, _: bar.update(done))
     if geometry is None:
         raise InputError('a volume needs a scanner: give a geometry, such as lm.Geometry.cone(...)')
-    volume = source.data if isinstance(source, Phantom) else np.asarray(as_numpy(source), np.float32)
+    volume = source.data if isinstance(source, Phantom) else as_numpy(source, 'the volume', np.float32)
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
     check_memory(geometry, held_out)

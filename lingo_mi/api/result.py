@@ -76,7 +76,7 @@ class Result:
     @property
     def gaussians(self) -> Gaussians:
         """The cloud, for `lm.project(*result.gaussians, geometry)`."""
-        return Gaussians(*world_cloud(self.fitted))
+        return Gaussians(*world_cloud(self.fitted, self.geometry))
 
     def __len__(self) -> int:
         return len(self.fitted.state)
