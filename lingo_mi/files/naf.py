@@ -25,7 +25,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.files.scanner import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.paths import one_line, reading, replacing
 from lingo_mi.scan import Dataset
 
@@ -263,10 +263,10 @@ def write(path, dataset: Dataset) -> None:
     For a panel that is not square NAF's own code wants nDetector as (u, v); R2-Gaussian's and this module's
     readers do not. Raises InputError if the file cannot be written or the test views have another scanner.
     """
-    check_one_scanner(dataset, path)
-    start, total = angle_range(dataset.train.geometry.angles)
+    geometry = one_circle(dataset, path)
+    start, total = angle_range(geometry.angles)
     data = {
-        **from_geometry(dataset.train.geometry, offset_order='uv'),
+        **from_geometry(geometry, offset_order='uv'),
         'numTrain': len(dataset.train),
         'numVal': 0 if dataset.test is None else len(dataset.test),
         'accuracy': 0.5,

@@ -17,7 +17,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
-from lingo_mi.files.tigre import angle_range, check_one_scanner, from_geometry, make_dataset, make_scan, to_geometry
+from lingo_mi.files.scanner import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.paths import new_folder, one_line, reading
 from lingo_mi.scan import Dataset
 
@@ -25,15 +25,15 @@ META = 'meta_data.json'
 
 
 def _views(meta, split, folder, where):
-    frames = meta.get(f'proj_{split}')
-    if not frames:
+    listed = meta.get(f'proj_{split}')
+    if not listed:
         return None
-    if not isinstance(frames, list):
+    if not isinstance(listed, list):
         raise InputError(f'{where}: proj_{split} must be a list of views')
     projections, angles = [], []
-    for i, frame in enumerate(frames):
+    for i, view in enumerate(listed):
         try:
-            file, angle = folder / frame['file_path'], float(frame['angle'])
+            file, angle = folder / view['file_path'], float(view['angle'])
         except (TypeError, KeyError, ValueError):
             raise InputError(
                 f"{where}: entry {i} of proj_{split} must have a 'file_path' and an 'angle' in radians"
@@ -82,8 +82,7 @@ def write(path, dataset: Dataset) -> None:
     R2-Gaussian itself cannot read a folder without a volume. Raises InputError if the folder exists and is
     not empty, cannot be written, or the test views have another scanner.
     """
-    check_one_scanner(dataset, path)
-    geometry = dataset.train.geometry
+    geometry = one_circle(dataset, path)
     start, total = angle_range(geometry.angles)
     scanner = {
         **from_geometry(geometry, offset_order='uv'),

@@ -49,7 +49,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.files import arrays, naf, r2
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
-from lingo_mi.files.tigre import (
+from lingo_mi.files.scanner import (
     MOTION,
     check_one_scanner,
     from_geometry,
@@ -193,16 +193,16 @@ def _line_integrals(projections, values, where, projections_path):
 
 
 def _dump_yaml(path, geometry, test=None, **more):
-    if not all(g is None or isinstance(g, CircularGeometry) for g in (geometry, test)):
+    if isinstance(geometry, CircularGeometry) and (test is None or isinstance(test, CircularGeometry)):
+        values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
+        if test is not None:
+            values['test_angles'] = np.degrees(test.angles).tolist()
+    else:
         values = {'mode': geometry.mode}
         values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
         values['poses'] = astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
         if test is not None:
             values['test_poses'] = astra.to_vectors(test.rays(), test.nDetector).tolist()
-    else:
-        values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
-        if test is not None:
-            values['test_angles'] = np.degrees(test.angles).tolist()
     values |= more
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
@@ -286,7 +286,7 @@ def _read_exr_folder(folder):
 
 
 def _write_exr_folder(path, dataset):
-    check_one_scanner(dataset, path, poses=True)
+    check_one_scanner(dataset, path)
     with new_folder(path) as folder:
         for split, scan in (('train', dataset.train), ('test', dataset.test)):
             if scan is not None:

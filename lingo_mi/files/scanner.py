@@ -1,5 +1,4 @@
-"""Scan geometry as a dictionary under TIGRE's names: the common ground of the pickle, the R2 folder and the
-YAML file."""
+"""A scanner as a dictionary under TIGRE's names, nVoxel in (x, y, z): what the pickle, the R2 folder and the YAML file share."""
 
 from __future__ import annotations
 
@@ -250,20 +249,32 @@ def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
     return Dataset(train, test, volume)
 
 
-def check_one_scanner(dataset: Dataset, where, poses: bool = False) -> None:
-    """Raises InputError unless the test views differ from the training views in their angles only, or, where the format
-    holds `poses`, in those. Without them, all views must be on the circle."""
+def one_circle(dataset: Dataset, where) -> CircularGeometry:
+    """The geometry of the training views, for formats of circular scans.
+
+    Raises InputError where a view is not on the circle, or the test views differ in more than their angles.
+    """
+    geometry = dataset.train.geometry
+    circular = all(
+        isinstance(scan.geometry, CircularGeometry) for scan in (dataset.train, dataset.test) if scan is not None
+    )
+    if not isinstance(geometry, CircularGeometry) or not circular:
+        raise InputError(
+            f"{where}: this format holds circular scans only, and this one has other poses; write it as 'npy' or 'exr'"
+        )
+    check_one_scanner(dataset, where)
+    return geometry
+
+
+def check_one_scanner(dataset: Dataset, where) -> None:
+    """Raises InputError unless the test views differ from the training views in their angles or poses only."""
     geometries = [scan.geometry for scan in (dataset.train, dataset.test) if scan is not None]
-    names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
-    if not all(isinstance(g, CircularGeometry) for g in geometries):
-        if not poses:
-            raise InputError(
-                f'{where}: this format holds circular scans only, and this one has other poses; write it as '
-                "'npy' or 'exr'"
-            )
-        known = [{name: getattr(g, name) for name in names} for g in geometries]
+    circles = [g for g in geometries if isinstance(g, CircularGeometry)]
+    if len(circles) == len(geometries):
+        known = [from_geometry(g) for g in circles]
     else:
-        known = [from_geometry(g) for g in geometries]
+        names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
+        known = [{name: getattr(g, name) for name in names} for g in geometries]
     if known[0] != known[-1]:
         raise InputError(
             f'{where}: this format holds one scanner, but the training and test views have '

@@ -1,0 +1,393 @@
+"""The constructors of `Geometry`: against `scanner_rays`, numbers by hand, and other packages' own formulas."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry import astra, rtk
+from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import circular, helix, scanner_rays
+
+PANEL = dict(nDetector=(20, 24), dDetector=(1.5, 2.0))
+GRID = dict(nVoxel=(5, 6, 7), dVoxel=(1.0, 2.0, 3.0))
+ANGLES = np.array([0.1, 0.7, 3.0])
+CONE = dict(DSO=900.0, DSD=1400.0, angles=ANGLES, **PANEL, **GRID)
+PARALLEL = dict(angles=ANGLES, **PANEL, **GRID)
+MOTION = dict(offDetector=(4.0, -5.0), rotDetector=(0.05, -0.04, 0.1), COR=2.0, tilt=0.03)
+
+
+def same_rays(a: Rays, b: Rays, tolerance=1e-9):
+    assert a.parallel == b.parallel
+    for x, y in ((a.source, b.source), (a.corner, b.corner), (a.u, b.u), (a.v, b.v)):
+        np.testing.assert_allclose(x, y, rtol=0, atol=tolerance)
+
+
+def same_grid(a: Geometry, b: Geometry):
+    for name in ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin'):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def scanner(parallel=False, **motion):
+    far = (0.0, 0.0) if parallel else (900.0, 1400.0)
+    return scanner_rays(ANGLES, *far, PANEL['nDetector'], PANEL['dDetector'], parallel, **motion)
+
+
+# ---- the front door ----------------------------------------------------------------------------------------
+
+
+def test_the_base_is_abstract():
+    with pytest.raises(TypeError, match='abstract'):
+        Geometry(**CONE, mode='cone')
+
+
+@pytest.mark.parametrize('make', [Geometry.cone, Geometry.parallel])
+def test_circles(make):
+    numbers = CONE if make == Geometry.cone else PARALLEL
+    parallel = make == Geometry.parallel
+    g = make(**numbers, offDetector=(4.0, -5.0), offOrigin=(1.0, -2.0, 3.0))
+    assert isinstance(g, CircularGeometry) and g.mode == ('parallel' if parallel else 'cone')
+    assert (g.offOrigin, g.offDetector) == ((1, -2, 3), (4, -5))
+    same_rays(g.rays(), scanner(parallel, offDetector=(4.0, -5.0)), 0)
+
+
+def test_one_number_stands_for_all():
+    g = Geometry.cone(
+        DSO=9, DSD=14, nDetector=8, dDetector=2, nVoxel=4, dVoxel=0.5, angles=0.3, offOrigin=1, offDetector=2
+    )
+    assert g.nDetector == (8, 8) and g.dDetector == (2, 2) and g.nVoxel == (4, 4, 4) and g.dVoxel == (0.5,) * 3
+    assert g.offOrigin == (1, 1, 1) and g.offDetector == (2, 2) and len(g) == 1
+    assert g.sDetector == (16, 16) and g.sVoxel == (2, 2, 2) and g.scale == 1
+    turned = Geometry.cone(**CONE, rotDetector=0.1)
+    same_rays(turned.rays(), scanner(rotDetector=(0.1, 0.1, 0.1)))
+
+
+@pytest.mark.parametrize('name', MOTION)
+def test_motion(name):
+    """Each alone, the others left out; only an offset keeps the circle."""
+    g = Geometry.cone(**CONE, **{name: MOTION[name]})
+    assert isinstance(g, CircularGeometry) == (name == 'offDetector')
+    same_rays(g.rays(), scanner(**{name: MOTION[name]}))
+
+
+def test_all_motion_at_once():
+    same_rays(Geometry.cone(**CONE, **MOTION).rays(), scanner(**MOTION))
+    g = Geometry.parallel(**PARALLEL, **MOTION | dict(rotDetector=(0, 0, 0.1)))
+    same_rays(g.rays(), scanner(True, **MOTION | dict(rotDetector=(0, 0, 0.1))))
+    g = Geometry.helix(**CONE, **MOTION, pitch=30.0)
+    same_rays(g.rays(), scanner(**MOTION, height=helix(ANGLES, 30.0)))
+
+
+def test_helix_by_hand():
+    turns = circular(8, total=720, start=-360)
+    g = Geometry.helix(**CONE | dict(angles=turns), pitch=40.0)
+    assert isinstance(g, PosedGeometry) and len(g) == 8
+    np.testing.assert_allclose(g.rays().source[:, 2], [-40, -30, -20, -10, 0, 10, 20, 30], atol=1e-12)
+    np.testing.assert_allclose(g.rays().source[5], [0, 900, 10], atol=1e-9)
+    np.testing.assert_allclose(g.rays().centre(g.nDetector)[5], [0, -500, 10], atol=1e-9)
+    assert isinstance(Geometry.helix(**CONE, pitch=0.0), CircularGeometry)
+
+
+def test_poses_choose_their_kind():
+    circle = Geometry.from_poses(scanner(offDetector=(4.0, -5.0)), PANEL['nDetector'], **GRID, offOrigin=(1, 2, 3))
+    assert isinstance(circle, CircularGeometry) and circle.offOrigin == (1, 2, 3)
+    np.testing.assert_allclose([circle.DSO, circle.DSD, *circle.offDetector], [900, 1400, 4, -5])
+    posed = Geometry.from_poses(scanner(tilt=0.1), PANEL['nDetector'], **GRID)
+    assert isinstance(posed, PosedGeometry)
+    np.testing.assert_allclose([posed.DSO, posed.DSD, *posed.dDetector], [900, 1400, 1.5, 2.0])
+    np.testing.assert_allclose(posed.angles, ANGLES)
+
+
+@pytest.mark.parametrize(
+    'make, change, match',
+    [
+        (Geometry.cone, dict(DSO=1500), 'DSD >= DSO > 0'),
+        (Geometry.cone, dict(DSO=[900, 901, 902]), 'DSO must be one number'),
+        (Geometry.cone, dict(rotDetector=(0.1, 0.2)), 'rotDetector must be 3'),
+        (Geometry.cone, dict(nVoxel=(1, 2)), 'nVoxel must be 3'),
+        (Geometry.cone, dict(dDetector=0), 'dDetector must be positive'),
+        (Geometry.cone, dict(angles=[]), 'at least one angle'),
+        (Geometry.cone, dict(tilt=np.nan), 'view 0 holds NaN'),
+        (Geometry.parallel, dict(offDetector=(1, 2, 3)), 'offDetector must be 2'),
+        (Geometry.helix, dict(pitch=np.nan), 'view 0 holds NaN'),
+    ],
+)
+def test_bad_numbers(make, change, match):
+    numbers = {'cone': CONE, 'parallel': PARALLEL, 'helix': CONE | dict(pitch=1.0)}[make.__name__]
+    with pytest.raises(InputError, match=match):
+        make(**numbers | change)
+
+
+# ---- what both kinds do ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('tilt', [0.0, 0.1])
+def test_methods_of_both_kinds(tilt):
+    g = Geometry.cone(**CONE, tilt=tilt, offDetector=(4.0, -5.0), offOrigin=(1.0, -2.0, 3.0))
+    kind, f = type(g), g.rays()
+    assert kind == (PosedGeometry if tilt else CircularGeometry)
+    some = g.subset([2, 0])
+    assert type(some) is kind and len(some) == 2
+    same_rays(some.rays(), f[[2, 0]])
+    both = some.joined(g)
+    assert type(both) is kind and len(both) == 5
+    same_rays(both.rays(), f[[2, 0, 0, 1, 2]])
+    finer = g.with_volume((10, 12, 14), 0.5)
+    assert type(finer) is kind and finer.nVoxel == (10, 12, 14) and finer.dVoxel == (0.5,) * 3
+    same_rays(finer.rays(), f, 0)
+    n = g.normalised_rays()
+    np.testing.assert_allclose(n.source, (f.source - (1, -2, 3)) * 2 / 21)
+    assert g.half.max() == 1
+
+
+@pytest.mark.parametrize('tilt', [0.0, 0.1])
+def test_binned_rays(tilt):
+    g = Geometry.cone(**CONE | dict(nDetector=(3, 23)), tilt=tilt, offDetector=(4.0, -5.0))
+    coarse, f = g.binned(4), g.rays()
+    assert g.bins(4) == (1, 4) and coarse.nDetector == (3, 5) and type(coarse) is type(g)
+    np.testing.assert_allclose(coarse.dDetector, (1.5, 8.0))
+    same_rays(coarse.rays(), Rays(f.source, f.corner, 4 * f.u, f.v, False))
+    same_rays(g.binned(1).rays(), f, 1e-12)
+    with pytest.raises(InputError, match='from 1 on'):
+        g.binned(0)
+
+
+def test_kinds_join():
+    circle, posed = Geometry.cone(**CONE), Geometry.cone(**CONE, tilt=0.1)
+    for a, b in ((circle, posed), (posed, circle)):
+        both = a.joined(b)
+        assert isinstance(both, PosedGeometry)
+        same_rays(both.rays(), a.rays().joined(b.rays()))
+
+
+# ---- TIGRE -------------------------------------------------------------------------------------------------
+
+
+def tigre(**changes):
+    """A geometry with TIGRE's names and order, as `tigre.geometry` has them."""
+    values = dict(
+        DSO=900.0,
+        DSD=1400.0,
+        nDetector=np.array([20, 24]),
+        dDetector=np.array([1.5, 2.0]),
+        sDetector=np.array([30.0, 48.0]),
+        nVoxel=np.array([7, 6, 5]),
+        dVoxel=np.array([3.0, 2.0, 1.0]),
+        sVoxel=np.array([21.0, 12.0, 5.0]),
+        accuracy=0.5,
+        mode=None,
+    )
+    return SimpleNamespace(**values | changes)
+
+
+def test_tigre_circle():
+    g = Geometry.from_tigre(tigre(offOrigin=np.array([3, -2, 1]), offDetector=np.array([4, -5])), ANGLES)
+    assert isinstance(g, CircularGeometry)
+    same_grid(g, Geometry.cone(**CONE, offOrigin=(1, -2, 3)))
+    same_rays(g.rays(), scanner(offDetector=(4.0, -5.0)), 0)
+    # TIGRE's own formulas for its first pixel: at the angle 0 the source is on x, u along y; its lowest row comes first, so
+    # that here it is the last.
+    f = Geometry.from_tigre(tigre(offDetector=np.array([4, -5])), [0.0]).rays()
+    np.testing.assert_allclose(f.source[0], [900, 0, 0])
+    lowest = f.corner[0] + 0.5 * f.u[0] + 19.5 * f.v[0]
+    np.testing.assert_allclose(lowest, [-(1400 - 900), 2.0 * (0 - 12 + 0.5) - 5, 1.5 * (0 - 10 + 0.5) + 4])
+
+
+def test_tigre_repeats_its_numbers():
+    """What `check_geo` makes of them: every number once a view, angles with two more that are zero."""
+    n = len(ANGLES)
+    geo = tigre(
+        DSO=np.full(n, 900.0),
+        DSD=np.full(n, 1400.0),
+        offOrigin=np.tile([3.0, -2.0, 1.0], (n, 1)),
+        offDetector=np.tile([4.0, -5.0], (n, 1)),
+        rotDetector=np.zeros((n, 3)),
+        COR=np.zeros(n),
+        mode='cone',
+    )
+    g = Geometry.from_tigre(vars(geo), np.stack([ANGLES, 0 * ANGLES, 0 * ANGLES], 1))
+    assert isinstance(g, CircularGeometry) and (g.DSO, g.DSD, g.offOrigin) == (900, 1400, (1, -2, 3))
+    same_rays(g.rays(), scanner(offDetector=(4.0, -5.0)), 0)
+
+
+def test_tigre_motion():
+    # rotDetector is about (x, y, z) there, (roll, pitch, yaw) about (z, y, x) here.
+    geo = tigre(rotDetector=np.array([0.1, -0.04, 0.05]), COR=2.0, DSO=np.array([900.0, 905.0, 910.0]))
+    g = Geometry.from_tigre(geo, ANGLES)
+    expected = scanner_rays(
+        ANGLES, [900, 905, 910], 1400, PANEL['nDetector'], PANEL['dDetector'], rotDetector=(0.05, -0.04, 0.1), COR=2.0
+    )
+    same_rays(g.rays(), expected)
+    # An in-plane turn about the beam, x at the angle 0: columns leave y towards +z.
+    f = Geometry.from_tigre(tigre(rotDetector=np.array([0.1, 0, 0])), [0.0]).rays()
+    np.testing.assert_allclose(f.u[0], 2 * np.array([0, np.cos(0.1), np.sin(0.1)]), atol=1e-12)
+    euler = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+    g = Geometry.from_tigre(tigre(), euler)
+    same_rays(g.rays(), scanner_rays(euler, 900, 1400, PANEL['nDetector'], PANEL['dDetector']))
+
+
+def test_tigre_moves_the_object():
+    """An offOrigin a view: the object at its place there is seen as TIGRE sees it."""
+    moves = np.array([[3.0, -2.0, 1.0], [0.0, 4.0, 2.0], [-1.0, 0.0, 5.0]])  # (z, y, x)
+    g = Geometry.from_tigre(tigre(offOrigin=moves), ANGLES)
+    np.testing.assert_allclose(g.offOrigin, moves.mean(0)[::-1])
+    point = np.array([2.0, -1.0, 3.0])
+    for view in range(3):
+        here = g.rays().project([point + g.offOrigin], view)
+        there = scanner().project([point + moves[view, ::-1]], view)
+        np.testing.assert_allclose(here, there, atol=1e-9)
+
+
+def test_tigre_parallel_and_sizes():
+    geo = tigre(mode='parallel', dDetector=None, dVoxel=None, DSO=None, DSD=None)
+    g = Geometry.from_tigre(geo, ANGLES)
+    same_grid(g, Geometry.parallel(**PARALLEL))
+    same_rays(g.rays(), scanner(True))
+    assert g.dDetector == (1.5, 2.0)
+
+
+@pytest.mark.parametrize(
+    'change, match',
+    [
+        (dict(DSO=None), 'has no DSO'),
+        (dict(nVoxel=None), 'has no nVoxel'),
+        (dict(offOrigin=np.zeros((2, 3))), 'offOrigin of the TIGRE geometry must be 3 numbers, or that for each of 3'),
+        (dict(DSO=2000.0), 'DSD >= DSO > 0'),
+        (dict(mode='fan'), 'mode must be'),
+    ],
+)
+def test_bad_tigre(change, match):
+    with pytest.raises(InputError, match=match):
+        Geometry.from_tigre(tigre(**change), ANGLES)
+
+
+# ---- ASTRA -------------------------------------------------------------------------------------------------
+
+
+VOLUME = dict(
+    GridColCount=5,
+    GridRowCount=6,
+    GridSliceCount=7,
+    option=dict(WindowMinX=-1.5, WindowMaxX=3.5, WindowMinY=-8.0, WindowMaxY=4.0, WindowMinZ=-7.5, WindowMaxZ=13.5),
+)
+SPACING = dict(DetectorSpacingX=2.0, DetectorSpacingY=1.5, DetectorRowCount=20, DetectorColCount=24)
+PLAIN = {
+    'cone': dict(type='cone', **SPACING, ProjectionAngles=ANGLES, DistanceOriginSource=900, DistanceOriginDetector=500),
+    'parallel3d': dict(type='parallel3d', **SPACING, ProjectionAngles=ANGLES),
+}
+
+
+def geom_2vec(proj_geom):
+    """What `astra.functions.geom_2vec` says of both types, by its documentation."""
+    rows = []
+    for a in proj_geom['ProjectionAngles']:
+        s, c = np.sin(a), np.cos(a)
+        if proj_geom['type'] == 'cone':
+            rows.append([900 * s, -900 * c, 0, -500 * s, 500 * c, 0, 2 * c, 2 * s, 0, 0, 0, 1.5])
+        else:
+            rows.append([s, -c, 0, 0, 0, 0, 2 * c, 2 * s, 0, 0, 0, 1.5])
+    return dict(type=proj_geom['type'] + '_vec', DetectorRowCount=20, DetectorColCount=24, Vectors=np.array(rows))
+
+
+@pytest.mark.parametrize('kind', PLAIN)
+def test_astra_circles(kind):
+    g = Geometry.from_astra(PLAIN[kind], VOLUME)
+    assert isinstance(g, CircularGeometry) and g.offOrigin == (1, -2, 3)
+    assert (g.nVoxel, g.dVoxel, g.nDetector, g.dDetector) == ((5, 6, 7), (1, 2, 3), (20, 24), (1.5, 2))
+    # The same by its vectors, whose rows are found to be a circle's once they are turned round.
+    again = Geometry.from_astra(geom_2vec(PLAIN[kind]), VOLUME)
+    assert isinstance(again, CircularGeometry)
+    same_grid(again, g)
+    same_rays(again.rays(), g.rays())
+    # And back: ASTRA's pixel (row, column) is ours (19 - row, column).
+    points = np.random.default_rng(0).uniform(-9, 9, (5, 3))
+    there = astra.from_vectors(geom_2vec(PLAIN[kind])['Vectors'], (20, 24), kind != 'cone')
+    back = astra.to_vectors(g.rays(), g.nDetector) * ([1] * 9 + [-1] * 3)
+    np.testing.assert_allclose(np.abs(back), np.abs(geom_2vec(PLAIN[kind])['Vectors']), atol=1e-9)
+    for view in range(3):
+        (x, y), (column, row) = g.rays().project(points, view), there.project(points, view)
+        np.testing.assert_allclose([x, 20 - y], [column, row], atol=1e-9)
+
+
+@pytest.mark.parametrize('parallel', [False, True])
+def test_astra_vectors_both_ways(parallel):
+    motion = MOTION | dict(height=[1.0, 5.0, -4.0]) | (dict(rotDetector=(0, 0, 0.1)) if parallel else {})
+    f = scanner(parallel, **motion)
+    vectors = astra.to_vectors(
+        Rays(f.source, f.corner + 20 * f.v, f.u, -f.v, parallel), (20, 24)
+    )  # rows up, as ASTRA's
+    proj = dict(type='parallel3d_vec' if parallel else 'cone_vec', DetectorRowCount=20, DetectorColCount=24)
+    for sign in (1, -1) if parallel else (1,):  # a parallel beam may be given either way
+        turned = vectors * ([sign] * 3 + [1] * 9)
+        g = Geometry.from_astra(proj | dict(Vectors=turned), **GRID)
+        assert isinstance(g, PosedGeometry) and g.nVoxel == (5, 6, 7)
+        same_rays(g.rays(), f)
+
+
+@pytest.mark.parametrize(
+    'proj, more, match',
+    [
+        (dict(type='fanflat'), dict(vol_geom=VOLUME), "must be of the type cone, .*not 'fanflat'"),
+        (dict(type='cone'), dict(vol_geom=VOLUME), 'has no Distance'),
+        (PLAIN['cone'], {}, 'either vol_geom or both'),
+        (PLAIN['cone'], dict(vol_geom=VOLUME, **GRID), 'either vol_geom or both'),
+        (PLAIN['cone'], dict(nVoxel=4), 'either vol_geom or both'),
+        (PLAIN['cone'], dict(vol_geom=dict(GridRowCount=4, GridColCount=4)), 'three dimensions'),
+        (dict(type='cone_vec', DetectorRowCount=2, DetectorColCount=2, Vectors=[[1, 2]]), GRID, '12 numbers'),
+    ],
+)
+def test_bad_astra(proj, more, match):
+    with pytest.raises(InputError, match=match):
+        Geometry.from_astra(proj, **more)
+
+
+# ---- RTK ---------------------------------------------------------------------------------------------------
+
+
+class Gantry:
+    """The methods of RTK's object that are read: its angles are in radians."""
+
+    def __init__(self, n=3, radius=0.0):
+        self.n, self.radius = n, radius
+
+    def __getattr__(self, name):
+        columns = dict(
+            GetSourceToIsocenterDistances=900.0,
+            GetSourceToDetectorDistances=1400.0,
+            GetGantryAngles=ANGLES[: self.n],
+            GetOutOfPlaneAngles=0.0,
+            GetInPlaneAngles=0.0,
+            GetProjectionOffsetsX=-5.0,
+            GetProjectionOffsetsY=4.0,
+            GetSourceOffsetsX=0.0,
+            GetSourceOffsetsY=0.0,
+        )
+        return lambda: tuple(np.broadcast_to(columns[name], self.n))
+
+    def GetRadiusCylindricalDetector(self):
+        return self.radius
+
+
+def test_rtk_object_and_file(tmp_path):
+    g = Geometry.from_rtk(Gantry(), **PANEL, **GRID, offOrigin=(1, -2, 3))
+    assert isinstance(g, CircularGeometry)
+    same_grid(g, Geometry.cone(**CONE, offOrigin=(1, -2, 3)))
+    same_rays(g.rays(), scanner(offDetector=(4.0, -5.0)))
+    f = scanner(**MOTION)
+    rtk.write(tmp_path / 'g.xml', f, PANEL['nDetector'])
+    for path in (tmp_path / 'g.xml', str(tmp_path / 'g.xml')):
+        again = Geometry.from_rtk(path, **PANEL, **GRID)
+        assert isinstance(again, PosedGeometry)
+        same_rays(again.rays(), f)
+
+
+def test_bad_rtk(tmp_path):
+    for source, match in (
+        (Gantry(radius=900.0), 'RadiusCylindricalDetector is not supported'),
+        (Gantry(0), 'holds no projections'),
+        (tmp_path / 'gone.xml', 'no such file'),
+    ):
+        with pytest.raises(InputError, match=match):
+            Geometry.from_rtk(source, **PANEL, **GRID)
