@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.runtime import use_variant
 
 matplotlib.use('agg')
-import matplotlib.pyplot as plt  # noqa: E402 - after the backend is chosen
+import matplotlib.pyplot as plt
 
 FIGURES = Path(__file__).resolve().parent / 'figures'
 VIEWS, ITERATIONS, ALL_VIEWS = 25, 800, 100
@@ -59,7 +59,9 @@ def lingo_steps(data, start, fitted, settings):
     resolution = settings.occupancy_voxels
     low, _ = valid_voxels(rays, found, (resolution,) * 3, geometry.half)
     coarse.imshow(depth(low, (resolution,) * 3), cmap='Blues')
-    coarse.set_title(f'2  occupancy on {resolution}³ cells\nP = {start.info["P"]:.3f}, scaled by S = {start.info["S"]:.2f}')
+    coarse.set_title(
+        f'2  occupancy on {resolution}³ cells\nP = {start.info["P"]:.3f}, scaled by S = {start.info["S"]:.2f}'
+    )
 
     grid = scaled_grid(geometry.nVoxel, start.info['S'])
     low, high = valid_voxels(rays, found, grid, geometry.half)
