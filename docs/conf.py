@@ -1,8 +1,8 @@
 """Sphinx's settings: `python -m sphinx -W -b html docs build/site` builds the site, warnings being errors."""
 
+import importlib.metadata
 import os
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -12,11 +12,11 @@ os.environ.setdefault('COLUMNS', '100')  # width of the command line's help
 import lingo_mi  # noqa: E402 - from the folder above
 
 project = 'lingo_mi'
-author = 'the authors of lingo_mi'
-copyright = f'2026, {author}'  # noqa: A001 - Sphinx's name
+author = 'the lingo_mi developers'
+copyright = f'2026, {author}'
 try:
-    release = version('lingo_mi')
-except PackageNotFoundError:
+    release = importlib.metadata.version('lingo_mi')
+except importlib.metadata.PackageNotFoundError:
     release = lingo_mi.__version__
 
 extensions = [
@@ -27,6 +27,7 @@ extensions = [
     'plain_docstrings',
     'plugin_pages',
     'command_help',
+    'recipes',
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
 # The page of the public API needs it; a list of modules stands in for it where `lingo_mi` does not offer it.

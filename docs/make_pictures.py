@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.runtime import use_variant
 
 matplotlib.use('agg')
-import matplotlib.pyplot as plt  # noqa: E402 - after the backend is chosen
+import matplotlib.pyplot as plt
 
 FIGURES = Path(__file__).resolve().parent / 'figures'
 VIEWS, ITERATIONS, ALL_VIEWS = 25, 800, 100

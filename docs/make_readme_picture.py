@@ -20,7 +20,7 @@ from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import read_volume
 
 matplotlib.use('agg')
-import matplotlib.pyplot as plt  # noqa: E402 - after the backend is chosen
+import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parents[1]
 VOLUME = 'chest_lidc0314.nii.gz'

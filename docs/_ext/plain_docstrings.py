@@ -2,7 +2,7 @@
 
 What is plain in them, and what it becomes:
 
-    name   what it is             a list of names and meanings, where two or more spaces follow a name;
+    name   what it is             a list of names and meanings, where two or more spaces or a line's end follow a name;
            and goes on            further lines are indented
         code = example()          a block of Python, where a paragraph is indented and is no list of names
     |A x - b|, rate_*             characters of reStructuredText, which lose their meaning outside of `backticks`
@@ -15,7 +15,7 @@ import inspect
 import re
 
 _NAME = r'`?[A-Za-z_|][\w.|/=\'-]*`?'
-ENTRY = re.compile(rf'^({_NAME}(?:, {_NAME})*)(?:\s{{2,}}|\s+:\s+)(\S.*)$')
+ENTRY = re.compile(rf'^({_NAME}(?:, {_NAME})*)(?:(?:\s{{2,}}|\s+:\s+)(\S.*))?$')
 RST = re.compile(r'^\s*\.\. |:\w+:`|^:param|^:return|^>>>', re.MULTILINE)
 QUOTED = re.compile(r'(``.+?``|`[^`\n]+`)')
 
@@ -33,7 +33,7 @@ def _block(lines: list[str]) -> str:
     """A paragraph, a list of names, or code."""
     indent = min(len(line) - len(line.lstrip()) for line in lines)
     bare = [line[indent:] for line in lines]
-    starts = [i for i, line in enumerate(bare) if ENTRY.match(line)]
+    starts = [i for i, line in enumerate(bare) if _starts_entry(line, bare[i + 1 : i + 2])]
     if starts and all(i in starts or bare[i].startswith('  ') for i in range(starts[0], len(bare))):
         before = [escaped(' '.join(line.strip() for line in bare[: starts[0]])), ''] if starts[0] else []
         entries = [bare[i:j] for i, j in zip(starts, [*starts[1:], len(bare)])]
@@ -43,15 +43,21 @@ def _block(lines: list[str]) -> str:
         return f'.. code-block:: {language}\n\n' + '\n'.join(f'    {line}' for line in bare)
     if all(line.startswith('- ') or line.startswith('  ') for line in bare):
         return '\n'.join(escaped(line) for line in bare)
-    head = next((i for i, line in enumerate(bare) if line.startswith('    ')), len(bare))
+    head = next((i for i, line in enumerate(bare) if i and line.startswith('    ')), len(bare))
     text = escaped('\n'.join(line.strip() for line in bare[:head]))
     return text if head == len(bare) else f'{text}\n\n{_block(bare[head:])}'
+
+
+def _starts_entry(line: str, following: list[str]) -> bool:
+    """Whether names stand at the start of a line, with their meaning behind them or indented below."""
+    found = ENTRY.match(line)
+    return bool(found and (found[2] or following and following[0].startswith('    ')))
 
 
 def _entry(lines: list[str]) -> str:
     """One name, or several, and what is said of it."""
     names, first = ENTRY.match(lines[0]).groups()
-    meaning = escaped(' '.join([first, *(line.strip() for line in lines[1:])]))
+    meaning = escaped(' '.join([first or '', *(line.strip() for line in lines[1:])]).strip())
     title = ', '.join(f'``{name.strip("`")}``' for name in names.split(', '))
     return f'{title}\n    {meaning}\n'
 

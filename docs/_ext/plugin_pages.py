@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 from docutils import nodes
-from docutils.parsers.rst import Directive, directives
+from docutils.parsers.rst import Directive
 from docutils.parsers.rst.directives.tables import ListTable
 from docutils.statemachine import StringList
 from sphinx.util.nodes import nested_parse_with_titles
@@ -29,7 +29,7 @@ class PluginParameters(ListTable):
         self.options.setdefault('widths', [18, 14, 68])
         self.options.setdefault('class', ['plugin-parameters'])
         source = self.content.source(0) if self.content else ''
-        head = StringList([' * - Parameter', '   - Type', '   - Meaning'], source=source)
+        head = StringList(['* - Parameter', '  - Type', '  - Meaning'], source=source)
         self.content = head + self.content
         return super().run()
 
@@ -38,7 +38,6 @@ class Plugin(Directive):
     """The docstring of a plugin, as sections of the page."""
 
     required_arguments = 1
-    option_spec = {'heading': directives.unchanged}
 
     def run(self):
         path = PLUGINS / f'{self.arguments[0]}.py'
