@@ -44,7 +44,7 @@ def ours(geometry, scan, volume):
     import mitsuba as mi
 
     from lingo_mi.projectors.joseph import Joseph
-    from lingo_mi.reconstruction.fdk import fdk
+    from lingo_mi.reconstruction.fdk import FDK
     from lingo_mi.reconstruction.sart import blocks, sweep
     from lingo_mi.reconstruction.system import System
 
@@ -64,7 +64,7 @@ def ours(geometry, scan, volume):
         dr.eval(x)
         return system.volume(x)
 
-    return dict(projector=project, transpose=transpose, FDK=lambda: fdk(scan), SART=sart)
+    return dict(projector=project, transpose=transpose, FDK=lambda: FDK().run(scan).volume, SART=sart)
 
 
 def rtk(geometry, scan, volume, cores):

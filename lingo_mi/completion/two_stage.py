@@ -20,8 +20,9 @@ from lingo_mi.fit.state import State
 from lingo_mi.fit.step import Stepper
 from lingo_mi.geometry.base import Geometry, spread
 from lingo_mi.projectors.objects import Ellipsoids, find_objects
+from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.effects_correction import corrected
-from lingo_mi.reconstruction.views import gaps, require_circle
+from lingo_mi.reconstruction.preconditions import require_circle
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.description import MOST_VIEWS

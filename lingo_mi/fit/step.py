@@ -21,7 +21,7 @@ from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
-from lingo_mi.reconstruction.views import require_signal
+from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.scan import Scan
 
 

@@ -13,26 +13,27 @@ from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import SAME, Geometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays, scanner_rays
-from lingo_mi.reconstruction.views import gaps, require_pixels
+from lingo_mi.reconstruction.arcs import gaps
+from lingo_mi.reconstruction.preconditions import require_pixels
 from lingo_mi.scan import Scan
 
 MOVES = 0.1  # of the panel's size by which its shadow may move from view to view
 
 
-def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
+def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     """The scan on a panel that is the same in all views: columns along z, rows along the source's circle, in its middle the
     ray through the axis.
 
     scan   all pixels valid; the source moves on a circle about z around the origin, the panel with it
     what   needs such a panel, for messages
 
-    The geometry is `upright_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
+    The geometry is `rectified_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
     real panel on. A scan on a circle before an upright panel is returned as it is.
 
     Raises InputError for pixels that are not valid, and for a source or a panel that moves otherwise.
     """
     require_pixels(scan, what)
-    geometry, (n_v, n_u) = upright_geometry(scan.geometry, what), scan.geometry.nDetector
+    geometry, (n_v, n_u) = rectified_geometry(scan.geometry, what), scan.geometry.nDetector
     if geometry is scan.geometry:
         return scan
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in geometry.nDetector[::-1]))
@@ -48,17 +49,17 @@ def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
     return Scan(geometry, out)
 
 
-def is_circular(scan: Scan) -> bool:
-    """Whether `upright` knows the scan."""
+def can_rectify(scan: Scan) -> bool:
+    """Whether `rectified` knows the scan: an upright panel before a source on a circle, turned and tilted ones too."""
     try:
         require_pixels(scan, '')
-        upright_geometry(scan.geometry)
+        rectified_geometry(scan.geometry)
     except InputError:
         return False
     return True
 
 
-def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
+def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
     """The same rays before an upright panel that holds the real panel's shadow of all views, with pixels no coarser.
 
     Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side
@@ -70,7 +71,7 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     if geometry.poses is None:
         return geometry
     frames, (n_v, n_u) = geometry.poses, geometry.nDetector
-    DSO, DSD, angles = _circle(geometry, what)
+    DSO, DSD, angles = _circle(geometry, frames, what)
     # Its positions are mm from the central ray, along the circle and downwards.
     plane = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), frames.parallel)
     corners = np.array([[0, n_u, 0, n_u], [0, 0, n_v, n_v], [1, 1, 1, 1]], float)
@@ -96,10 +97,11 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
             right = max(right, -left)
             left = -right
     step_u, step_v = _steps(_homographies(plane, frames), shadow)
+    rows, columns = (int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u))
     return Geometry(
         DSO,
         DSD,
-        tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
+        (rows, columns),
         (step_v, step_u),
         geometry.nVoxel,
         geometry.dVoxel,
@@ -110,9 +112,9 @@ def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geom
     )
 
 
-def _circle(geometry: Geometry, what: str):
-    """DSO, the mean DSD and the angles [view] of the circle about z that the source moves on, InputError where it does not."""
-    frames = geometry.poses
+def _circle(geometry: Geometry, frames: Rays, what: str):
+    """DSO, the mean DSD and the angles [view] of the circle about z that the source of `frames` moves on, InputError where it
+    does not."""
     out = -frames.source if frames.parallel else frames.source
     angles = np.arctan2(out[:, 1], out[:, 0])
     DSO = 0.0 if frames.parallel else float(np.linalg.norm(out[:, :2], axis=1).mean())
