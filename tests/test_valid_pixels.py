@@ -18,7 +18,7 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import Settings, initialise
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
-from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -106,7 +106,7 @@ def test_files_keep_the_mask(tmp_path, scan):
 
 def test_filtered_backprojection_needs_every_pixel(scan):
     with pytest.raises(InputError, match='needs every pixel'):
-        fdk(Scan(scan.geometry, scan.projections, patches(scan)))
+        FDK().run(Scan(scan.geometry, scan.projections, patches(scan)))
 
 
 # ---- the initial cloud -------------------------------------------------------------------------------------

@@ -22,21 +22,27 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
-
 from lingo_mi.cli.common import Parser, check_input, definitions, input_arguments, read_input, writable_file
+from lingo_mi.completion.clouds import load_cloud
+from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.parsing import parse
+from lingo_mi.reconstruction import ALGORITHMS, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction.effects_correction import linearised
+from lingo_mi.reconstruction.preconditions import require_signal
+from lingo_mi.results.measure import compared, volume_quality
 from lingo_mi.runtime import use_variant
+from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
 
-ALGORITHMS = ('fdk', 'sart', 'os-sart', 'sirt', 'cgls', 'asd-pocs', 'refined', 'voxelize')
+FROM_CLOUD = 'refined', 'voxelize'  # algorithms that nothing can be done by without a cloud
 
 
 def arguments():
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
-    p.add_argument('--algorithm', choices=ALGORITHMS, default='fdk', help='(default: fdk)')
+    p.add_argument('--algorithm', choices=(*ALGORITHMS, 'voxelize'), default='fdk', help='(default: fdk)')
     p.add_argument(
         '--views',
         type=int,
@@ -67,7 +73,7 @@ def arguments():
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi/recon), or of '
+        help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi.reconstruction), or of '
         'the scene file; effects=ignore takes projections for line integrals',
     )
     return p.parse_args()
@@ -80,45 +86,12 @@ def output(path: Path, force: bool) -> Path:
     return writable_file(path, force)
 
 
-def options(function, given: dict[str, str]) -> dict:
-    """The -D values of an algorithm's own parameters, with the types of their defaults."""
-    from lingo_mi.reconstruction.system import options_of
-
-    known, out = options_of(function), {}
-    for name, text in given.items():
-        if name not in known:
-            raise InputError(
-                f'-D {name}: neither a parameter of the scene nor of {function.__name__} '
-                f'({", ".join(known) or "it has none"})'
-            )
-        out[name] = parse(f'-D {name}', text, 0.0 if known[name] is None else known[name])
-    return out
-
-
-def main():
-    args = arguments()
-    use_variant(args.variant)
-    from lingo_mi.completion.clouds import load_cloud
-    from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
-    from lingo_mi.files.volumes import first_voxel, write_volume
-    from lingo_mi.geometry.base import CircularGeometry
-    from lingo_mi.progress import Progress
-    from lingo_mi.reconstruction.asd_pocs import asd_pocs
-    from lingo_mi.reconstruction.cgls import cgls
-    from lingo_mi.reconstruction.effects_correction import linearised
-    from lingo_mi.reconstruction.fdk import fdk
-    from lingo_mi.reconstruction.refined import refined
-    from lingo_mi.reconstruction.sart import os_sart, sart, sirt
-    from lingo_mi.reconstruction.views import require_signal
-    from lingo_mi.results.measure import compared, volume_quality
-    from lingo_mi.scene.load import defaults, load_scene
-    from lingo_mi.scene.truth import voxelize_cloud
-
+def check_arguments(args):
+    """Raises InputError where the arguments contradict each other."""
     check_input(args)
     if args.seed is not None and args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
-    from_cloud = args.algorithm in ('refined', 'voxelize')
-    if from_cloud and not (args.complete or args.start and args.algorithm == 'refined'):
+    if args.algorithm in FROM_CLOUD and not (args.complete or args.start and args.algorithm == 'refined'):
         raise InputError(
             f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete'
             + (' or --start' if args.algorithm == 'refined' else '')
@@ -131,16 +104,25 @@ def main():
         raise InputError(
             '--start is for an iterative --algorithm and the views of its fit: leave out --complete and --views'
         )
-    run = {
-        'fdk': fdk,
-        'sart': sart,
-        'os-sart': os_sart,
-        'sirt': sirt,
-        'cgls': cgls,
-        'asd-pocs': asd_pocs,
-        'refined': refined,
-        'voxelize': voxelize_cloud,
-    }[args.algorithm]
+
+
+def algorithm_of(name: str, given: dict[str, str]) -> Algorithm | None:
+    """The algorithm of this name with the -D values of its options, which have the types of their defaults; None: voxelize."""
+    made = ALGORITHMS.get(name)
+    known, options = made().options if made else {}, {}
+    for option, text in given.items():
+        if option not in known:
+            raise InputError(
+                f'-D {option}: neither a parameter of the scene nor of {name} ({", ".join(known) or "it has none"})'
+            )
+        options[option] = parse(f'-D {option}', text, 0.0 if known[option] is None else known[option])
+    return made(**options) if made else None
+
+
+def main():
+    args = arguments()
+    use_variant(args.variant)
+    check_arguments(args)
     args.scene = scene_path(args.scene)
     defined, own = definitions(args.define), defaults(args.scene)
     chosen = {k: v for k, v in defined.items() if k not in own}
@@ -149,12 +131,13 @@ def main():
         raise InputError(
             f"-D effects={effects}: must be 'model' or 'ignore', and with --complete or --start goes by the fit"
         )
-    given = options(run, chosen)
-    finer = given.get('finer', 1)
+    if args.start and args.algorithm == 'refined':  # there are no completed views
+        chosen = dict(completed_niter='0') | chosen
+    algorithm = algorithm_of(args.algorithm, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
-    if (from_cloud or args.start) and not hasattr(cloud, 'gaussians'):
+    if (args.algorithm in FROM_CLOUD or args.start) and not hasattr(cloud, 'gaussians'):
         raise InputError(
             f'{args.complete or args.start}: opacities and radiances make no volume; '
             + ('leave out --start' if args.start else 'take another --algorithm')
@@ -162,79 +145,36 @@ def main():
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
     views = len(cloud.geometry) if cloud else args.views
     if not (args.projections or args.volume):  # their geometry is not known before they are read
-        check_scan(scene.scanner.geometry, views, args.algorithm, finer)
+        check_scan(scene.scanner.geometry, algorithm, views)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0)
-    scan = dataset.train
-    check_scan(scan.geometry, views, args.algorithm, finer)
-    if args.algorithm != 'voxelize':
-        require_signal(scan)
-
-    def sample(geometry):
-        return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
-
-    began = time.monotonic()
-    if args.algorithm == 'voxelize':
-        volume, residuals = sample(scan.geometry), []
+    scan, inputs = dataset.train, {}
+    check_scan(scan.geometry, algorithm, views)
+    if algorithm is None:
+        began = time.perf_counter()
+        volume = sampled(cloud)(scan.geometry)
+        found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
+        of = f'a cloud fitted to {views}'
     else:
+        require_signal(scan)
         if args.complete:
-            measured = fitted_views(dataset, cloud.geometry)
-            on_circle = [isinstance(g, CircularGeometry) for g in (measured.geometry, cloud.corrected)]
-            if args.algorithm == 'fdk' and on_circle == [True, False]:
-                raise InputError(
-                    'filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
-                    'take another --algorithm'
-                )
-            check_scan(measured.geometry, args.views, args.algorithm, finer)
-            scan = complete(measured, cloud, args.views)
-            if args.algorithm == 'refined':
-                given |= dict(completed=scan, sample=sample)
-                scan = scan.subset(np.arange(len(measured)))
+            scan, inputs = prepare_completed(dataset, cloud, args.views, algorithm)
         elif args.start:
-            scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
-            if args.algorithm == 'refined':
-                given = dict(completed_niter=0, sample=sample) | given
-            else:
-                given['init'] = sample(scan.geometry)
+            scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
-        began = time.monotonic()
-        volume, residuals = reconstruct(run, scan, given, Progress)
-    seconds = time.monotonic() - began
-    geometry = scan.geometry
+        with progress_bar(algorithm, scan) as progress:
+            found = reconstruct(scan, algorithm, progress=progress, **inputs)
+        of = len(scan)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_volume(out, volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
-    of = f'a cloud fitted to {views}' if args.algorithm == 'voxelize' else len(scan)
+    write_volume(out, found.volume, found.geometry.dVoxel, first_voxel(found.geometry), 'density per mm')
     print(
-        f'{args.algorithm} of {of} views: {seconds:.1f} s'
-        + (f', |A x - b| / |b| = {residuals[-1]:.4g} after {len(residuals) - 1} iterations' if residuals else '')
+        f'{args.algorithm} of {of} views: {found.seconds:.1f} s'
+        + (
+            f', |A x - b| / |b| = {found.residuals[-1]:.4g} after {len(found.residuals) - 1} iterations'
+            if found.residuals
+            else ''
+        )
     )
     if dataset.volume is not None:
-        print(volume_quality(compared(volume, dataset.volume)))
+        print(volume_quality(compared(found.volume, dataset.volume)))
     print(out)
-
-
-def check_scan(geometry, views: int | None, algorithm: str, finer: int):
-    """Whether so many views of a scan (None: its own) see the volume, and the algorithm has the memory for them, on `finer`
-    times as many voxels a side."""
-    from lingo_mi.reconstruction.refined import divided
-    from lingo_mi.reconstruction.requirements import NEEDS, needed
-    from lingo_mi.reconstruction.views import require_rays
-    from lingo_mi.scene.checks import check_memory
-
-    require_rays(geometry)
-    geometry, views = divided(geometry, finer), views or len(geometry)
-    check_memory(geometry, views=views, needed=needed(algorithm, geometry, views) if algorithm in NEEDS else 0)
-
-
-def reconstruct(run, scan, given, Progress):
-    """Volume and residual history of an algorithm, with a progress bar."""
-    from lingo_mi.reconstruction.system import options_of
-
-    total = sum(n for name, n in (options_of(run) | given).items() if name.endswith('niter')) or len(scan)
-    with Progress(run.__name__, total) as bar:
-
-        def progress(done, _, residual=None):
-            bar.update(done, residual=residual)
-
-        result = run(scan, **given, progress=progress)
-    return (result, []) if run.__name__ == 'fdk' else (result.volume, result.residuals)

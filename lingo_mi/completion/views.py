@@ -11,8 +11,9 @@ from lingo_mi.errors import InputError
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
+from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.effects_correction import corrected
-from lingo_mi.reconstruction.views import gaps, require_circle
+from lingo_mi.reconstruction.preconditions import require_circle
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.description import MOST_VIEWS

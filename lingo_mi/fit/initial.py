@@ -17,8 +17,8 @@ from lingo_mi.fit.state import start
 from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.lingo import initialise as lingo
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.rectify import is_circular
+from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.scan import Scan
 
 
@@ -38,7 +38,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     elif settings.init == 'cuboid':
         cloud = cuboid(g.nVoxel, g.half, settings.cuboid_step)
     elif settings.init == 'r2':
-        volume = fdk(scan) / unit
+        volume = FDK().run(scan).volume / unit
         cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, settings.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)
     else:
@@ -48,9 +48,9 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             return CloudModel(settings, g, unit).render(state, g.subset(views)) * g.scale
 
         chosen = settings.of_start()
-        if chosen.density == 'fdk' and not is_circular(scan):
+        if chosen.density == 'fdk' and not can_rectify(scan):
             chosen = replace(chosen, density='lsq')
-        volume = fdk(scan) if chosen.density == 'fdk' else None
+        volume = FDK().run(scan).volume if chosen.density == 'fdk' else None
         cloud = lingo.initialise(
             g.normalised_rays(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume, scan.valid
         )

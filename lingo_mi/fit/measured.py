@@ -9,7 +9,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.fit.settings import Settings
 from lingo_mi.reconstruction import effects_correction as corrections
-from lingo_mi.reconstruction.views import require_signal
+from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.scan import Scan
 
 

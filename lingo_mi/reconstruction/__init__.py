@@ -1,1 +1,38 @@
-"""Volumes on voxels: filtered backprojection, iterative algorithms, and the refinement of a cloud's volume."""
+"""Volumes on voxels: filtered backprojection, iterative algorithms, and the refinement of a cloud's volume.
+
+    from lingo_mi.reconstruction import SART, reconstruct
+    found = reconstruct(scan, SART(niter=5))
+    found.volume, found.residuals, found.seconds
+
+An algorithm is an object of its options, which are checked when it is made, and `run` makes a `Reconstruction` of a scan with
+it. `reconstruct` does the same after it has asked whether the scan sees the volume and the memory suffices. A variant of Mitsuba
+must be active.
+"""
+
+from lingo_mi.reconstruction.algorithm import Algorithm, Reconstruction
+from lingo_mi.reconstruction.asd_pocs import ASDPOCS
+from lingo_mi.reconstruction.cgls import CGLS
+from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.refined import Refined
+from lingo_mi.reconstruction.run import check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction.sart import OSSART, SART, SIRT
+
+ALGORITHMS: dict[str, type[Algorithm]] = {
+    algorithm.name: algorithm for algorithm in (FDK, SART, OSSART, SIRT, CGLS, ASDPOCS, Refined)
+}
+
+__all__ = [
+    'ALGORITHMS',
+    'ASDPOCS',
+    'CGLS',
+    'FDK',
+    'OSSART',
+    'SART',
+    'SIRT',
+    'Algorithm',
+    'Reconstruction',
+    'Refined',
+    'check_scan',
+    'progress_bar',
+    'reconstruct',
+]

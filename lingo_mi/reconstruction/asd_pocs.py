@@ -1,30 +1,22 @@
-"""ASD-POCS: SART steps towards the data, then steepest descent on total variation, in balance.
-
-Sidky and Pan, "Image reconstruction in circular cone-beam computed tomography by constrained, total-variation
-minimization", Phys. Med. Biol. 53 (2008), algorithm of section 2.3; the defaults of lmbda, lmbda_red, tviter, alpha,
-alpha_red, rmax and blocksize are TIGRE's.
-"""
+"""ASD-POCS: SART steps towards the data, then steepest descent on total variation, in balance."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
 import drjit as dr
 import mitsuba as mi
+from numpy.typing import ArrayLike
 
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.rectify import is_circular
+from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_order, check_range
+from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.sart import passes, sweep
-from lingo_mi.reconstruction.system import (
-    LARGE,
-    Reconstruction,
-    System,
-    check_bound,
-    check_counts,
-    check_range,
-    dot,
-    evaluated,
-    norm,
-    scalar,
-)
+from lingo_mi.reconstruction.system import System, dot, evaluated, norm, scalar
 from lingo_mi.scan import Scan
 
 EPSILON = 1e-8  # added to the squared gradient, relative to its largest value before a pass's descent: TV is not smooth at zero
@@ -82,114 +74,122 @@ def minimise_tv(volume, size, step: float, tviter: int):
     return volume
 
 
-def check_parameters(
-    *, niter, tviter, alpha, alpha_red, rmax, maxl2err, exact_every, seed, blocksize=1, lmbda=1.0, lmbda_red=1.0
-):
-    """Raises InputError for a parameter of `asd_pocs` out of its range."""
-    check_counts(niter=niter, blocksize=blocksize, tviter=tviter)
-    check_counts(least=0, exact_every=exact_every, seed=seed)
-    for name, value, high in (
-        ('lmbda', lmbda, 2),
-        ('lmbda_red', lmbda_red, 1),
-        ('alpha', alpha, LARGE),
-        ('alpha_red', alpha_red, 1),
-        ('rmax', rmax, LARGE),
-    ):
-        check_range(name, value, 0, high)
-    if maxl2err is not None:
-        check_bound('maxl2err', maxl2err)
+@dataclass(frozen=True)
+class ASDPOCS(Algorithm):
+    """Adaptive steepest descent, projection onto convex sets: of the volumes that meet the data, one of little total variation.
 
+    Each pass P of `OSSART` towards the data is followed by `tviter` steps down the total variation TV,
 
-def asd_pocs(
-    scan: Scan,
-    niter: int = 50,
-    blocksize: int = 1,
-    lmbda: float = 1.0,
-    lmbda_red: float = 0.99,
-    tviter: int = 20,
-    alpha: float = 0.002,
-    alpha_red: float = 0.95,
-    rmax: float = 0.95,
-    maxl2err: float | None = None,
-    noneg: bool = True,
-    OrderStrategy: str = 'random',
-    exact_every: int = 0,
-    init=None,
-    weights=None,
-    blur=None,
-    seed: int = 0,
-    progress=None,
-) -> Reconstruction:
-    """Adaptive steepest descent, projection onto convex sets.
+        x  <-  P(x),        x  <-  x - step grad TV(x) / |grad TV(x)|,  tviter times
 
-    scan         projections and geometry
-    niter        passes over all views, at most
-    blocksize    views an update of the data step (1: SART, else OS-SART)
-    lmbda        relaxation of the data step, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
-    tviter       steepest-descent steps on total variation a pass
-    alpha        length of these steps over the change of the first data step
-    alpha_red    factor on the step length where total variation changed more than `rmax` times what the data changed,
-                 while the data are not met
-    rmax         see `alpha_red`
-    maxl2err     |A x - b| at which the data count as met, density times mm (default: 0.2 |A fdk(b) - b|; 0 for scans that FDK
-                 does not know, so that the step shortens wherever total variation changes too much)
-    noneg        whether negative densities are set to zero by the data step
-    OrderStrategy
-                 of the blocks, see `os_sart`
-    exact_every  passes between corrections of the projections for what Joseph's projector is off (`System.correct`), before the
-                 first pass and after every so many; 0 for none
-    init         start volume [x, y, z], density per mm (default: zero)
-    weights      of the voxels in the data step, see `os_sart`
-    blur         of what a data step changes, see `os_sart`
-    seed         of the random order
-    progress     called as progress(passes done, niter, residual)
+    The first step is `alpha` times what the first P has changed. It shrinks by `alpha_red` wherever the descent changes the
+    volume by more than `rmax` of what P does, while the data are not met yet.
 
-    Stops where the data are met and both steps undo each other (cosine below -0.99), or lmbda falls below 0.005. The
-    volume is the one after descent, as TIGRE's; the residuals are those of the data steps before it.
+    niter           passes over all views, from 1 on; fewer where it stops
+    blocksize       views an update of P (1: SART, else OS-SART)
+    lmbda           relaxation of P, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
+    lmbda_red       0 < lmbda_red <= 1
+    tviter          steps of steepest descent a pass, from 1 on
+    alpha           length of the first of them over the change by the first P, above 0
+    alpha_red       factor on the length, 0 < alpha_red <= 1
+    rmax            change by descent over that by P, above 0
+    maxl2err        |A x - b| at which the data count as met, density times mm, from 0 on. None: 0.2 |A fdk(b) - b|, and 0 for
+                    scans that FDK does not know, so that the step shrinks wherever total variation changes too much
+    noneg           whether P sets negative densities to zero
+    OrderStrategy   of the blocks, see `OSSART`
+    exact_every     passes between corrections of the projections for what Joseph's projector is off (`System.correct`), before
+                    the first pass and after every so many; 0 for none
+    seed            of the random order, from 0 on
 
-    Raises InputError for a parameter out of its range, a start volume that does not fit, and where the result is not finite.
+    It stops where the data are met and both parts of a pass undo each other (cosine below -0.99), or lmbda falls below 0.005.
+    The volume is the one after descent, as TIGRE's; the residuals are those before it.
+
+    Prefer it for few views of objects with large even regions. maxl2err says how well to meet noisy projections.
+
+        >>> from lingo_mi.phantoms import make, x3d_scan
+        >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
+        >>> found = ASDPOCS(niter=5).run(measured)
+        >>> len(found.residuals), found.residuals[-1] < 0.05
+        (6, True)
+
+    Sidky and Pan, "Image reconstruction in circular cone-beam computed tomography by constrained, total-variation minimization",
+    Phys. Med. Biol. 53 (2008), algorithm of section 2.3; the defaults of lmbda, lmbda_red, tviter, alpha, alpha_red, rmax and
+    blocksize are TIGRE's. Raises InputError for an option out of its range.
     """
-    check_parameters(
-        niter=niter,
-        tviter=tviter,
-        alpha=alpha,
-        alpha_red=alpha_red,
-        rmax=rmax,
-        maxl2err=maxl2err,
-        exact_every=exact_every,
-        seed=seed,
-        blocksize=blocksize,
-        lmbda=lmbda,
-        lmbda_red=lmbda_red,
-    )
-    order, size = passes(scan.geometry.angles, blocksize, OrderStrategy, seed), scan.geometry.nVoxel
-    system = System(scan, weights, blur)
-    x = system.start(init)
-    if maxl2err is None:
-        maxl2err = 0.2 * system.residual(system.start(fdk(scan)))[1] * system.size_b if is_circular(scan) else 0.0
-    residuals = [system.residual(x)[1]]
-    step = None
-    for k in range(niter):
-        if exact_every and k % exact_every == 0:
-            system.correct(x)
-        start = x
-        x = sweep(system, x, lmbda, next(order), noneg)
-        residuals.append(system.residual(x)[1])
-        error = residuals[-1] * system.size_b
-        data_change = evaluated(x - start)
-        data_length = norm(data_change)
-        if step is None:
-            step = alpha * data_length
-        start = x
-        x = minimise_tv(x, size, step, tviter)
-        tv_change = evaluated(x - start)
-        tv_length = norm(tv_change)
-        if tv_length > rmax * data_length and error > maxl2err:
-            step *= alpha_red
-        lmbda *= lmbda_red
-        if progress:
-            progress(k + 1, niter, residuals[-1])
-        cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
-        if (cosine < -0.99 and error <= maxl2err) or lmbda < LMBDA_MIN:
-            break
-    return Reconstruction(system.volume(x), residuals)
+
+    name: ClassVar[str] = 'asd-pocs'
+
+    niter: int = 50
+    blocksize: int = 1
+    lmbda: float = 1.0
+    lmbda_red: float = 0.99
+    tviter: int = 20
+    alpha: float = 0.002
+    alpha_red: float = 0.95
+    rmax: float = 0.95
+    maxl2err: float | None = None
+    noneg: bool = True
+    OrderStrategy: str = 'random'
+    exact_every: int = 0
+    seed: int = 0
+
+    def __post_init__(self):
+        check_counts(niter=self.niter, blocksize=self.blocksize, tviter=self.tviter)
+        check_counts(least=0, exact_every=self.exact_every, seed=self.seed)
+        check_range('lmbda', self.lmbda, 0, 2)
+        check_range('lmbda_red', self.lmbda_red, 0, 1)
+        check_range('alpha', self.alpha, 0, LARGE)
+        check_range('alpha_red', self.alpha_red, 0, 1)
+        check_range('rmax', self.rmax, 0, LARGE)
+        check_order(self.OrderStrategy)
+        if self.maxl2err is not None:
+            check_bound('maxl2err', self.maxl2err)
+
+    def run(
+        self,
+        scan: Scan,
+        *,
+        start: ArrayLike | None = None,
+        progress: Progress | None = None,
+        weights: ArrayLike | None = None,
+        blur: Sequence[float] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the volume of a scan, as `Algorithm.run` says; `weights` and `blur` of P are as of `OSSART.run`."""
+        began = time.perf_counter()
+        order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
+        system = System(scan, weights, blur)
+        x = system.start(start)
+        maxl2err = self._maxl2err(system, scan)
+        residuals, lmbda, step = [system.residual(x)[1]], self.lmbda, 0.0
+        for k in range(self.niter):
+            if self.exact_every and k % self.exact_every == 0:
+                system.correct(x)
+            before = x
+            x = sweep(system, x, lmbda, next(order), self.noneg)
+            residuals.append(system.residual(x)[1])
+            error = residuals[-1] * system.size_b
+            data_change = evaluated(x - before)
+            data_length = norm(data_change)
+            if k == 0:
+                step = self.alpha * data_length
+            before = x
+            x = minimise_tv(x, scan.geometry.nVoxel, step, self.tviter)
+            tv_change = evaluated(x - before)
+            tv_length = norm(tv_change)
+            if tv_length > self.rmax * data_length and error > maxl2err:
+                step *= self.alpha_red
+            lmbda *= self.lmbda_red
+            if progress:
+                progress(k + 1, self.niter, residuals[-1])
+            cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
+            if (cosine < -0.99 and error <= maxl2err) or lmbda < LMBDA_MIN:
+                break
+        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+
+    def _maxl2err(self, system: System, scan: Scan) -> float:
+        """|A x - b| at which the data count as met."""
+        if self.maxl2err is not None:
+            return self.maxl2err
+        if not can_rectify(scan):
+            return 0.0
+        return 0.2 * system.residual(system.start(FDK().run(scan).volume))[1] * system.size_b

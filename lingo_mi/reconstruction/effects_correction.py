@@ -9,8 +9,8 @@ import numpy as np
 
 from lingo_mi.effects.forward import Effects
 from lingo_mi.projectors.objects import GridInCube
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.rectify import is_circular
+from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.scan import Scan
 from lingo_mi.scene.simulate import render_objects, render_with
 
@@ -43,9 +43,9 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
     if effects.detector and effects.detector.saturation:
         least = effects.detector.least(scan.geometry.nDetector)
         found = replace(found, projections=np.where(scan.projections <= least + 1e-6, np.float32(0), found.projections))
-    if effects.scatter is None:
+    if effects.scatter is None or effects.tube is None:  # one comes with the other
         return found
-    if not is_circular(scan):
+    if not can_rectify(scan):
         warnings.warn(
             'scatter stays in the projections for filtered backprojection and initial clouds: its estimate needs a '
             'source on a circle with its panel, and all pixels',
@@ -62,7 +62,8 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
     )
     shape = np.ceil(np.array(g.sVoxel) * scatter.voxels / max(g.sVoxel) - 1e-6).astype(int).clip(1).tolist()
     coarse = g.with_volume(shape, [s / n for s, n in zip(g.sVoxel, shape)])
+    low, high = np.array(scatter.box)
     for _ in range(PASSES):
-        volume = np.maximum(fdk(Scan(coarse, found.projections)), 0)
-        found = corrected(scan, effects, [GridInCube.of(volume, *scatter.box, 'volume')])
+        volume = np.maximum(FDK().run(Scan(coarse, found.projections)).volume, 0)
+        found = corrected(scan, effects, [GridInCube.of(volume, low, high, 'volume')])
     return found

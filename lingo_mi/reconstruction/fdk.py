@@ -11,18 +11,25 @@ where the view weights dbeta sum to pi (`view_weights`). A parallel beam has w =
 
 from __future__ import annotations
 
-from dataclasses import replace
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import fft
+import scipy.fft
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.reconstruction.rectify import upright
-from lingo_mi.reconstruction.views import gaps
+from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.arcs import gaps
+from lingo_mi.reconstruction.rectify import rectified
 from lingo_mi.scan import Scan
+
+fft: Any = scipy.fft  # untyped: its functions look like those that dispatch them
 
 # Apodisation of the ramp over |frequency| in units of the Nyquist frequency, f in [0, 1].
 WINDOWS = {
@@ -33,8 +40,15 @@ WINDOWS = {
     'hann': lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
 }
 
-
 BATCH = 4  # views a launch: shares the index arithmetic and the volume's memory traffic
+
+
+def window_of(filter: str) -> Callable[[np.ndarray], np.ndarray]:
+    """One of `WINDOWS`, by its name or TIGRE's, which has _ for -. Raises InputError for an unknown one."""
+    shape = WINDOWS.get(filter.replace('_', '-'))
+    if shape is None:
+        raise InputError(f'filter {filter!r} is unknown: use one of {", ".join(WINDOWS)}')
+    return shape
 
 
 def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
@@ -45,9 +59,7 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
 
     Raises InputError for an unknown window.
     """
-    shape = WINDOWS.get(window.replace('_', '-'))
-    if shape is None:
-        raise InputError(f'filter {window!r} is unknown: use one of {", ".join(WINDOWS)}')
+    shape = window_of(window)
     size = fft.next_fast_len(2 * n, real=True)
     k = np.minimum(np.arange(size), size - np.arange(size))
     kernel = np.where(k % 2 == 1, -1 / (np.pi * np.maximum(k, 1) * tau) ** 2, 0.0)
@@ -172,45 +184,78 @@ def _add_views(volume, views, geometry):
     return volume
 
 
-def fdk(scan: Scan, filter: str = 'ram-lak', progress=None) -> np.ndarray:
-    """Reconstruct a volume by filtered backprojection: float32 [x, y, z], density per mm.
+@dataclass(frozen=True)
+class FDK(Algorithm):
+    """Filtered backprojection, in one go: FDK for cone beams, its fan-beam form for one detector row, FBP for parallel beams.
 
-    scan       cone (one detector row: fan) or parallel, detector offsets included; the views together must see the
-               whole width of the object, otherwise the truncated rows are filtered as they are. What a panel that is turned
-               or tilted has measured is brought to an upright one first (`upright`)
-    filter     'ram-lak', 'shepp-logan', 'cosine', 'hamming' or 'hann'; TIGRE's 'ram_lak' and 'shepp_logan' are known too
-    progress   called as progress(views done, views) after every few views
+    Each view is weighted by the cosine of its rays, convolved along its rows with the band-limited ramp h, and smeared back,
 
-    Short scans and offset detectors are weighted, see `ray_weights`. A voxel outside a view's panel gets nothing from that
-    view. With one detector row only the slice in the plane of the fan is meaningful. One compiled kernel serves all
-    views.
+        f(x) = sum over views  dbeta / w^2  tau (h * [cosine p])(u(x), v(x))
 
-    Raises InputError for an unknown filter, a source that moves on no circle about z, a panel that moves against it, or pixels
-    that are not valid.
+    with the pixel size tau at the axis and the distance w of x from the source along the central ray, over DSO.
+
+    filter   apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth;
+             TIGRE's 'ram_lak' and 'shepp_logan' are known too
+
+    Short scans (Parker) and panels beside the axis (Wang) are weighted, see `ray_weights`. What a panel that is turned or tilted
+    has measured is brought to an upright one first (`rectified`). The views together must see the whole width of the object;
+    truncated rows are filtered as they are. A voxel outside a view's panel gets nothing from that view, and with one detector
+    row only the slice in the plane of the fan is meaningful.
+
+    Prefer it for hundreds of views, and where seconds count: few views leave streaks, and noise passes through the ramp.
+
+        >>> from lingo_mi.phantoms import make, x3d_scan
+        >>> measured = x3d_scan.scan(make('foot', 24), views=90, pixels=48).train
+        >>> FDK(filter='hann').run(measured).volume.shape
+        (24, 24, 24)
+
+    Feldkamp, Davis and Kress, "Practical cone-beam algorithm", JOSA A 1 (1984), with the ramp of Kak and Slaney, "Principles of
+    Computerized Tomographic Imaging", 1988, section 3.3. Raises InputError for an unknown filter.
     """
-    ramp(scan.geometry.nDetector[1], 1.0, filter)  # an unknown name must fail before the work
-    scan = upright(scan, 'filtered backprojection')
-    rays = ray_weights(scan.geometry)[:, None].astype(np.float32)
-    scan = extended(Scan(scan.geometry, scan.projections * rays))
-    geometry = scan.geometry
-    volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
-    dr.make_opaque(volume)
-    matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
-    n = len(geometry)
-    for start in range(0, n, BATCH):
-        images = filtered(scan.projections[start : start + BATCH], geometry, filter).transpose(0, 2, 1)
-        views = []
-        for i in range(start, start + BATCH):  # the last batch is filled with views of weight zero
-            weight, i = (weights[i], i) if i < n else (0.0, start)
-            views.append(
-                (
-                    mi.Float(np.ascontiguousarray(images[i - start]).ravel()),
-                    [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
-                    dr.opaque(mi.Float, float(weight)),
-                )
+
+    name: ClassVar[str] = 'fdk'
+
+    filter: str = 'ram-lak'
+
+    def __post_init__(self):
+        window_of(self.filter)
+
+    def steps(self, scan: Scan) -> int:
+        return len(scan)
+
+    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
+        """Reconstruct the volume of a scan, as `Algorithm.run` says; `progress` is told of views, without residuals.
+
+        Raises InputError for a start, for a source that moves on no circle about z, a panel that moves against it, and pixels
+        that are not valid.
+        """
+        if start is not None:
+            raise InputError(
+                'filtered backprojection starts from no volume: leave out start, or take another algorithm'
             )
-        volume = _add_views(volume, views, geometry)
-        dr.eval(volume)
-        if progress:
-            progress(min(start + BATCH, n), n)
-    return volume.numpy().reshape(geometry.nVoxel)
+        began = time.perf_counter()
+        level = rectified(scan, 'filtered backprojection')
+        rays = ray_weights(level.geometry)[:, None].astype(np.float32)
+        level = extended(Scan(level.geometry, level.projections * rays))
+        geometry = level.geometry
+        volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+        dr.make_opaque(volume)
+        matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
+        n = len(geometry)
+        for first in range(0, n, BATCH):
+            images = filtered(level.projections[first : first + BATCH], geometry, self.filter).transpose(0, 2, 1)
+            views = []
+            for i in range(first, first + BATCH):  # the last batch is filled with views of weight zero
+                weight, i = (weights[i], i) if i < n else (0.0, first)
+                views.append(
+                    (
+                        mi.Float(np.ascontiguousarray(images[i - first]).ravel()),
+                        [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
+                        dr.opaque(mi.Float, float(weight)),
+                    )
+                )
+            volume = _add_views(volume, views, geometry)
+            dr.eval(volume)
+            if progress:
+                progress(min(first + BATCH, n), n, None)
+        return Reconstruction(volume.numpy().reshape(geometry.nVoxel), [], time.perf_counter() - began, scan.geometry)

@@ -15,26 +15,27 @@ from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import SAME
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import scanner_rays
-from lingo_mi.reconstruction.views import gaps, require_pixels
+from lingo_mi.reconstruction.arcs import gaps
+from lingo_mi.reconstruction.preconditions import require_pixels
 from lingo_mi.scan import Scan
 
 MOVES = 0.1  # of the panel's size by which its shadow may move from view to view
 
 
-def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
+def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     """The scan on a panel that is the same in all views: columns along z, rows along the source's circle, in its middle the
     ray through the axis.
 
     scan   all pixels valid; the source moves on a circle about z around the origin, the panel with it
     what   needs such a panel, for messages
 
-    The geometry is `upright_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
+    The geometry is `rectified_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
     real panel on. A scan on a circle before an upright panel is returned as it is.
 
     Raises InputError for pixels that are not valid, and for a source or a panel that moves otherwise.
     """
     require_pixels(scan, what)
-    geometry, (n_v, n_u) = upright_geometry(scan.geometry, what), scan.geometry.nDetector
+    geometry, (n_v, n_u) = rectified_geometry(scan.geometry, what), scan.geometry.nDetector
     if geometry is scan.geometry:
         return scan
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in geometry.nDetector[::-1]))
@@ -50,17 +51,17 @@ def upright(scan: Scan, what: str = 'an upright panel') -> Scan:
     return Scan(geometry, out)
 
 
-def is_circular(scan: Scan) -> bool:
-    """Whether `upright` knows the scan."""
+def can_rectify(scan: Scan) -> bool:
+    """Whether `rectified` knows the scan: an upright panel before a source on a circle, turned and tilted ones too."""
     try:
         require_pixels(scan, '')
-        upright_geometry(scan.geometry)
+        rectified_geometry(scan.geometry)
     except InputError:
         return False
     return True
 
 
-def upright_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
+def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
     """The same rays before an upright panel that holds the real panel's shadow of all views, with pixels no coarser.
 
     Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side

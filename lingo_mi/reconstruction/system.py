@@ -1,43 +1,23 @@
-"""What the iterative algorithms share: the linear system A x = b of a scan on the device, and what they return."""
+"""The linear system A x = b of a scan on the device, which the iterative algorithms share."""
 
 from __future__ import annotations
-
-import inspect
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.exact import ExactPair
 from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.reconstruction.views import on_circle
+from lingo_mi.reconstruction.parameters import check_bound
+from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.wide_pixels import Between
 from lingo_mi.scan import Scan
 
-INPUTS = (
-    'init',
-    'weights',
-    'blur',
-    'completed',
-    'progress',
-)  # of algorithms: what they work on and report to, not options
 PARTIAL = 4096  # terms of a sum that are added in float32
-LARGE = 1e18  # of parameters without a bound of their own: what is above has no square in float32
 DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the projections'
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """A volume and how it was reached.
-
-    volume      float32 [x, y, z], density per mm
-    residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|)
-    """
-
-    volume: np.ndarray
-    residuals: list[float]
 
 
 class System:
@@ -51,7 +31,7 @@ class System:
 
     def __init__(self, scan: Scan, weights=None, blur=None):
         self.geometry = scan.geometry
-        self.A = Joseph(scan.geometry) if on_circle(scan) else ExactPair(scan.geometry, scan.valid)
+        self.A = Joseph(scan.geometry) if is_circular(scan) else ExactPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.0
@@ -71,23 +51,19 @@ class System:
             self.weights = self._device(weights, 'weights of the voxels')
             self.weighed = evaluated(self.A.forward(self.weights, self.views)[0])
 
-    def start(self, init):
-        """The start volume on the device: zero, or `init` [x, y, z], density per mm.
+    def start(self, volume: ArrayLike | None):
+        """The start volume on the device: zero, or `volume` [x, y, z], density per mm.
 
-        Raises InputError where `init` does not fit the geometry or is not finite.
+        Raises InputError where it does not fit the geometry or is not finite.
         """
-        if init is None:
+        if volume is None:
             x = dr.zeros(mi.Float, self.A.voxels)
             dr.make_opaque(x)
             return x
-        return self._device(init, 'start volume')
+        return self._device(volume, 'start volume')
 
     def _device(self, volume, name: str):
-        volume = np.ascontiguousarray(volume, np.float32)
-        if volume.shape != self.geometry.nVoxel:
-            raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {self.geometry.nVoxel}')
-        if not np.isfinite(volume).all():
-            raise InputError(f'the {name}: NaN or infinity')
+        volume = on_voxels(volume, self.geometry, name)
         return evaluated(mi.Float(volume.ravel()) + scalar(0))  # a copy: the algorithms write into theirs
 
     def residual(self, x):
@@ -118,15 +94,6 @@ class System:
         return finite(x.numpy().reshape(self.geometry.nVoxel))
 
 
-def options_of(function) -> dict:
-    """The parameters of an algorithm that are options, and their defaults."""
-    return {
-        name: p.default
-        for name, p in inspect.signature(function).parameters.items()
-        if p.default is not p.empty and name not in INPUTS
-    }
-
-
 def evaluated(x):
     dr.eval(x)
     return x
@@ -146,27 +113,18 @@ def norm(a) -> float:
     return dot(a, a) ** 0.5
 
 
+def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
+    """A volume as float32 [x, y, z]. Raises InputError where it does not fit the geometry or is not finite."""
+    volume = np.ascontiguousarray(volume, np.float32)
+    if volume.shape != geometry.nVoxel:
+        raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    if not np.isfinite(volume).all():
+        raise InputError(f'the {name}: NaN or infinity')
+    return volume
+
+
 def finite(volume: np.ndarray) -> np.ndarray:
     """The volume itself. Raises InputError where it is not finite."""
     if not np.isfinite(volume).all():
         raise InputError(DIVERGED)
     return volume
-
-
-def check_counts(least: int = 1, **counts):
-    """Raises InputError for a count that is not an integer, or below `least`."""
-    for name, value in counts.items():
-        if not (least <= value < np.inf and value == int(value)):
-            raise InputError(f'{name} must be an integer from {least} on, not {value}')
-
-
-def check_range(name: str, value: float, low: float, high: float):
-    """Raises InputError for a parameter outside low < value <= high."""
-    if not low < value <= high:
-        raise InputError(f'{name} must be above {low:g} and at most {high:g}, not {value}')
-
-
-def check_bound(name: str, value: float, high: float = LARGE):
-    """Raises InputError for a parameter, which may be zero, outside 0 <= value <= high."""
-    if not 0 <= value <= high:
-        raise InputError(f'{name} must be from 0 to {high:g}, not {value}')

@@ -1,7 +1,7 @@
 """Pixels wider than voxels: rays that leave voxels between them out, and their pattern in a volume.
 
 Rays go to pixels' centres, and a projector's weights reach one voxel to either side of a ray. Where pixels at the axis are
-two voxels wide or more, some voxels are met by no ray of any view.
+two voxels wide or more, some voxels are crossed by no ray of any view.
 """
 
 from __future__ import annotations
@@ -13,14 +13,15 @@ import mitsuba as mi
 
 from lingo_mi.geometry.base import Geometry
 
-LEAST = 0.1  # A^T 1 over its mean around a voxel, above which it counts as met
+LEAST = 0.1  # A^T 1 over its mean around a voxel, above which rays count as crossing it
 
 
 def pitch(geometry: Geometry) -> tuple[float, float, float]:
     """The distance between rays at the axis, (x, y, z) voxels: columns are as far apart along x and y, rows along z."""
     at_axis = geometry.DSO / geometry.DSD if geometry.mode == 'cone' else 1.0
     v, u = (at_axis * d for d in geometry.dDetector)
-    return tuple(distance / d for distance, d in zip((u, u, v), geometry.dVoxel))
+    x, y, z = geometry.dVoxel
+    return u / x, u / y, v / z
 
 
 def leave_voxels_out(geometry: Geometry) -> bool:
@@ -34,17 +35,18 @@ def excess_width(geometry: Geometry) -> tuple[float, float, float]:
     Variances add up, and that of a box is a twelfth of its width's square; twice, since a pixel's width comes in with A and
     with A^T. Zero where pixels are no wider than voxels.
     """
-    return tuple(sqrt(max(p**2 - 1, 0) / 6) for p in pitch(geometry))
+    x, y, z = (sqrt(max(p**2 - 1, 0) / 6) for p in pitch(geometry))
+    return x, y, z
 
 
 class Between:
-    """The voxels between rays, met by none, or by few with a corner, among voxels that are met.
+    """The voxels between rays, crossed by none, or by few at a corner, among voxels that rays do cross.
 
     geometry   of the scan
     A, views   its projector and views
 
     Few and small steps leave such a voxel behind those around it, which meet the projections without it. Beyond the rays, where
-    less than half of what is around a voxel is met, nothing counts as between.
+    less than half of what is around a voxel is crossed, nothing counts as between.
     """
 
     @classmethod
@@ -55,16 +57,16 @@ class Between:
     def __init__(self, geometry: Geometry, A, views):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
         weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
-        self.met = weight > LEAST * blurred(weight, self.size, self.deviations)
-        share = blurred(dr.select(self.met, mi.Float(1), 0), self.size, self.deviations)
+        self.crossed = weight > LEAST * blurred(weight, self.size, self.deviations)
+        share = blurred(dr.select(self.crossed, mi.Float(1), 0), self.size, self.deviations)
         self.share = dr.select(
-            self.met | (share < 0.5), 0, share
-        )  # of what is met around a voxel between rays, 0 elsewhere
-        dr.eval(self.met, self.share)
+            self.crossed | (share < 0.5), 0, share
+        )  # of what rays cross around a voxel between them, 0 elsewhere
+        dr.eval(self.crossed, self.share)
 
     def filled(self, change):
         """A change of the volume (mi.Float [voxels]), the voxels between rays changed as those around them."""
-        around = blurred(dr.select(self.met, change, 0), self.size, self.deviations)
+        around = blurred(dr.select(self.crossed, change, 0), self.size, self.deviations)
         return dr.select(self.share > 0, around / self.share, change)
 
 

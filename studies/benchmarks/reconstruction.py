@@ -24,7 +24,7 @@ from lingo_mi import phantoms
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
@@ -92,7 +92,7 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
         dr.eval(x)
         return system.volume(x)
 
-    return dict(projector=project, transpose=transpose, FDK=lambda: fdk(scan), SART=sart)
+    return dict(projector=project, transpose=transpose, FDK=lambda: FDK().run(scan).volume, SART=sart)
 
 
 def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:

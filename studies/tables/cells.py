@@ -15,7 +15,6 @@ import functools
 import hashlib
 import json
 import sys
-import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -36,11 +35,7 @@ from lingo_mi.interrupts import between_steps
 from lingo_mi.paths import replacing
 from lingo_mi.phantoms.x3d_scan import scan
 from lingo_mi.progress import Progress
-from lingo_mi.reconstruction.asd_pocs import asd_pocs
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.refined import refined
-from lingo_mi.reconstruction.sart import sart
-from lingo_mi.reconstruction.system import options_of
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Refined, progress_bar
 from lingo_mi.results.measure import measure
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
@@ -52,11 +47,11 @@ NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # num
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {
-    'fdk': (fdk, {}),
-    'sart': (sart, dict(niter=20)),
-    'asd-pocs': (asd_pocs, dict(niter=10)),
-    'refined': (refined, {}),
-    'finer': (refined, dict(finer=2, completed_niter=0, niter=4)),
+    'fdk': FDK(),
+    'sart': SART(niter=20),
+    'asd-pocs': ASDPOCS(niter=10),
+    'refined': Refined(),
+    'finer': Refined(finer=2, completed_niter=0, niter=4),
 }
 
 
@@ -142,7 +137,7 @@ class Cells:
         )
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
-            options = dict(algorithm=_options(cell.algorithm), completed=COMPLETED)
+            options = dict(algorithm=ALGORITHMS[cell.algorithm].options, completed=COMPLETED)
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
@@ -234,31 +229,24 @@ class Cells:
         return insert_views(self._measured(fit).train, COMPLETED, self._cloud(fit).render)
 
     def _volume(self, cell: Volume, path: Path, label: str) -> dict:
-        function, options = ALGORITHMS[cell.algorithm]
+        algorithm, inputs = ALGORITHMS[cell.algorithm], {}
         if cell.fit.method != 'none' and self.get(cell.fit) is None:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
-        total = sum(n for name, n in _options(cell.algorithm).items() if name.endswith('niter')) or len(views)
-        if function is refined:
-            options = options | dict(completed=views, sample=self._cloud(cell.fit).volume)
+        if isinstance(algorithm, Refined):
+            stepper, state = self._cloud(cell.fit)
+            inputs = dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
             views = dataset.train
-        with Progress(label, total) as bar:
-
-            def progress(done, _, residual=None):
-                bar.update(done, residual=residual)
-
-            begun = time.perf_counter()
-            result = function(views, **options, progress=progress)
-        seconds = time.perf_counter() - begun
-        volume = result if isinstance(result, np.ndarray) else result.volume
+        with progress_bar(algorithm, views, label) as progress:
+            found = algorithm.run(views, progress=progress, **inputs)
         return dict(
             algorithm=cell.algorithm,
-            options=_options(cell.algorithm),
+            options=algorithm.options,
             method=cell.fit.method,
-            seconds=seconds,
-            psnr_3d=metrics.psnr_3d(volume, dataset.volume),
-            ssim_3d=metrics.ssim_3d(volume, dataset.volume),
+            seconds=found.seconds,
+            psnr_3d=metrics.psnr_3d(found.volume, dataset.volume),
+            ssim_3d=metrics.ssim_3d(found.volume, dataset.volume),
         )
 
 
@@ -268,12 +256,6 @@ def _iterations(path: Path) -> int | None:
         return checkpoint.load(path)[1].get('iteration')
     except InputError:
         return None
-
-
-def _options(algorithm: str) -> dict:
-    """All parameters of an algorithm that have a value, those left at their defaults too."""
-    function, options = ALGORITHMS[algorithm]
-    return options_of(function) | options
 
 
 def _hash(values: dict) -> str:

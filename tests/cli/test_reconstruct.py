@@ -21,10 +21,8 @@ from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry.base import CircularGeometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d, psnr_3d_absolute
-from lingo_mi.reconstruction.asd_pocs import asd_pocs
-from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART
 from lingo_mi.reconstruction.refined import structure
-from lingo_mi.reconstruction.sart import sart
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.results.measure import compared, volume_quality
 from lingo_mi.results.scene_file import write_scene
@@ -81,11 +79,11 @@ def test_every_algorithm(scene, dataset, tmp_path, algorithm, options):
     assert ('|A x - b|' in text) == (algorithm != 'fdk') and 'of 8 views' in text and str(out) in text
 
 
-def test_the_volume_is_the_functions(scene, dataset, tmp_path):
+def test_the_volume_is_the_algorithms(scene, dataset, tmp_path):
     run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=2', '--views', '4', '--out', tmp_path / 'v.nii')
     image = nibabel.load(tmp_path / 'v.nii')
     assert np.allclose(image.affine[:3, 3], -11.5)
-    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(dataset.train.subset([0, 2, 4, 6]), 2).volume)
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), SART(2).run(dataset.train.subset([0, 2, 4, 6])))
 
 
 def test_fdk_of_a_turned_panel(dataset, tmp_path):
@@ -95,8 +93,8 @@ def test_fdk_of_a_turned_panel(dataset, tmp_path):
     code, _, err = run(RECONSTRUCT, path, '--out', tmp_path / 'v.nii')
     assert code == 0, err
     volume, turned = load(tmp_path / 'v.nii'), take_scan(load_scene(path)).train
-    assert psnr_3d(volume, dataset.volume) > psnr_3d(fdk(dataset.train), dataset.volume) - 0.3
-    np.testing.assert_array_equal(volume, fdk(turned))
+    assert psnr_3d(volume, dataset.volume) > psnr_3d(FDK().run(dataset.train).volume, dataset.volume) - 0.3
+    np.testing.assert_array_equal(volume, FDK().run(turned))
 
 
 def test_two_stage(scene, dataset, fitted, tmp_path):
@@ -106,12 +104,12 @@ def test_two_stage(scene, dataset, fitted, tmp_path):
     measured = fitted_views(dataset, cloud.geometry)
     np.testing.assert_array_equal(measured.projections, dataset.train.projections[::2])
     whole = complete(measured, cloud, 16)
-    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), fdk(whole))
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), FDK().run(whole))
     np.testing.assert_array_equal(whole.projections[:4], measured.projections)
     loaded = load_scene(fitted)
     image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(5, whole.geometry)))[..., 0]
     np.testing.assert_allclose(whole.projections[5], image, atol=1e-5 * image.max())
-    assert psnr_3d(fdk(whole), dataset.volume) > psnr_3d(fdk(measured), dataset.volume) + 0.5
+    assert psnr_3d(FDK().run(whole).volume, dataset.volume) > psnr_3d(FDK().run(measured).volume, dataset.volume) + 0.5
     with pytest.raises(InputError, match='ask for more'):
         complete(measured, cloud, 3)
     assert complete(measured, cloud, 4) is measured
@@ -136,7 +134,7 @@ def test_start(scene, dataset, fitted, tmp_path):
     cloud = load_cloud(fitted)
     scan = fitted_views(dataset, cloud.geometry)
     own = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
-    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), sart(scan, 3, init=own).volume)
+    np.testing.assert_array_equal(load(tmp_path / 'v.nii'), SART(3).run(scan, start=own))
     assert psnr_3d(load(tmp_path / 'v.nii'), dataset.volume) > psnr_3d(own, dataset.volume) + 0.5
 
 
@@ -160,9 +158,10 @@ def test_refined(scene, dataset, fitted, tmp_path):
     cloud = load_cloud(fitted)
     measured = fitted_views(dataset, cloud.geometry)
     own = voxelize_cloud(cloud.gaussians, measured.geometry, cloud.extent)
-    rates = dict(blur=excess_width(measured.geometry), alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0, exact_every=5)
-    first = sart(complete(measured, cloud, 12), 1, init=own, weights=structure(own), blur=rates['blur']).volume
-    then = asd_pocs(measured, 4, **rates, init=first, weights=structure(first))
+    blur = excess_width(measured.geometry)
+    rates = dict(alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0, exact_every=5)
+    first = SART(1).run(complete(measured, cloud, 12), start=own, weights=structure(own), blur=blur)
+    then = ASDPOCS(4, **rates).run(measured, start=first, weights=structure(first.volume), blur=blur)
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), then.volume)
     assert psnr_3d(then.volume, dataset.volume) > psnr_3d(own, dataset.volume) + 0.5
     # Means of smaller voxels, on which the cloud is sampled anew.
@@ -188,8 +187,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
     g = measured.geometry
     small = replace(measured, geometry=g.with_volume([2 * n for n in g.nVoxel], [d / 2 for d in g.dVoxel]))
     own = voxelize_cloud(cloud.gaussians, small.geometry, cloud.extent)
-    finer = rates | dict(blur=excess_width(small.geometry))
-    then = asd_pocs(small, 2, **finer, init=own, weights=structure(own)).volume
+    fine = excess_width(small.geometry)
+    then = ASDPOCS(2, **rates).run(small, start=own, weights=structure(own), blur=fine).volume
     eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
     # Of the measured views alone, which any scan will do for.
@@ -198,7 +197,7 @@ def test_refined(scene, dataset, fitted, tmp_path):
     )
     assert code == 0 and 'refined of 4 views' in text and '2/2 (100%)' in err, err
     own = voxelize_cloud(cloud.gaussians, g, cloud.extent)
-    then = asd_pocs(measured, 2, **rates, init=own, weights=structure(own))
+    then = ASDPOCS(2, **rates).run(measured, start=own, weights=structure(own), blur=blur)
     np.testing.assert_array_equal(load(tmp_path / 'm.nii'), then.volume)
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'completed_niter=1', '--start', fitted)
     assert code == 2 and err.count('error') == 1 and 'completed_niter must be 0' in err, err
@@ -221,10 +220,10 @@ def test_hardening_is_taken_out_first(tmp_path):
     hard.write_text(clean.replace('</scene>', tube + '</scene>'))
     code, _, err = run(RECONSTRUCT, hard, '--out', out)
     assert code == 0, err
-    expected = fdk(take_scan(load_scene(tmp_path / 'clean.xml')).train)
+    expected = FDK().run(take_scan(load_scene(tmp_path / 'clean.xml')).train).volume
     size = np.linalg.norm(expected)
     assert np.linalg.norm(load(out) - expected) < 1e-3 * size
-    ignored = fdk(take_scan(load_scene(hard)).train)
+    ignored = FDK().run(take_scan(load_scene(hard)).train).volume
     assert np.linalg.norm(ignored - expected) > 0.02 * size
     # Three materials cannot be told apart: the advice is to leave them out.
     hard.write_text(
@@ -393,7 +392,7 @@ def test_too_many_views_and_too_little_memory(scene, fitted, tmp_path, monkeypat
     assert 'at most 100000' in refused(scene, '--complete', fitted, '--views', 1_000_000, *out)
     assert 'GiB of memory' in refused(scene, '--complete', fitted, '--views', 10_000_000, *out)
     size = 4 * (24**3 + 8 * 32 * 40)
-    monkeypatch.setattr('lingo_mi.scene.load.room', lambda: 3.8 * size)
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 3.8 * size)
     assert run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', *out)[0] == 0
     for algorithm in 'cgls', 'asd-pocs':
         assert 'at least' in refused(scene, '--algorithm', algorithm, '-D', 'niter=1', *out, '--force')
@@ -464,7 +463,7 @@ def test_corrected_poses(scene, tmp_path):
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=2', '--start', path, *out)
     assert code == 0 and 'of 4 views' in text, err
     own = voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
-    expected = sart(as_corrected(measured, cloud), 2, init=own).volume  # up to the order of sums
+    expected = SART(2).run(as_corrected(measured, cloud), start=own).volume  # up to the order of sums
     np.testing.assert_allclose(load(tmp_path / 'v.nii'), expected, rtol=1e-4, atol=1e-5 * expected.max())
     code, _, err = run(
         RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', '--complete', path, '--views', 8, *out
@@ -499,9 +498,8 @@ def test_the_noise_is_that_of_the_fit(tmp_path):
 
     def expected(seed):
         scan = fitted_views(take_scan(load_scene(path), seed=seed), cloud.geometry)
-        return sart(
-            without_effects(scan, cloud), 1, init=voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
-        ).volume
+        own = voxelize_cloud(cloud.gaussians, scan.geometry, cloud.extent)
+        return SART(1).run(without_effects(scan, cloud), start=own).volume
 
     start = '--start', tmp_path / 'fit' / 'result.xml'
     np.testing.assert_allclose(volume(*start), expected(3), rtol=1e-4, atol=1e-5)

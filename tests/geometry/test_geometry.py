@@ -245,13 +245,13 @@ def test_normalised_frames_of_poses():
 
 
 def test_filtered_backprojection_refuses_other_poses():
-    from lingo_mi.reconstruction.fdk import fdk
+    from lingo_mi.reconstruction.fdk import FDK
 
     g = moving(tilt=0.3)
     with pytest.raises(InputError, match='on a circle about z'):
-        fdk(Scan(g, np.ones((5, 24, 30))))
+        FDK().run(Scan(g, np.ones((5, 24, 30))))
     scan = Scan(moving(angles=circular(5), tilt=0.0), np.ones((5, 24, 30)))
-    assert fdk(scan).shape == g.nVoxel
+    assert FDK().run(scan).volume.shape == g.nVoxel
 
 
 # ---- bad input ---------------------------------------------------------------------------------------------

@@ -1,7 +1,5 @@
-"""What tests share with iterative."""
+"""The iterative algorithms, by their names: what starts from any volume, and needs no cloud."""
 
-from lingo_mi.reconstruction.asd_pocs import asd_pocs
-from lingo_mi.reconstruction.cgls import cgls
-from lingo_mi.reconstruction.sart import os_sart, sart, sirt
+from lingo_mi.reconstruction import ALGORITHMS
 
-ALGORITHMS = dict(sart=sart, os_sart=os_sart, sirt=sirt, cgls=cgls, asd_pocs=asd_pocs)
+ITERATIVE = {name: algorithm for name, algorithm in ALGORITHMS.items() if name not in ('fdk', 'refined')}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from helpers.algorithms import ALGORITHMS
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from helpers.grids import scan
 from lingo_mi.geometry.base import Geometry
@@ -16,7 +15,7 @@ from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.projectors.exact import ExactPair
 from lingo_mi.projectors.grid import backproject, project
 from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.reconstruction.sart import sart
+from lingo_mi.reconstruction import ALGORITHMS, SART
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
@@ -81,15 +80,15 @@ def test_which_projector_a_scan_gets():
     'name, views, options',
     [
         ('sart', 40, dict(niter=3)),
-        ('os_sart', 60, dict(niter=4, blocksize=6)),
+        ('os-sart', 60, dict(niter=4, blocksize=6)),
         ('cgls', 120, dict(niter=12)),
-        ('asd_pocs', 40, dict(niter=3)),
+        ('asd-pocs', 40, dict(niter=3)),
     ],
 )
 def test_helix(name, views, options):
     """Two turns that climb by 20 mm each."""
     geo = spiral(geometry(angles=4 * np.pi * np.arange(views) / views), 20.0)
-    assert_ball(ALGORITHMS[name](ellipsoids(geo, BALL), **options).volume, geo)
+    assert_ball(ALGORITHMS[name](**options).run(ellipsoids(geo, BALL)).volume, geo)
 
 
 def test_pixels_left_out_count_for_nothing():
@@ -98,11 +97,11 @@ def test_pixels_left_out_count_for_nothing():
     whole = ellipsoids(geo, BALL)
     valid = np.random.default_rng(0).random(whole.projections.shape) < 0.75
     dead = replace(whole, projections=np.where(valid, whole.projections, np.nan), valid=valid)
-    result = sart(dead, 3)
+    result = SART(3).run(dead)
     assert_ball(result.volume, geo)
     assert result.residuals[-1] < 0.1
     with pytest.raises(AssertionError):
-        assert_ball(sart(replace(whole, projections=np.where(valid, whole.projections, 0)), 3).volume, geo)
+        assert_ball(SART(3).run(replace(whole, projections=np.where(valid, whole.projections, 0))).volume, geo)
 
 
 def test_kernels_serve_any_views():
@@ -110,9 +109,8 @@ def test_kernels_serve_any_views():
     geo = laminography(scan(n=5))
     measured = Scan(geo, np.random.default_rng(0).random((5, *geo.nDetector)).astype(np.float32))
     for algorithm in ('sart', 'cgls'):
-        run = ALGORITHMS[algorithm]
-        run(measured, niter=2)
+        ALGORITHMS[algorithm](niter=2).run(measured)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            run(measured, niter=3)
+            ALGORITHMS[algorithm](niter=3).run(measured)
             assert all(k['cache_hit'] for k in dr.kernel_history([dr.KernelType.JIT]))

@@ -6,10 +6,9 @@
 import numpy as np
 import pytest
 
-from helpers.algorithms import ALGORITHMS
 from helpers.balls import BALL, assert_ball, ball_errors, ellipsoids, geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.fdk import fdk
+from lingo_mi.reconstruction import ALGORITHMS
 
 # A panel off the axis by a few pixels, and one that reaches 110 mm on one side of the central ray, 10 mm on the other.
 PANELS = {'(4, -7) mm': (72, (4.0, -7.0)), '(4, 50) mm': (40, (4.0, 50.0))}
@@ -17,18 +16,18 @@ PANELS = {'(4, -7) mm': (72, (4.0, -7.0)), '(4, 50) mm': (40, (4.0, 50.0))}
 SMALL = {
     'fdk': (360, {}),
     'sart': (40, dict(niter=3)),
-    'os_sart': (60, dict(niter=4, blocksize=6)),
+    'os-sart': (60, dict(niter=4, blocksize=6)),
     'sirt': (40, dict(niter=30, lmbda=1.9, lmbda_red=1.0)),
     'cgls': (120, dict(niter=12)),
-    'asd_pocs': (40, dict(niter=5)),
+    'asd-pocs': (40, dict(niter=5)),
 }
 LARGE = {
     'fdk': {},
     'sart': dict(niter=5, lmbda_red=0.7),
-    'os_sart': dict(niter=20),
+    'os-sart': dict(niter=20),
     'sirt': dict(niter=50, lmbda=1.9, lmbda_red=1.0),
     'cgls': dict(niter=45),
-    'asd_pocs': dict(niter=3),
+    'asd-pocs': dict(niter=3),
 }
 
 
@@ -50,7 +49,7 @@ def check(name, views, options, mode, panel):
     columns, offset = PANELS[panel]
     geo = geometry(mode, circular(views, start=3), nDetector=(64, columns), offDetector=offset)
     scan = ellipsoids(geo, BALL)
-    volume = fdk(scan) if name == 'fdk' else ALGORITHMS[name](scan, **options).volume
+    volume = ALGORITHMS[name](**options).run(scan).volume
     assert volume.shape == geo.nVoxel and volume.dtype == np.float32
     density, place = ball_errors(volume, geo)
     said = ', '.join(f'{name} = {value}' for name, value in options.items())

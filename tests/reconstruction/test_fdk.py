@@ -8,7 +8,7 @@ from helpers.balls import BALL, centres, ellipsoids, geometry
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.fdk import WINDOWS, fdk, ramp, ray_weights, view_weights
+from lingo_mi.reconstruction.fdk import FDK, WINDOWS, ramp, ray_weights, view_weights
 from lingo_mi.scan import Scan
 
 
@@ -21,7 +21,7 @@ def test_asymmetric_phantom_axis_by_axis():
         (np.array([0.0, 0.0, 30.0]), axes, 0.03),
         (np.array([0.0, -30.0, 0.0]), axes, 0.04),
     ]
-    volume, x = fdk(ellipsoids(geo, *bodies)), centres(geo)
+    volume, x = FDK().run(ellipsoids(geo, *bodies)).volume, centres(geo)
     for centre, _, density in bodies:
         inside = np.linalg.norm(x - centre, axis=-1) < 7
         assert abs(volume[inside].mean() / density - 1) < 0.06  # a cone misses data off the central plane
@@ -34,7 +34,7 @@ def test_asymmetric_phantom_axis_by_axis():
 def test_parker_weights_on_a_short_scan(span):
     """A panel that spans 31 degrees of fan needs 211; rays measured twice must not count twice."""
     geo = geometry(angles=circular(span, span, start=40)[::-1])
-    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    volume, near = FDK().run(ellipsoids(geo, BALL)).volume, np.linalg.norm(centres(geo) - BALL[0], axis=-1)
     assert np.sqrt(np.mean((volume[near < 20] / 0.02 - 1) ** 2)) < 0.005  # unweighted: 0.02 to 0.04
     assert np.sqrt(np.mean((volume[(near > 30) & (near < 60)] / 0.02) ** 2)) < 0.025  # unweighted: above 0.05
 
@@ -61,7 +61,7 @@ def test_parker_weights_of_opposite_rays_sum_to_one(span):
 @pytest.mark.parametrize('offset', [50.0, -50.0])
 def test_offset_detector_that_sees_little_more_than_half(mode, offset):
     geo = geometry(mode, nDetector=(64, 40), offDetector=(4.0, offset))  # from -10 to 110 mm
-    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    volume, near = FDK().run(ellipsoids(geo, BALL)).volume, np.linalg.norm(centres(geo) - BALL[0], axis=-1)
     assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.005  # unweighted: 0.36
     assert np.sqrt(np.mean((volume[near < 20] / 0.02 - 1) ** 2)) < 0.02
     weights = ray_weights(geo)[0]
@@ -74,14 +74,14 @@ def test_offset_detector_that_sees_little_more_than_half(mode, offset):
 @pytest.mark.parametrize('values', [0.0, 1.0, -1.0])
 def test_constant_projections(values):
     geo = geometry(angles=circular(6))
-    volume = fdk(Scan(geo, np.full((6, *geo.nDetector), values)))
+    volume = FDK().run(Scan(geo, np.full((6, *geo.nDetector), values))).volume
     assert np.isfinite(volume).all() and (volume.any() == bool(values))
 
 
 @pytest.mark.parametrize('mode, span', [('cone', 180), ('cone', 230), ('parallel', 180), ('parallel', 230)])
 def test_shorter_spans_keep_the_density(mode, span):
     geo = geometry(mode, circular(span // 2, span))
-    volume, near = fdk(ellipsoids(geo, BALL)), np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    volume, near = FDK().run(ellipsoids(geo, BALL)).volume, np.linalg.norm(centres(geo) - BALL[0], axis=-1)
     assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.06
 
 
@@ -89,10 +89,10 @@ def test_filters_keep_the_density():
     scan = ellipsoids(geometry(angles=circular(60)), BALL)
     near = np.linalg.norm(centres(scan.geometry) - BALL[0], axis=-1)
     for name in WINDOWS:
-        assert abs(fdk(scan, name)[near < 10].mean() / 0.02 - 1) < 0.02, name
+        assert abs(FDK(name).run(scan).volume[near < 10].mean() / 0.02 - 1) < 0.02, name
         assert ramp(64, 1.0, name)[-1] <= ramp(64, 1.0)[-1] + 1e-12
     with pytest.raises(InputError, match='ram-lak'):
-        fdk(scan, 'ramlak')
+        FDK('ramlak')
 
 
 def test_view_weights():
@@ -134,7 +134,7 @@ def test_one_kernel_for_all_views():
     scan = ellipsoids(geometry(angles=circular(10)), BALL)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        fdk(scan)
+        FDK().run(scan)
         history = dr.kernel_history([dr.KernelType.JIT])
     assert len({kernel['hash'] for kernel in history}) == 1 and len(history) == 3
 
@@ -147,7 +147,7 @@ def test_fan_beam_of_one_row():
         offOrigin=(0.0, 0.0, 0.0),
         offDetector=(0.0, -7.0),
     )
-    volume = fdk(ellipsoids(geo, (np.array([12.0, -9.0, 0.0]), np.array([25.0, 25.0, 25.0]), 0.02)))
+    volume = FDK().run(ellipsoids(geo, (np.array([12.0, -9.0, 0.0]), np.array([25.0, 25.0, 25.0]), 0.02))).volume
     near = np.linalg.norm(centres(geo) - [12.0, -9.0, 0.0], axis=-1)
     assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.01
 
@@ -168,7 +168,7 @@ def test_measured_fan_beam(data):
         dVoxel=voxel,
         angles=angles,
     )
-    volume = fdk(Scan(geo, data['sinogram_ta'][:-1, None]))[..., 0]
+    volume = FDK().run(Scan(geo, data['sinogram_ta'][:-1, None])).volume[..., 0]
     reference = data['fbp_ta']
     assert np.corrcoef(volume.ravel(), reference.ravel())[0, 1] > 0.99
     disc = reference > 0.7 * reference.max()

@@ -1,6 +1,5 @@
 """SART, OS-SART, SIRT, CGLS and ASD-POCS: literal transcriptions on a small system, bad input."""
 
-import inspect
 from dataclasses import replace
 
 import drjit as dr
@@ -10,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import lsqr
 
-from helpers.algorithms import ALGORITHMS
+from helpers.algorithms import ITERATIVE
 from helpers.grids import scan as small
 from helpers.matrices import matrix
 from lingo_mi import phantoms
@@ -22,11 +21,10 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.reconstruction.asd_pocs import asd_pocs, tv_floor, tv_gradient
-from lingo_mi.reconstruction.cgls import cgls
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.refined import refined, structure
-from lingo_mi.reconstruction.sart import blocks, os_sart, sart, sirt
+from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refined
+from lingo_mi.reconstruction.asd_pocs import tv_floor, tv_gradient
+from lingo_mi.reconstruction.refined import structure
+from lingo_mi.reconstruction.sart import blocks
 from lingo_mi.scan import Scan
 
 
@@ -64,7 +62,7 @@ def close(result, expected):
 def test_sart_is_the_transcription(system, blocksize, noneg):
     scan, A, b = system
     start = np.random.default_rng(1).random(scan.geometry.nVoxel)
-    result = os_sart(scan, 3, blocksize, 0.8, 0.9, noneg, 'ordered', start)
+    result = OSSART(3, blocksize, 0.8, 0.9, noneg, 'ordered').run(scan, start=start)
     x = start.ravel()
     expected = [np.linalg.norm(A @ x - b) / np.linalg.norm(b)]
     for k in range(3):
@@ -89,20 +87,22 @@ def test_weighted_sart_is_that_of_the_scaled_system(system, blocksize):
             x, A, b, 0.8 * 0.9**k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], s=s.ravel()
         )
     for factor in (1, 1e-3):
-        found = os_sart(scan, 3, blocksize, 0.8, 0.9, True, 'ordered', start, factor * s)
+        found = OSSART(3, blocksize, 0.8, 0.9, True, 'ordered').run(scan, start=start, weights=factor * s)
         close(found, x)
         np.testing.assert_array_equal(found.volume[:2], np.float32(start[:2]))
     ones = np.full_like(s, 3)
-    np.testing.assert_allclose(asd_pocs(scan, 2, weights=ones).volume, asd_pocs(scan, 2).volume, atol=1e-5)
-    assert np.abs(asd_pocs(scan, 2, init=start, weights=s).volume - asd_pocs(scan, 2, init=start).volume).max() > 0.1
+    two = ASDPOCS(2)
+    np.testing.assert_allclose(two.run(scan, weights=ones), two.run(scan), atol=1e-5)
+    change = two.run(scan, start=start, weights=s).volume - two.run(scan, start=start).volume
+    assert np.abs(change).max() > 0.1
 
 
 @pytest.mark.parametrize('value, why', [(np.nan, 'NaN'), (-1, 'negative')])
 def test_weights_that_are_none(system, value, why):
     shape = system[0].geometry.nVoxel
-    for weights, why in ((np.full(shape, value), why), (np.ones((2, *shape[1:])), 'shape')):
-        with pytest.raises(InputError, match=f'weights.*{why}'):
-            sart(system[0], 1, weights=weights)
+    for weights, reason in ((np.full(shape, value), why), (np.ones((2, *shape[1:])), 'shape')):
+        with pytest.raises(InputError, match=f'weights.*{reason}'):
+            SART(1).run(system[0], weights=weights)
 
 
 def test_blurred_sart_is_the_transcription(system):
@@ -115,10 +115,10 @@ def test_blurred_sart_is_the_transcription(system):
             change = sart_pass(x, A, b, 0.8 * 0.9**k, [np.arange(i, i + 1) for i in range(5)], noneg) - x
             change = gaussian_filter(change.reshape(start.shape), deviations, radius=[int(4 * s) for s in deviations])
             x = np.maximum(x + change.ravel(), 0) if noneg else x + change.ravel()
-        close(sart(scan, 3, 0.8, 0.9, noneg, 'ordered', start, blur=deviations), x)
-    np.testing.assert_array_equal(sirt(scan, 2, blur=(0, 0, 0)).volume, sirt(scan, 2).volume)
+        close(SART(3, 0.8, 0.9, noneg, 'ordered').run(scan, start=start, blur=deviations), x)
+    np.testing.assert_array_equal(SIRT(2).run(scan, blur=(0, 0, 0)), SIRT(2).run(scan))
     plain, soft = (
-        asd_pocs(scan, 1, lmbda=1e-3, tviter=1, alpha=1e-9, init=start, blur=s).volume for s in (None, deviations)
+        ASDPOCS(1, lmbda=1e-3, tviter=1, alpha=1e-9).run(scan, start=start, blur=s).volume for s in (None, deviations)
     )
     np.testing.assert_allclose(soft - start, gaussian_filter(plain - start, deviations), atol=2e-5)
     assert np.abs(plain - soft).max() > 1e-4
@@ -127,14 +127,14 @@ def test_blurred_sart_is_the_transcription(system):
 @pytest.mark.parametrize('blur', [(1, 1), (1, -1, 1), (1, np.nan, 1), (1, 1, np.inf)])
 def test_a_blur_that_is_none(system, blur):
     with pytest.raises(InputError, match='blur must be'):
-        sart(system[0], 1, blur=blur)
+        SART(1).run(system[0], blur=blur)
 
 
 def test_names_of_the_family(system):
     scan, _, _ = system
-    np.testing.assert_array_equal(sirt(scan, 2).volume, os_sart(scan, 2, 5, OrderStrategy='ordered').volume)
-    np.testing.assert_array_equal(sart(scan, 2).volume, os_sart(scan, 2, 1).volume)
-    assert np.abs(sart(scan, 1).volume - sart(scan, 1, seed=1).volume).max() > 0
+    np.testing.assert_array_equal(SIRT(2).run(scan), OSSART(2, 5, OrderStrategy='ordered').run(scan))
+    np.testing.assert_array_equal(SART(2).run(scan), OSSART(2, 1).run(scan))
+    assert np.abs(SART(1).run(scan).volume - SART(1, seed=1).run(scan).volume).max() > 0
 
 
 def test_orders():
@@ -154,27 +154,27 @@ def test_order_strategy(system, strategy):
     blocks(scan.geometry.angles, 1, strategy, rng)  # the first draw is for a check of the name
     for _ in range(2):
         x = sart_pass(x, A, b, 0.8, blocks(scan.geometry.angles, 1, strategy, rng))
-    close(sart(scan, 2, 0.8, 1.0, OrderStrategy=strategy, seed=3), x)
+    close(SART(2, 0.8, 1.0, OrderStrategy=strategy, seed=3).run(scan), x)
 
 
-@pytest.mark.parametrize('name', ['sart', 'sirt', 'asd_pocs'])
+@pytest.mark.parametrize('name', ['sart', 'sirt', 'asd-pocs'])
 def test_noneg(system, name):
     scan = replace(system[0], projections=system[0].projections - system[0].projections.mean())
-    kept, free = (ALGORITHMS[name](scan, niter=2, noneg=noneg).volume for noneg in (True, False))
+    kept, free = (ITERATIVE[name](niter=2, noneg=noneg).run(scan).volume for noneg in (True, False))
     assert free.min() < -0.1 * free.max()
-    assert kept.min() >= (-0.01 * kept.max() if name == 'asd_pocs' else 0)  # whose descent comes after
+    assert kept.min() >= (-0.01 * kept.max() if name == 'asd-pocs' else 0)  # whose descent comes after
 
 
 def test_cgls_is_lsqr_and_its_residual_falls(system):
     scan, A, b = system
-    result = cgls(scan, 12)
+    result = CGLS(12).run(scan)
     expected = lsqr(A.reshape(-1, A.shape[2]), b.ravel(), iter_lim=12, atol=0, btol=0, conlim=0)[0]
     np.testing.assert_allclose(result.volume.ravel(), expected, atol=2e-3 * np.abs(expected).max())
     assert len(result.residuals) == 13 and np.all(np.diff(result.residuals) < 0)
     np.testing.assert_allclose(result.residuals[-1], np.linalg.norm(A @ expected - b) / np.linalg.norm(b), rtol=1e-4)
     start = np.random.default_rng(2).random(scan.geometry.nVoxel)
     shifted = Scan(scan.geometry, (b - A @ start.ravel()).reshape(scan.projections.shape))
-    close(cgls(scan, 4, start), start.ravel() + cgls(shifted, 4).volume.ravel())
+    close(CGLS(4).run(scan, start=start), start.ravel() + CGLS(4).run(shifted).volume.ravel())
 
 
 def squared_gradient(x):
@@ -214,7 +214,7 @@ def test_tv_gradient():
 def test_asd_pocs_is_the_transcription(system):
     scan, A, b = system
     shape, maxl2err = scan.geometry.nVoxel, 0.05 * np.linalg.norm(b)
-    result = asd_pocs(scan, 4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, OrderStrategy='ordered')
+    result = ASDPOCS(4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, OrderStrategy='ordered').run(scan)
     x, lmbda, step, errors = np.zeros(A.shape[2]), 0.9, None, []
     for _ in range(4):
         start = x
@@ -239,57 +239,57 @@ def test_asd_pocs_meets_exact_line_integrals():
     truth = rng.random(geo.nVoxel)
     scan = Scan(geo, project(truth, geo))
     missed = [
-        np.linalg.norm(project(asd_pocs(scan, 40, alpha=1e-6, exact_every=n).volume, geo) - scan.projections)
+        np.linalg.norm(project(ASDPOCS(40, alpha=1e-6, exact_every=n).run(scan).volume, geo) - scan.projections)
         for n in (0, 2)
     ]
     assert missed[1] < 0.2 * missed[0]
     valid = rng.random(scan.projections.shape) > 0.01
     masked = Scan(geo, scan.projections, valid)  # of which the projector is the exact one
-    np.testing.assert_array_equal(asd_pocs(masked, 2, exact_every=1).volume, asd_pocs(masked, 2).volume)
+    np.testing.assert_array_equal(ASDPOCS(2, exact_every=1).run(masked), ASDPOCS(2).run(masked))
 
 
 def test_asd_pocs_stops(system):
     scan, _, _ = system
-    assert len(asd_pocs(scan, 50, 5, 0.01, 0.8, maxl2err=1.0).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
+    assert len(ASDPOCS(50, 5, 0.01, 0.8, maxl2err=1.0).run(scan).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
     met = dict(tviter=5, alpha=0.02, lmbda_red=1.0, alpha_red=1.0, maxl2err=1e9, OrderStrategy='ordered')
     assert (
-        len(asd_pocs(scan, 100, 5, **met).residuals) < 100
+        len(ASDPOCS(100, 5, **met).run(scan).residuals) < 100
     )  # the data are met at once: the steps come to undo each other
-    assert len(asd_pocs(scan, 100, 5, **{**met, 'maxl2err': 1e-9}).residuals) == 101
+    assert len(ASDPOCS(100, 5, **{**met, 'maxl2err': 1e-9}).run(scan).residuals) == 101
 
 
-@pytest.mark.parametrize('name', ALGORITHMS)
+@pytest.mark.parametrize('name', ITERATIVE)
 @pytest.mark.parametrize('value', [0.0, 1.0, -1.0])
 def test_constant_projections(name, value):
     geo = small(n=2)
-    result = ALGORITHMS[name](Scan(geo, np.full((2, *geo.nDetector), value)), niter=2)
+    result = ITERATIVE[name](niter=2).run(Scan(geo, np.full((2, *geo.nDetector), value)))
     assert np.isfinite(result.volume).all() and np.isfinite(result.residuals).all()
     assert result.volume.dtype == np.float32 and result.volume.shape == geo.nVoxel
-    if name != 'cgls' and value <= 0 and name != 'asd_pocs':
+    if name != 'cgls' and value <= 0 and name != 'asd-pocs':
         assert not result.volume.any()
 
 
-@pytest.mark.parametrize('name', ALGORITHMS)
+@pytest.mark.parametrize('name', ITERATIVE)
 def test_bad_input(name):
     scan = Scan(small(n=2), np.ones((2, 17, 21)))
-    run = ALGORITHMS[name]
+    make = ITERATIVE[name]
     with pytest.raises(InputError, match='niter'):
-        run(scan, niter=0)
+        make(niter=0)
     with pytest.raises(InputError, match='nVoxel'):
-        run(scan, init=np.zeros((3, 3, 3)))
+        make().run(scan, start=np.zeros((3, 3, 3)))
     with pytest.raises(InputError, match='NaN'):
-        run(scan, init=np.full((9, 11, 7), np.nan))
+        make().run(scan, start=np.full((9, 11, 7), np.nan))
     if name != 'cgls':
         with pytest.raises(InputError, match='lmbda'):
-            run(scan, lmbda=3.0)
-    if name in ('sart', 'os_sart', 'asd_pocs'):
+            make(lmbda=3.0)
+    if name in ('sart', 'os-sart', 'asd-pocs'):
         with pytest.raises(
             InputError, match='OrderStrategy .sorted. is unknown: use one of ordered, random, angularDistance'
         ):
-            run(scan, OrderStrategy='sorted')
-    if name == 'asd_pocs':
+            make(OrderStrategy='sorted')
+    if name == 'asd-pocs':
         with pytest.raises(InputError, match='exact_every'):
-            run(scan, exact_every=-1)
+            make(exact_every=-1)
     for parameter, values in (
         ('seed', (-1,)),
         ('tol', (np.nan, -1.0, np.inf)),
@@ -298,18 +298,18 @@ def test_bad_input(name):
         ('rmax', (np.inf,)),
         ('niter', (np.inf, np.nan)),
     ):
-        for value in values if parameter in inspect.signature(run).parameters else ():
+        for value in values if parameter in make().options else ():
             with pytest.raises(InputError, match=f'{parameter} must be'):
-                run(scan, **{parameter: value})
+                make(**{parameter: value})
     calls = []
-    run(scan, niter=2, progress=lambda *a: calls.append(a))
+    make(niter=2).run(scan, progress=lambda *a: calls.append(a))
     assert [c[:2] for c in calls] == [(1, 2), (2, 2)] and all(np.isfinite(c[2]) for c in calls)
 
 
-@pytest.mark.parametrize('run', [sart, cgls, asd_pocs])
-def test_what_is_not_finite_is_no_result(run):
+@pytest.mark.parametrize('algorithm', [SART(), CGLS(), ASDPOCS()])
+def test_what_is_not_finite_is_no_result(algorithm):
     with pytest.raises(InputError, match='not finite'):
-        run(Scan(small(n=2), np.full((2, 17, 21), 1e25)))
+        algorithm.run(Scan(small(n=2), np.full((2, 17, 21), 1e25)))
 
 
 @pytest.mark.parametrize(
@@ -325,9 +325,8 @@ def test_what_is_not_finite_is_no_result(run):
     ],
 )
 def test_refined_checks_before_its_passes(wrong):
-    scan = Scan(small(n=2), np.ones((2, 17, 21)))
     with pytest.raises(InputError, match=f'{next(iter(wrong))} must be'):
-        refined(scan, completed=scan, sample=None, progress=lambda *_: pytest.fail('has begun'), **wrong)
+        Refined(**wrong)
 
 
 def test_structure_is_where_a_volume_changes():
@@ -350,10 +349,9 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
     geo = default_geometry(made, circular(12, 180.0), 96)
     scan = Scan(geo, project(made.data, geo))
     start = np.asarray(gaussian_filter(made.data, 1), np.float32)
-    found = refined(scan, 4, 0, 1, completed=scan, sample=lambda _: start).volume
-    alike = asd_pocs(
-        scan, 4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5, init=start
-    ).volume
+    found = Refined(4, 0, 1).run(scan, completed=scan, sample=lambda _: start).volume
+    alike = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
+    alike = alike.run(scan, start=start).volume
     assert psnr_3d(found, made.data) > psnr_3d(alike, made.data) + 1, [
         psnr_3d(v, made.data) for v in (found, alike, start)
     ]
@@ -372,7 +370,7 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
         return np.kron(means, np.ones(np.array(geometry.nVoxel) // means.shape))
 
     found = [
-        psnr_3d(refined(coarse, 3, 1, 5, finer=finer, completed=coarse, sample=sample).volume, means)
+        psnr_3d(Refined(3, 1, 5, finer=finer).run(coarse, completed=coarse, sample=sample).volume, means)
         for finer in (1, 2)
     ]
     assert found[1] > found[0] + 3, found
@@ -381,10 +379,10 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
 def test_no_kernel_is_compiled_after_the_first_iterations(system):
     scan, _, _ = system
     runs = [
-        lambda: sart(scan, 3),
-        lambda: sart(scan, 3, blur=(0.5, 0.5, 0.5)),
-        lambda: cgls(scan, 3),
-        lambda: asd_pocs(scan, 3, 2),
+        lambda: SART(3).run(scan),
+        lambda: SART(3).run(scan, blur=(0.5, 0.5, 0.5)),
+        lambda: CGLS(3).run(scan),
+        lambda: ASDPOCS(3, 2).run(scan),
     ]
     for run in runs:
         run()
@@ -397,7 +395,7 @@ def test_no_kernel_is_compiled_after_the_first_iterations(system):
     assert len({k['hash'] for k in history}) < 40
 
 
-@pytest.mark.parametrize('algorithm', [fdk, lambda scan: complete(scan, None, 9)])
+@pytest.mark.parametrize('algorithm', [FDK().run, lambda scan: complete(scan, None, 9)])
 def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
     geo = small(n=5)
     moved = Geometry.from_poses(

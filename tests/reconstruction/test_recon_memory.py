@@ -8,7 +8,7 @@ import pytest
 
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.requirements import NEEDS, needed
+from lingo_mi.reconstruction.memory_needs import NEEDS, needed
 
 # Not `resource`, whose maximum begins with that of the process which started this one.
 pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
@@ -19,13 +19,8 @@ import numpy as np
 from lingo_mi.runtime import use_variant
 use_variant('llvm_ad_mono')
 import mitsuba as mi
-from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.asd_pocs import asd_pocs
-from lingo_mi.reconstruction.cgls import cgls
-from lingo_mi.reconstruction.fdk import fdk
-from lingo_mi.reconstruction.refined import refined
-from lingo_mi.reconstruction.sart import os_sart, sart, sirt
+from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.reconstruction import ALGORITHMS
 from lingo_mi.scan import Scan
 from lingo_mi.projectors.joseph import Joseph
 
@@ -37,10 +32,12 @@ def run(size, pixels, views):
     scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
     del project
     few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
-    {'fdk': lambda: fdk(scan), 'sart': lambda: sart(scan, niter=1), 'os-sart': lambda: os_sart(scan, niter=1),
-     'sirt': lambda: sirt(scan, niter=1), 'cgls': lambda: cgls(scan, niter=1),
-     'asd-pocs': lambda: asd_pocs(scan, niter=1, tviter=2),
-     'refined': lambda: refined(few, 1, 1, 2, completed=scan, sample=lambda _: ramp)}[sys.argv[1]]()
+    options = {'fdk': {}, 'asd-pocs': dict(niter=1, tviter=2), 'refined': dict(niter=1, completed_niter=1, tviter=2)}
+    algorithm = ALGORITHMS[sys.argv[1]](**options.get(sys.argv[1], dict(niter=1)))
+    if sys.argv[1] == 'refined':
+        algorithm.run(few, completed=scan, sample=lambda _: ramp)
+    else:
+        algorithm.run(scan)
 
 def peak():
     return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))

@@ -15,9 +15,8 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.reconstruction.asd_pocs import asd_pocs
-from lingo_mi.reconstruction.refined import refined, structure
-from lingo_mi.reconstruction.sart import os_sart, sart, sirt
+from lingo_mi.reconstruction import ASDPOCS, OSSART, SART, SIRT, Refined
+from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.wide_pixels import blurred, excess_width
 from lingo_mi.scan import Scan
 
@@ -50,7 +49,7 @@ def test_excess_width():
     np.testing.assert_allclose(excess_width(replace(geo, mode='parallel', dDetector=(4, 2))), (0.5**0.5, 0, 0.5**0.5))
 
 
-@pytest.mark.parametrize('algorithm', [sart, os_sart, sirt, asd_pocs])
+@pytest.mark.parametrize('algorithm', [SART, OSSART, SIRT, ASDPOCS])
 def test_voxels_between_rays(algorithm):
     """Rows 2.3 voxels apart at the axis leave some voxels there out: they become like those around them. Beyond the panel only
     total variation changes anything."""
@@ -58,12 +57,12 @@ def test_voxels_between_rays(algorithm):
     geo = default_geometry(made, circular(30), 64)
     geo = replace(geo, nDetector=(8, 64), dDetector=(2.3 * geo.DSD / geo.DSO, geo.dDetector[1]))
     A = Joseph(geo)
-    met = A.adjoint(dr.ones(mi.Float, 30 * A.pixels), np.arange(30)).numpy().reshape(geo.nVoxel) > 0
-    assert not met[11:13, 11:13, 10:26].all() and not met[:, :, 0].any()
-    found = algorithm(Scan(geo, project(made.data, geo)), 8).volume
+    crossed = A.adjoint(dr.ones(mi.Float, 30 * A.pixels), np.arange(30)).numpy().reshape(geo.nVoxel) > 0
+    assert not crossed[11:13, 11:13, 10:26].all() and not crossed[:, :, 0].any()
+    found = algorithm(8).run(Scan(geo, project(made.data, geo))).volume
     centre = found[11:13, 11:13, 9:27]
     assert np.abs(centre - 1).max() < 0.03, centre[0, 0]
-    assert found[:, :, :5].max() < (0.03 if algorithm is asd_pocs else 1e-6)
+    assert found[:, :, :5].max() < (0.03 if algorithm is ASDPOCS else 1e-6)
 
 
 def test_wide_pixels_leave_no_pattern():
@@ -74,19 +73,9 @@ def test_wide_pixels_leave_no_pattern():
     scan = Scan(geo, project(made.data, geo))
     wrong = np.float32(0.1 * made.data.max()) * np.asarray(gaussian_filter(np.float32(made.data > 0), 3), np.float32)
     start = made.data + wrong
-    found = refined(scan, 4, 0, 1, completed=scan, sample=lambda _: start).volume
-    plain = asd_pocs(
-        scan,
-        4,
-        tviter=1,
-        alpha=0.12,
-        alpha_red=0.87,
-        rmax=0.65,
-        maxl2err=0.0,
-        exact_every=5,
-        init=start,
-        weights=structure(start),
-    ).volume
+    found = Refined(4, 0, 1).run(scan, completed=scan, sample=lambda _: start).volume
+    plain = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
+    plain = plain.run(scan, start=start, weights=structure(start)).volume
     assert psnr_3d(found, made.data) > psnr_3d(plain, made.data) + 0.5, [
         psnr_3d(v, made.data) for v in (found, plain, start)
     ]

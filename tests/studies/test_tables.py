@@ -33,8 +33,8 @@ def tiny(monkeypatch):
     monkeypatch.setattr(tables, 'SCANNED', 25)
     monkeypatch.setattr(tables, 'COMPLETED', 30)
     monkeypatch.setitem(METHODS, 'fast', METHODS['fast'].changed(iterations=15))
-    monkeypatch.setitem(tables.ALGORITHMS, 'sart', (tables.sart, dict(niter=2)))
-    monkeypatch.setitem(tables.ALGORITHMS, 'asd-pocs', (tables.asd_pocs, dict(niter=1, tviter=2)))
+    monkeypatch.setitem(tables.ALGORITHMS, 'sart', tables.SART(niter=2))
+    monkeypatch.setitem(tables.ALGORITHMS, 'asd-pocs', tables.ASDPOCS(niter=1, tviter=2))
 
 
 @pytest.fixture(scope='module')
@@ -92,18 +92,20 @@ def test_two_stages(out):
     assert rows['voxelize']['none'] is None and '| voxelize | foot | – | – |' in text
     volumes = [rows[a][m]['psnr_3d'] for a in ('fdk', 'sart', 'asd-pocs') for m in ('none', 'r2')]
     assert len(set(volumes)) == 6 and min(volumes) > 0
-    # The numbers are those of the functions, on views rendered from the stored cloud.
+    # The numbers are those of the algorithms, on views rendered from the stored cloud.
     cells = Cells(out, TINY)
     fit = Fit('foot', 4, 'r2', 20)
     whole = cells._completed(fit)
     assert len(whole) == 30
     train = cells.dataset('foot').train
     np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
-    volume = tables.fdk(whole)
+    volume = tables.FDK().run(whole).volume
     truth = make('foot', 16).data
     assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
     measured = train.subset([0, 6, 12, 18])
-    found = tables.refined(measured, completed=whole, sample=cells._cloud(fit).volume).volume
+    stepper, state = cells._cloud(fit)
+    refined = tables.Refined().run(measured, completed=whole, sample=lambda geometry: stepper.volume(state, geometry))
+    found = refined.volume
     assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(found, truth), abs=1e-3)
     assert (
         rows['refined']['none'] is None

@@ -1,4 +1,4 @@
-"""Memory that each algorithm takes at its peak, as tests/test_recon_memory.py measures it."""
+"""Memory that each algorithm takes at its peak, as tests/reconstruction/test_recon_memory.py measures it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Need(NamedTuple):
     projections: float
 
 
-NEEDS = {
+NEEDS = {  # by the algorithms' names
     'fdk': Need(3.4, 3.4, 2.5),
     'sart': Need(4.6, 8.7, 4.2),
     'os-sart': Need(3.7, 7.7, 4.8),
@@ -32,8 +32,8 @@ NEEDS = {
 
 
 def needed(algorithm: str, geometry: Geometry, views: int) -> float:
-    """Bytes that an algorithm takes at its peak: the larger of what works on volumes, beside two sets of projections, and of what
-    works on projections, beside a volume."""
+    """Bytes that an algorithm, one of `NEEDS`, takes at its peak: the larger of what works on volumes, beside two sets of
+    projections, and of what works on projections, beside a volume."""
     volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes

@@ -1,4 +1,4 @@
-"""What reconstruction on voxels asks of a scan, and how its views lie around the circle."""
+"""What reconstruction on voxels asks of a scan."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
-def on_circle(scan: Scan) -> bool:
-    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid; `upright.is_circular`
-    asks the same of a panel that is turned or tilted."""
+def is_circular(scan: Scan) -> bool:
+    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid.
+
+    `rectify.can_rectify` asks the same of a panel that is turned or tilted.
+    """
     return isinstance(scan.geometry, CircularGeometry) and scan.valid is None
 
 
 def require_circle(scan: Scan, what: str):
-    """Raises InputError, naming what needs it, for a scan that is not `on_circle`."""
+    """Raises InputError, naming what needs it, for a scan that is not `is_circular`."""
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)
@@ -50,22 +52,3 @@ def require_signal(scan: Scan, purpose: str = 'reconstruct'):
         raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')
     if scan.projections.max() <= 0:
         raise InputError(f'the projections are nowhere above zero: there is nothing to {purpose}; check their sign')
-
-
-def gaps(geometry: Geometry, turn: float):
-    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
-
-    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
-    step.
-    """
-    angle = np.mod(geometry.angles, turn)
-    order = np.argsort(angle, kind='stable')
-    gap = np.diff(angle[order], append=angle[order[0]] + turn)
-    distinct = np.sort(gap[gap > 1e-6])
-    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
-    is_open = bool(distinct[-1] > 1.5 * typical)
-    if is_open:
-        widest = np.argmax(gap)
-        gap[widest] = typical
-        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
-    return order, gap, is_open

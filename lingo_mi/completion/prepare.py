@@ -1,0 +1,77 @@
+"""What an algorithm on voxels is given of a scan and a fitted cloud: views completed from it, or its volume to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.completion.clouds import FittedCloud
+from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
+from lingo_mi.errors import InputError
+from lingo_mi.fit.fitted import Fitted
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.reconstruction import FDK, Algorithm, Refined, check_scan
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.truth import voxelize_cloud
+
+
+def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
+    """The cloud's densities per mm, float32 [x, y, z], at the voxel centres of a geometry, as a function of that.
+
+    Raises InputError for a cloud of alpha compositing, which has none.
+    """
+    if isinstance(cloud, Fitted):
+        if cloud.cloud() is None:
+            raise InputError('opacities and radiances make no volume: take the cloud of another method')
+        return cloud.volume
+
+    def sample(geometry: Geometry) -> np.ndarray:
+        return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
+
+    return sample
+
+
+def prepare_completed(
+    dataset: Dataset, cloud: FittedCloud | Fitted, views: int, algorithm: Algorithm
+) -> tuple[Scan, dict[str, Any]]:
+    """The views that a cloud was fitted to and those between them, rendered from it: `views` in all.
+
+        scan, inputs = prepare_completed(dataset, cloud, 100, algorithm)
+        found = reconstruct(scan, algorithm, **inputs)
+
+    dataset   holds the views that the cloud was fitted to
+
+    `Refined` is given the measured views, and the completed ones and the cloud's densities beside them; any other algorithm the
+    completed ones. Raises InputError as `fitted_views`, `check_scan` and `complete` do, and for FDK where the fit has corrected
+    the poses.
+    """
+    measured = fitted_views(dataset, cloud.geometry)
+    on_circle = [isinstance(g, CircularGeometry) for g in (measured.geometry, cloud.corrected)]
+    if isinstance(algorithm, FDK) and on_circle == [True, False]:
+        raise InputError(
+            'filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
+            'take another algorithm'
+        )
+    check_scan(measured.geometry, algorithm, views)
+    whole = complete(measured, cloud, views)
+    if isinstance(algorithm, Refined):
+        return whole.subset(np.arange(len(measured))), dict(completed=whole, sample=sampled(cloud))
+    return whole, {}
+
+
+def prepare_start(dataset: Dataset, cloud: FittedCloud | Fitted, algorithm: Algorithm) -> tuple[Scan, dict[str, Any]]:
+    """The views that a cloud was fitted to, with the cloud's own volume to start from.
+
+        scan, inputs = prepare_start(dataset, cloud, algorithm)
+        found = reconstruct(scan, algorithm, **inputs)
+
+    dataset   holds the views that the cloud was fitted to
+
+    `Refined` is given the cloud's densities, to sample them on its voxels; its completed_niter must be 0. Raises InputError as
+    `fitted_views` and `sampled` do.
+    """
+    scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
+    sample = sampled(cloud)
+    return scan, dict(sample=sample) if isinstance(algorithm, Refined) else dict(start=sample(scan.geometry))

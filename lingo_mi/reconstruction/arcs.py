@@ -1,0 +1,26 @@
+"""How the views of a scan lie around the circle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.geometry.base import Geometry
+
+
+def gaps(geometry: Geometry, turn: float):
+    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
+
+    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
+    step.
+    """
+    angle = np.mod(geometry.angles, turn)
+    order = np.argsort(angle, kind='stable')
+    gap = np.diff(angle[order], append=angle[order[0]] + turn)
+    distinct = np.sort(gap[gap > 1e-6])
+    typical = np.median(distinct[:-1]) if len(distinct) > 1 else distinct[-1]
+    is_open = bool(distinct[-1] > 1.5 * typical)
+    if is_open:
+        widest = np.argmax(gap)
+        gap[widest] = typical
+        order, gap = np.roll(order, -widest - 1), np.roll(gap, -widest - 1)
+    return order, gap, is_open

@@ -1,0 +1,67 @@
+"""Algorithms run with what goes around them: checks before, a bar of progress during."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from numpy.typing import ArrayLike
+
+from lingo_mi import progress as bars
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.memory_needs import needed
+from lingo_mi.reconstruction.preconditions import require_rays, require_signal
+from lingo_mi.scan import Scan
+from lingo_mi.scene.checks import check_memory
+
+
+def reconstruct(
+    scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs
+) -> Reconstruction:
+    """The volume of a scan by an algorithm, if this machine can hold it and the scan can give one.
+
+        found = reconstruct(scan, ASDPOCS(niter=20))
+        better = reconstruct(scan, SART(niter=5), start=found)
+
+    scan       projections and geometry. Projections are taken for line integrals: take the effects of a detector out before
+               (`effects_correction.linearised`)
+    algorithm  with its options
+    start      volume [x, y, z] to start from, density per mm (default: zero)
+    progress   called as progress(steps done, steps, residual or None) after every step
+    inputs     further arguments of this algorithm's `run`, such as `weights`, or `sample` and `completed` of `Refined`
+
+    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and where the result
+    is not finite.
+    """
+    check_scan(scan.geometry, algorithm, max(len(scan), len(inputs.get('completed') or ())))
+    require_signal(scan)
+    return algorithm.run(scan, start=start, progress=progress, **inputs)
+
+
+def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None):
+    """Raises InputError where no ray meets the volume, where the source is in it, and where memory is too small.
+
+    algorithm   whose memory is asked for (None: the least that any needs)
+    views       that it works on (None: the geometry's own)
+    """
+    require_rays(geometry)
+    views = views or len(geometry)
+    if algorithm is None:
+        check_memory(geometry, views=views)
+    else:
+        grid = algorithm.grid(geometry)
+        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views))
+
+
+@contextmanager
+def progress_bar(algorithm: Algorithm, scan: Scan, label: str | None = None) -> Iterator[Progress]:
+    """A `progress` that is shown on standard error.
+
+        with progress_bar(algorithm, scan) as progress:
+            found = reconstruct(scan, algorithm, progress=progress)
+
+    label   before the bar (default: the algorithm's name)
+    """
+    with bars.Progress(label or algorithm.name, algorithm.steps(scan)) as bar:
+        yield lambda done, _, residual: bar.update(done, residual=residual)

@@ -1,0 +1,193 @@
+"""Algorithms as objects: options and their checks, what `run` and `reconstruct` take and give, the examples of their docs."""
+
+import doctest
+import importlib
+from dataclasses import FrozenInstanceError, fields, replace
+
+import numpy as np
+import pytest
+
+from helpers.grids import scan as small
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.grid import project
+from lingo_mi.reconstruction import ALGORITHMS, CGLS, FDK, SART, Reconstruction, Refined, progress_bar, reconstruct
+from lingo_mi.scan import Scan
+
+FAST = dict(niter=2, completed_niter=0, tviter=2)  # of those that have it
+
+
+def quick(name):
+    """An algorithm of few steps."""
+    made = ALGORITHMS[name]
+    return made(**{option: value for option, value in FAST.items() if option in made().options})
+
+
+def inputs(name, scan):
+    """What `run` of this algorithm cannot do without."""
+    return dict(start=np.ones(scan.geometry.nVoxel)) if name == 'refined' else {}
+
+
+@pytest.fixture(scope='module')
+def scan():
+    geometry = small(n=5)
+    return Scan(geometry, project(np.random.default_rng(0).random(geometry.nVoxel), geometry))
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+def test_what_comes_back(scan, name):
+    found = quick(name).run(scan, **inputs(name, scan))
+    assert isinstance(found, Reconstruction) and found.geometry is scan.geometry
+    assert found.volume.dtype == np.float32 and found.volume.shape == scan.geometry.nVoxel
+    assert found.seconds > 0 and len(found.residuals) == (0 if name == 'fdk' else 3)
+
+
+def test_as_an_array(scan):
+    found = FDK().run(scan)
+    assert np.asarray(found) is found.volume
+    assert np.asarray(found, np.float64).dtype == np.float64 and np.mean(found) == np.mean(found.volume)
+    copied = np.array(found)
+    copied[:] = 0
+    assert found.volume.any()
+
+
+@pytest.mark.parametrize('name', [name for name in ALGORITHMS if name not in ('fdk', 'refined')])
+def test_a_start_is_anything_that_gives_an_array(scan, name):
+    first, algorithm = FDK().run(scan), quick(name)
+    found = algorithm.run(scan, start=first.volume)
+    assert np.abs(found.volume - algorithm.run(scan).volume).max() > 1e-4
+    for start in (first, first.volume.astype(float), first.volume.tolist()):
+        again = algorithm.run(scan, start=start)
+        np.testing.assert_array_equal(again, found)
+    assert found.residuals[0] == again.residuals[0] < 1
+
+
+def test_options_are_fields(scan):
+    for name, algorithm in ALGORITHMS.items():
+        made = algorithm()
+        assert made.name == name and list(made.options) == [f.name for f in fields(algorithm)]
+        assert algorithm(**made.options) == made
+        with pytest.raises(FrozenInstanceError):
+            setattr(made, next(iter(made.options)), 0)
+    assert SART(niter=3) == replace(SART(), niter=3) != SART()
+
+
+@pytest.mark.parametrize(
+    'name, wrong, says',
+    [
+        ('fdk', dict(filter='box'), "filter 'box' is unknown: use one of ram-lak, shepp-logan, cosine, hamming, hann"),
+        ('sart', dict(niter=0), 'niter must be an integer from 1 on, not 0'),
+        ('sart', dict(lmbda=2.5), 'lmbda must be above 0 and at most 2, not 2.5'),
+        ('sart', dict(lmbda_red=0), 'lmbda_red must be above 0 and at most 1, not 0'),
+        (
+            'sart',
+            dict(OrderStrategy='any'),
+            "OrderStrategy 'any' is unknown: use one of ordered, random, angularDistance",
+        ),
+        ('sart', dict(seed=-1), 'seed must be an integer from 0 on, not -1'),
+        ('os-sart', dict(blocksize=0), 'blocksize must be an integer from 1 on, not 0'),
+        ('os-sart', dict(tol=-1), 'tol must be from 0 to 1e+18, not -1'),
+        ('sirt', dict(niter=1.5), 'niter must be an integer from 1 on, not 1.5'),
+        ('sirt', dict(tol=np.nan), 'tol must be from 0 to 1e+18, not nan'),
+        ('cgls', dict(tol=np.inf), 'tol must be from 0 to 1e+18, not inf'),
+        ('asd-pocs', dict(rmax=0), 'rmax must be above 0 and at most 1e+18, not 0'),
+        ('asd-pocs', dict(tviter=0), 'tviter must be an integer from 1 on, not 0'),
+        ('asd-pocs', dict(OrderStrategy='any'), "OrderStrategy 'any' is unknown"),
+        ('refined', dict(finer=0), 'finer must be an integer from 1 on, not 0'),
+        ('refined', dict(completed_niter=-1), 'completed_niter must be an integer from 0 on, not -1'),
+        ('refined', dict(alpha=0), 'alpha must be above 0 and at most 1e+18, not 0'),
+    ],
+)
+def test_options_are_checked_at_once(name, wrong, says):
+    with pytest.raises(InputError) as error:
+        ALGORITHMS[name](**wrong)
+    assert str(error.value).startswith(says)
+
+
+def test_what_a_run_needs(scan):
+    volume = np.ones(scan.geometry.nVoxel)
+    with pytest.raises(InputError, match='leave out start'):
+        FDK().run(scan, start=volume)
+    with pytest.raises(InputError, match='completed_niter must be 0 where no completed views are given'):
+        Refined().run(scan, start=volume)
+    refined = quick('refined')
+    for given in ({}, dict(start=volume, sample=lambda _: volume)):
+        with pytest.raises(InputError, match='give it as start, or a function for it as sample'):
+            refined.run(scan, **given)
+    with pytest.raises(InputError, match='give sample in the place of start'):
+        replace(refined, finer=2).run(scan, start=volume)
+    with pytest.raises(InputError, match='the start volume: shape'):
+        refined.run(scan, start=volume[1:])
+    by_start = refined.run(scan, start=volume)
+    np.testing.assert_array_equal(by_start, refined.run(scan, sample=lambda g: np.ones(g.nVoxel, np.float32)))
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+def test_progress_counts_the_steps(scan, name):
+    algorithm, told = quick(name), []
+    algorithm.run(scan, progress=lambda *said: told.append(said), **inputs(name, scan))
+    assert told[-1][:2] == (algorithm.steps(scan),) * 2 and [done for done, _, _ in told] == sorted(t[0] for t in told)
+    assert all(residual is None if name == 'fdk' else residual > 0 for _, _, residual in told)
+
+
+def test_progress_of_both_stages(scan):
+    told, refined = [], Refined(niter=2, completed_niter=1, tviter=2)
+    few = scan.subset([0, 2])
+    refined.run(few, progress=lambda *said: told.append(said), start=np.ones(scan.geometry.nVoxel), completed=scan)
+    assert [said[:2] for said in told] == [(1, 3), (2, 3), (3, 3)] and told[0][2] is None and told[1][2] > 0
+
+
+def test_a_bar(scan, capsys):
+    algorithm = CGLS(niter=2)
+    with progress_bar(algorithm, scan) as progress:
+        algorithm.run(scan, progress=progress)
+    said = capsys.readouterr().err
+    assert 'cgls: 2/2 (100%)' in said and 'residual' in said
+    with progress_bar(FDK(), scan, 'first look') as progress:
+        FDK().run(scan, progress=progress)
+    assert 'first look: 5/5 (100%)' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+def test_reconstruct_is_the_run(scan, name):
+    given = inputs(name, scan)
+    np.testing.assert_array_equal(reconstruct(scan, quick(name), **given), quick(name).run(scan, **given))
+
+
+def test_reconstruct_asks_first(scan, monkeypatch):
+    g = scan.geometry
+    with pytest.raises(InputError, match='zero everywhere'):
+        reconstruct(replace(scan, projections=0 * scan.projections), FDK())
+    with pytest.raises(InputError, match='nowhere above zero'):
+        reconstruct(replace(scan, projections=-scan.projections), FDK())
+    with pytest.raises(InputError, match='no ray meets the volume'):
+        reconstruct(replace(scan, geometry=replace(g, offOrigin=(0.0, 0.0, 1000.0))), FDK())
+    with pytest.raises(InputError, match='source lies within the volume'):
+        reconstruct(replace(scan, geometry=replace(g, DSO=5.0)), FDK())
+    volume = 4 * np.prod(g.nVoxel)
+    projections = 4 * scan.projections.size
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 3.5 * volume + 8 * projections)
+    assert reconstruct(scan, FDK()).volume.any()
+    start = np.ones(g.nVoxel)
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 20 * volume + 8 * projections)
+    refined = quick('refined')
+    reconstruct(scan, refined, start=start)
+    with pytest.raises(InputError, match='18 x 22 x 14 voxels and 5 views'):  # of those that it works on
+        reconstruct(scan, replace(refined, finer=2), sample=lambda geometry: np.ones(geometry.nVoxel))
+    many = Scan(Geometry.joined(g, small(n=200)), np.concatenate([scan.projections, np.ones((200, *g.nDetector))]))
+    with pytest.raises(InputError, match='205 views'):
+        reconstruct(scan, replace(refined, completed_niter=1), start=start, completed=many)
+
+
+@pytest.mark.parametrize('name', ALGORITHMS)
+def test_documentation(name):
+    """The examples run, and every option is described."""
+    algorithm = ALGORITHMS[name]
+    module = importlib.import_module(algorithm.__module__)
+    found = doctest.DocTestFinder(recurse=False).find(
+        algorithm, algorithm.__name__, globs=vars(module) | dict(SART=SART)
+    )
+    runner = doctest.DocTestRunner()
+    assert found[0].examples and runner.run(found[0]).failed == 0
+    words = algorithm.__doc__.replace(',', ' ').split()
+    assert all(option in words for option in algorithm().options)
