@@ -19,7 +19,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS, VOLUMETRIC, settings_of
+from lingo_mi.fit.recipes import METHODS, VOLUMETRIC, settings_of
 
 COLUMNS = (
     ('psnr_2d', 'views, dB', '{:.2f}'),

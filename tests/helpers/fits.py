@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lingo_mi.fit.settings import R2
+from lingo_mi.fit.recipes import R2
 from lingo_mi.geometry.base import Geometry, circular
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.phantoms.gaussians import Cloud

@@ -26,7 +26,7 @@ from helpers import oracle
 from helpers.oracle import Cloud, Pose, random_cloud
 from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.fit.loop import run as fit
-from lingo_mi.fit.settings import FAST
+from lingo_mi.fit.recipes import FAST
 from lingo_mi.fit.state import activate
 from lingo_mi.geometry.base import Geometry, circular
 from lingo_mi.geometry.rays import Rays
@@ -618,7 +618,7 @@ def fit_to(scan, iterations, **changes):
     assert all(np.isfinite(x).all() for x in (centre, scale, rotation, density)) and len(density)
     assert all(np.isfinite(x).all() for c in (done.state.first, done.state.second) for x in c.values())
     # The sigmoid reaches its bounds where float32 saturates.
-    assert scale.min() >= done.settings.scale_min and scale.max() <= done.settings.scale_max
+    assert scale.min() >= done.settings.bounds.scale_min and scale.max() <= done.settings.bounds.scale_max
     assert all(np.isfinite(entry['loss']) for entry in done.history)
     return done
 
