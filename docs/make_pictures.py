@@ -23,7 +23,7 @@ def main():
     use_variant()
     from lingo_mi.fit.initial import initial_cloud
     from lingo_mi.fit.loop import run
-    from lingo_mi.fit.settings import FAST
+    from lingo_mi.fit.recipes import FAST
     from lingo_mi.results.measure import quick_measure
     from lingo_mi.scene.load import load_scene
     from lingo_mi.scene.shipped import scene_path

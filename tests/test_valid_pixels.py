@@ -1,6 +1,7 @@
 """Pixels that are left out, and scans that the panel cuts off: in the scan, its file, the initial cloud and the fit."""
 
 import warnings
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -12,10 +13,10 @@ from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.recipes import METHODS
 from lingo_mi.fit.view import Target
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.initialise import Settings, initialise
+from lingo_mi.lingo.initialise import LingoSettings, initialise
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
 from lingo_mi.reconstruction.fdk import FDK
@@ -158,14 +159,11 @@ def test_densities_come_from_valid_pixels(scan):
 
         clouds.append(
             initialise(
-                g.normalised_rays(),
-                spoilt(scan, valid, value) * g.scale,
-                g.nVoxel,
-                g.half,
-                Settings(n_points=300),
+                # A Scan would forget what stands there.
+                SimpleNamespace(geometry=g, normalised=spoilt(scan, valid, value) * g.scale, valid=valid),
+                LingoSettings(n_points=300),
                 np.random.default_rng(0),
                 render,
-                valid=valid,
             )
         )
     np.testing.assert_array_equal(clouds[0].points, clouds[1].points)

@@ -9,7 +9,8 @@ from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
-from lingo_mi.fit.settings import Settings, settings_of
+from lingo_mi.fit.recipes import settings_of
+from lingo_mi.fit.settings import Settings
 from lingo_mi.interrupts import between_steps
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure

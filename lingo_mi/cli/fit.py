@@ -24,7 +24,7 @@ from lingo_mi.cli.common import (
     writable_folder,
 )
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.recipes import METHODS
 from lingo_mi.interrupts import between_steps
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
@@ -86,7 +86,7 @@ def main():
     if twice := given.keys() & options.keys():
         raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
     given |= options
-    unknown = [k for k in given if not hasattr(METHODS[args.method], k)]
+    unknown = [k for k in given if k not in METHODS[args.method].flat()]
     if unknown:
         names = ', '.join(sorted(own)) or 'it has none'
         raise InputError(

@@ -99,6 +99,6 @@ def _composited(path) -> Fitted:
     if not Path(path).exists():
         raise InputError(f'{path}: no such file; {WANTED}')
     fitted = Fitted.from_checkpoint(path)
-    if fitted.settings.render != 'alpha':
+    if fitted.settings.volumetric:
         raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
     return fitted

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from lingo_mi.errors import InputError
@@ -20,25 +18,25 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     What is in units of the scene's radius becomes a length. Raises InputError where the source is in the volume.
     """
     g = scan.geometry
-    if settings.render == 'alpha':
+    if not settings.volumetric:
         radius = scene_radius(g)
-        settings = replace(
-            settings,
-            rate_centre=tuple(radius * r for r in settings.rate_centre),
-            split_size=radius * settings.split_size,
-            prune_size=radius * settings.prune_size,
+        settings = settings.changed(
+            rate_centre=tuple(radius * r for r in settings.adam.rate_centre),
+            split_size=radius * settings.densification.split_size,
+            prune_size=radius * settings.densification.prune_size,
         )
-    if settings.values_per_gaussian > 0:
-        most = min(max(int(scan.projections.size / settings.values_per_gaussian), 1), settings.max_gaussians)
-        settings = replace(settings, max_gaussians=most, n_points=min(settings.n_points, most))
+    control, bounds = settings.densification, settings.bounds
+    if control.values_per_gaussian > 0:
+        most = min(max(int(scan.projections.size / control.values_per_gaussian), 1), control.max_gaussians)
+        settings = settings.changed(max_gaussians=most, n_points=min(settings.start.n_points, most))
     if g.mode == 'parallel':
         return settings
     rays = g.normalised_rays()
     room = np.linalg.norm(rays.source, axis=1).min() - np.linalg.norm(g.half)
-    largest = 0.9 * room / settings.extent
-    if largest <= settings.scale_min:
+    largest = 0.9 * room / settings.model.extent
+    if largest <= bounds.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
-    return replace(settings, scale_max=min(settings.scale_max, largest))
+    return settings.changed(scale_max=min(bounds.scale_max, largest))
 
 
 def scene_radius(geometry: Geometry) -> float:

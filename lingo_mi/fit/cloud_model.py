@@ -66,11 +66,11 @@ class CloudModel:
         The grid must be of the scan's size, whatever its voxels.
         None for alpha compositing: opacities and radiances are no attenuation.
         """
-        if self.settings.render == 'alpha':
+        if not self.settings.volumetric:
             return None
         g = geometry or self.geometry
         grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        values = voxelize(*state.gaussians(self.settings), grid, self.settings.extent, deep=True)
+        values = voxelize(*state.gaussians(self.settings), grid, self.settings.model.extent, deep=True)
         return grid.volume(values) * np.float32(self.unit)
 
     def shares(self, state: DeviceState):
@@ -82,7 +82,7 @@ class CloudModel:
 
     def cloud(self, state: DeviceState) -> Ellipsoids | None:
         """The Gaussians in the world frame, mm, densities in 1/mm; None for alpha compositing, which knows no densities."""
-        if self.settings.render == 'alpha':
+        if not self.settings.volumetric:
             return None
         centre, scale, rotation, density = (dr.detach(x) for x in state.gaussians(self.settings))
         size, middle = dr.opaque(mi.Float, self.geometry.scale), dr.opaque(mi.Point3f, self.geometry.offOrigin)

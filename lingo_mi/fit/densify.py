@@ -33,13 +33,14 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     flat      whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
     largest   standard deviation above which the Gaussians of alpha compositing vanish
     """
+    control = settings.densification
     mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
-    strong = mean >= settings.densify_threshold
-    room = max(settings.max_gaussians - len(state), 0)  # each adds one
+    strong = mean >= control.densify_threshold
+    room = max(control.max_gaussians - len(state), 0)  # each adds one
     strong[np.argsort(-mean, kind='stable')[room:]] = False
-    if settings.birth == 'halve':
+    if control.birth == 'halve':
         return prune(halve(state, strong, settings, flat), settings, half, largest)
-    large = activate(state, settings)[1].max(1) > settings.split_size
+    large = activate(state, settings)[1].max(1) > control.split_size
     state = split(
         clone(state, strong & ~large),
         np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
@@ -59,7 +60,7 @@ def clone(state: State, chosen) -> State:
 def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> State:
     """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
-    low, high = settings.scale_min, settings.scale_max
+    low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation, _ = activate(state, settings)
     shrink = np.array([SHRINK, SHRINK, 1.0 if flat else SHRINK])
     children = _fresh(_with_density(state, chosen, 0.5), parents)
@@ -75,7 +76,7 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
 def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State:
     """Replace each of the chosen Gaussians [N] by two, side by side along its longest axis, with its mass and covariance."""
     parents = np.flatnonzero(chosen)
-    low, high = settings.scale_min, settings.scale_max
+    low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
     axis = np.eye(3)[scale[:, : 2 if flat else 3].argmax(1)]
     shrink = np.where(axis > 0, np.sqrt(1 - APART**2), 1)
@@ -94,8 +95,8 @@ def prune(state: State, settings: Settings, half, largest: float = np.inf) -> St
     For alpha compositing: those whose opacity is below the bound or a standard deviation above `largest`.
     """
     centre, scale, _, density = activate(state, settings)
-    inside = (np.abs(centre) <= np.asarray(half)).all(1) if settings.render == 'integral' else scale.max(1) <= largest
-    keep = (density >= settings.prune_density) & inside
+    inside = (np.abs(centre) <= np.asarray(half)).all(1) if settings.volumetric else scale.max(1) <= largest
+    keep = (density >= settings.densification.prune_density) & inside
     kept = _take(state, keep)
     kept.gradient[:], kept.seen[:] = 0, 0
     return kept

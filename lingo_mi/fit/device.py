@@ -52,11 +52,11 @@ class DeviceState:
         """
         v = self.values
         low, high = (
-            dr.opaque(mi.Float, settings.scale_min),
-            dr.opaque(mi.Float, settings.scale_max - settings.scale_min),
+            dr.opaque(mi.Float, settings.bounds.scale_min),
+            dr.opaque(mi.Float, settings.bounds.scale_max - settings.bounds.scale_min),
         )
         scale = low + high / (1 + dr.exp(-v['scale']))
-        if settings.render == 'alpha':
+        if not settings.volumetric:
             radiance = [v[k] for k in ('radiance', 'harmonics') if k in v]
             return v['centre'], scale, v['rotation'], 1 / (1 + dr.exp(-v['opacity'])), *radiance
         return v['centre'], scale, v['rotation'], _softplus(v['density'])
@@ -67,14 +67,16 @@ class DeviceState:
 
     def adam(self, gradients: dict, settings: Settings, iteration: int):
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
-        b1, b2, step = settings.beta1, settings.beta2, iteration + 1
+        b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
         # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
         c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
         for name, g in gradients.items():
             m = b1 * self.first[name] + (1 - b1) * g
             v = b2 * self.second[name] + (1 - b2) * g * g
             rate = dr.opaque(mi.Float, settings.rate(name, iteration))
-            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + settings.epsilon)
+            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (
+                dr.sqrt(v * c2) + settings.adam.epsilon
+            )
             self.first[name], self.second[name] = m, v
         dr.eval(self.values, self.first, self.second, self.gradient, self.seen)
 

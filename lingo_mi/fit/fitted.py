@@ -117,7 +117,7 @@ class Fitted:
             )
         geometry = mi.load_dict(scanner).geometry
         poses = None
-        if max(settings.rate_pose) > 0:
+        if max(settings.adam.rate_pose) > 0:
             poses = Poses(len(geometry))
             poses.restore(arrays)
         state.values |= average.values_of(arrays)

@@ -13,7 +13,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.measured import density_unit, linearised
 from lingo_mi.fit.r2_start import r2_initialise
 from lingo_mi.fit.settings import Settings
-from lingo_mi.fit.state import start
+from lingo_mi.fit.state import start as initial_state
 from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.lingo import initialise as lingo
 from lingo_mi.lingo.initialise import InitialCloud
@@ -33,26 +33,24 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     rng = np.random.default_rng(seed)
     scan = linearised(scan, settings)
     g, unit = scan.geometry, density_unit(scan, settings)
-    if settings.init == 'random':
-        cloud = random_points(g.half, g.nVoxel[2] == 1, settings.n_points, rng)
-    elif settings.init == 'cuboid':
-        cloud = cuboid(g.nVoxel, g.half, settings.cuboid_step)
-    elif settings.init == 'r2':
+    start = settings.start
+    if start.init == 'random':
+        cloud = random_points(g.half, g.nVoxel[2] == 1, start.n_points, rng)
+    elif start.init == 'cuboid':
+        cloud = cuboid(g.nVoxel, g.half, start.cuboid_step)
+    elif start.init == 'r2':
         volume = FDK().run(scan).volume / unit
-        cloud = r2_initialise(volume, g.half, rng, settings.n_points, settings.fdk_threshold, settings.fdk_rescale)
+        cloud = r2_initialise(volume, g.half, rng, start.n_points, start.fdk_threshold, start.fdk_rescale)
         cloud = replace(cloud, density=cloud.density * unit)
     else:
 
         def render(points, density, spacing, views):
-            state = DeviceState(start(points, spacing, density / unit, settings))
+            state = DeviceState(initial_state(points, spacing, density / unit, settings))
             return CloudModel(settings, g, unit).render(state, g.subset(views)) * g.scale
 
-        chosen = settings.of_start()
-        if chosen.density == 'fdk' and not can_rectify(scan):
-            chosen = replace(chosen, density='lsq')
-        volume = FDK().run(scan).volume if chosen.density == 'fdk' else None
-        cloud = lingo.initialise(
-            g.normalised_rays(), scan.normalised, g.nVoxel, g.half, chosen, rng, render, volume, scan.valid
-        )
+        if start.init_density == 'fdk' and not can_rectify(scan):
+            start = replace(start, init_density='lsq')
+        volume = FDK().run(scan).volume if start.init_density == 'fdk' else None
+        cloud = lingo.initialise(scan, start, rng, render, volume)
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import drjit as dr
@@ -51,7 +50,7 @@ def run(
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
-    average = Average(settings.average)
+    average = Average(settings.adam.average)
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
     if initial is None:
         host, extra, arrays = checkpoint.load(path)
@@ -65,7 +64,7 @@ def run(
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0.0, [], dict(initial.info)
-        density = None if settings.render == 'alpha' else initial.density / stepper.model.unit
+        density = initial.density / stepper.model.unit if settings.volumetric else None
         state = DeviceState(start(points, initial.spacing, density, settings))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()
@@ -83,7 +82,7 @@ def run(
                     seconds=seconds + time.perf_counter() - clock,
                     history=history,
                     info=info,
-                    settings=asdict(settings),
+                    settings=settings.flat(),
                     unit=stepper.model.unit,
                     effects=stepper.model.effects is not None,
                     **scanned,
@@ -93,7 +92,9 @@ def run(
 
     while iteration < settings.iterations:
         # Not after the last step, which nothing would mend; a longer fit that goes on from there does it first.
-        if iteration < settings.densify_until and (renewed := _renewed(state, stepper, settings, iteration, rng)):
+        if iteration < settings.densification.densify_until and (
+            renewed := _renewed(state, stepper, settings, iteration, rng)
+        ):
             state = renewed
             average.restart()
         while len(order) < settings.batch:  # every view once before any a second time
@@ -132,13 +133,14 @@ def run(
 
 def _renewed(state, stepper, settings, iteration, rng):
     """The state densified and its opacities reset, as far as they are due after so many iterations; None if neither is."""
-    densifying = iteration > settings.densify_from and iteration % settings.densify_every == 0
-    resetting = settings.reset_every and iteration > 0 and iteration % settings.reset_every == 0
+    s = settings.densification
+    densifying = iteration > s.densify_from and iteration % s.densify_every == 0
+    resetting = s.reset_every and iteration > 0 and iteration % s.reset_every == 0
     if not (densifying or resetting):
         return None
     host = state.host()
     if densifying:
-        largest = settings.prune_size if 0 < settings.reset_every < iteration else np.inf
+        largest = s.prune_size if 0 < s.reset_every < iteration else np.inf
         host = densify(host, settings, stepper.half, rng, stepper.flat, largest)
         if len(host) == 0:
             raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')

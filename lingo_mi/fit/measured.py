@@ -16,7 +16,7 @@ from lingo_mi.scan import Scan
 def modelled_effects(scan: Scan, settings: Settings) -> Effects | None:
     """The scan's effects that the fit models; None where it takes the projections for line integrals, because the scan has
     none or they are ignored."""
-    effects = scan.effects if settings.effects == 'model' else None
+    effects = scan.effects if settings.model.effects == 'model' else None
     return None if effects is None or effects.ideal else effects
 
 
@@ -30,7 +30,7 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
 
     Raises InputError for a scan that says neither how many photons it has counted nor its bit depth.
     """
-    if settings.weights == 'equal':
+    if settings.loss.weights == 'equal':
         return None
     detector = scan.effects.detector if scan.effects else None
     if not (detector and (detector.photons or detector.bits)):
@@ -46,17 +46,17 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
 
 def trusted(scan: Scan, settings: Settings) -> Scan:
     """The scan without the pixels that its detector knows to be dead."""
-    effects = scan.effects if settings.effects == 'model' else None
+    effects = scan.effects if settings.model.effects == 'model' else None
     return scan if effects is None else effects.masked(scan)
 
 
 def linearised(scan: Scan, settings: Settings) -> Scan:
     """A scan of line integrals at the reference energy for what knows no effects: initial clouds, FDK."""
-    effects = scan.effects if settings.effects == 'model' else None
+    effects = scan.effects if settings.model.effects == 'model' else None
     return scan if effects is None else corrections.linearised(scan, effects)
 
 
 def density_unit(scan: Scan, settings: Settings) -> float:
     """The density, in 1/mm, that a fit counts as 1: see `normalise` of the settings. Raises InputError for an empty scan."""
     require_signal(scan, 'fit')
-    return float(scan.projections.max()) * scan.geometry.scale if settings.normalise else 1.0
+    return float(scan.projections.max()) * scan.geometry.scale if settings.model.normalise else 1.0

@@ -19,6 +19,7 @@ import drjit as dr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lingo_mi.fit.settings import AdamSettings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.view import vector64
@@ -69,7 +70,7 @@ class Poses:
         back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
         return back
 
-    def step(self, view: int, rays: Rays, gradient: dict, rate: float, settings):
+    def step(self, view: int, rays: Rays, gradient: dict, rate: float, adam: AdamSettings):
         """Move a view by one Adam step, then take off the mean motion of all.
 
         rays       the view as corrected so far, [1]
@@ -78,13 +79,13 @@ class Poses:
         turn = sum(np.cross(getattr(rays, name)[0], gradient[name]) for name in _NAMES)
         shift = gradient['corner'] if rays.parallel else gradient['corner'] + gradient['source']
         g = np.concatenate([turn, shift]) * self.free
-        b1, b2 = settings.beta1, settings.beta2
+        b1, b2 = adam.beta1, adam.beta2
         self.steps[view] += 1
         self.first[view] = b1 * self.first[view] + (1 - b1) * g
         self.second[view] = b2 * self.second[view] + (1 - b2) * g * g
         m = self.first[view] / (1 - b1 ** self.steps[view])
         v = self.second[view] / (1 - b2 ** self.steps[view])
-        move = -rate * m / (np.sqrt(v) + settings.epsilon)
+        move = -rate * m / (np.sqrt(v) + adam.epsilon)
         by = Rotation.from_rotvec(move[:3])
         self.turn[view] = (by * Rotation.from_rotvec(self.turn[view])).as_rotvec()
         self.shift[view] = by.apply(self.shift[view]) + move[3:]  # the origin stays: a turn carries the shift along

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from lingo_mi.fit.state import State, parameters
 
 def extensible(settings: Settings) -> bool:
     """Whether a longer fit begins with the very steps of a shorter one, and can go on from where that ended."""
-    return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.average == 0
+    return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.adam.average == 0
 
 
 def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict, seed: int, path: Path):
@@ -27,7 +26,7 @@ def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict
         <= extra.keys()
     ):
         raise damaged
-    now = asdict(settings)
+    now = settings.flat()
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
     if extensible(settings) and extra['iteration'] <= settings.iterations:

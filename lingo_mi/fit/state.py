@@ -18,9 +18,9 @@ def parameters(settings: Settings) -> dict[str, int]:
     `PARAMETERS`; for alpha compositing 'opacity' and 'radiance' in place of the density, and 'harmonics', coefficients of the
     radiance's spherical harmonics from degree 1 on, degree by degree.
     """
-    if settings.render == 'integral':
+    if settings.volumetric:
         return PARAMETERS
-    harmonics = {'harmonics': (settings.sh_degree + 1) ** 2 - 1} if settings.sh_degree else {}
+    harmonics = {'harmonics': (settings.model.sh_degree + 1) ** 2 - 1} if settings.model.sh_degree else {}
     return {'centre': 3, 'scale': 3, 'rotation': 4, 'opacity': 1, 'radiance': 1} | harmonics
 
 
@@ -51,7 +51,7 @@ def start(points, spacing, density, settings: Settings) -> State:
     points [N, 3], spacing [N] standard deviations, density [N] at the centres, in the fit's unit; normalised frame. For
     alpha compositing, without density: opacities of 0.1 and half grey (3DGS).
     """
-    scale_min, scale_max = settings.scale_min, settings.scale_max
+    scale_min, scale_max = settings.bounds.scale_min, settings.bounds.scale_max
     n = len(points)
     scale = np.clip(spacing, scale_min + 1e-5, scale_max - 1e-5)[:, None].repeat(3, 1)
     values = dict(
@@ -59,7 +59,7 @@ def start(points, spacing, density, settings: Settings) -> State:
         scale=inverse_scale(scale, scale_min, scale_max),
         rotation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
     )
-    if settings.render == 'integral':
+    if settings.volumetric:
         values['density'] = inverse_softplus(np.asarray(density))[:, None]
     else:
         values['opacity'] = np.full((n, 1), inverse_sigmoid(OPACITY))
@@ -81,7 +81,7 @@ def activate(state: State, settings: Settings):
 
     Scales by a sigmoid between the bounds, densities by softplus: both R2-Gaussian's. Opacities by a sigmoid (3DGS).
     """
-    scale_min, scale_max = settings.scale_min, settings.scale_max
+    scale_min, scale_max = settings.bounds.scale_min, settings.bounds.scale_max
     v = {k: x.astype(float) for k, x in state.values.items()}
     rotation = v['rotation'] / np.linalg.norm(v['rotation'], axis=1, keepdims=True)
     scale = scale_min + (scale_max - scale_min) / (1 + np.exp(-v['scale']))

@@ -47,7 +47,7 @@ class Stepper:
         self.half = scan.geometry.half
         # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
-        self.poses = Poses(len(scan), self.flat) if max(settings.rate_pose) > 0 else None
+        self.poses = Poses(len(scan), self.flat) if max(settings.adam.rate_pose) > 0 else None
 
     def step(self, state: DeviceState, views, iteration: int, rng):
         """Advance the state by one Adam step on the given views; returns the loss, Float [1], not yet evaluated.
@@ -77,8 +77,8 @@ class Stepper:
             state.gradient += norm
             state.seen += visible
             if self.poses is not None:
-                self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s)
-        if s.lambda_tv > 0:
+                self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s.adam)
+        if s.loss.lambda_tv > 0:
             total += random_cube_variation(leaf, self.geometry, s, rng)
         pass_on(gaussians, map(dr.grad, leaf))
         gradients = {name: dr.grad(value) for name, value in state.values.items()}
@@ -86,7 +86,10 @@ class Stepper:
             gradients['centre'].z, gradients['scale'].z = 0, 0
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
         if 'harmonics' in gradients:  # those of a degree that has not joined in stay at zero
-            joined = [dr.opaque(mi.Float, float((iteration + 1) // s.sh_every >= k)) for k in range(1, s.sh_degree + 1)]
+            joined = [
+                dr.opaque(mi.Float, float((iteration + 1) // s.model.sh_every >= k))
+                for k in range(1, s.model.sh_degree + 1)
+            ]
             for i in range(len(gradients['harmonics'])):
                 gradients['harmonics'][i] *= joined[math.isqrt(i + 1) - 1]
         state.adam(gradients, s, iteration)
@@ -126,7 +129,7 @@ class Stepper:
 
     def _view(self, leaf, target, batch):
         """`differentiate` a view: replayed, where nothing but line integrals from known poses is fitted."""
-        if self.model.signal is None and self.poses is None and self.settings.render != 'alpha':
+        if self.model.signal is None and self.poses is None and self.settings.volumetric:
             return differentiate_replayed(leaf, target, self.settings, batch)
         return differentiate(leaf, target, self.settings, batch, self.model.signal, self.share)
 

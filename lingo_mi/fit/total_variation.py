@@ -22,7 +22,7 @@ def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng
     geometry    says the voxels, `tv_stride` of which lie between two samples: all between the centres of the first and the
                 last ones
     """
-    s, half = settings, geometry.half
+    s, half, extent = settings.loss, geometry.half, settings.model.extent
     voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1
     shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
     room = between - (np.array(shape) - 1) * s.tv_stride
@@ -31,13 +31,13 @@ def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng
     low, high = vector64(corner), vector64(corner + shape * voxel)
     with dr.suspend_grad():
         centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
-        reach = dr.max(scale) * s.extent
+        reach = dr.max(scale) * extent
         near = dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))
         index = dr.compress(near)
     if dr.width(index) == 0:
         return mi.Float(0)
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
-    cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), s.extent)
+    cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), extent)
     loss = s.lambda_tv * losses.tv(cube, shape[::-1])
     dr.backward(loss)
     evaluate(gaussians)

@@ -72,21 +72,22 @@ class Target:
 
 def footprints_of(gaussians, rays, settings: Settings):
     """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
-    if settings.render == 'alpha':
+    if not settings.volumetric:
         centre, scale, rotation, opacity, *radiance = gaussians
         return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
-    return project(*gaussians, rays, settings.extent)
+    return project(*gaussians, rays, settings.model.extent)
 
 
 def integrals(footprints, rays, settings: Settings, share=None) -> list:
     """Line integrals along the rays of a view, a list of Float [height * width]: of the cloud, or of each of its two materials,
     where `share` is the second one's share in every Gaussian; or the grey image that alpha compositing takes for them."""
-    if settings.render == 'alpha':
+    if not settings.volumetric:
         return [composite(footprints, rays.height, rays.width)]
     amplitude, *others = footprints.values
     parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
     return [
-        splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.extent) * rays.lengths()
+        splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.model.extent)
+        * rays.lengths()
         for part in parts
     ]
 
@@ -101,14 +102,14 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
     Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
     footprint's place, and 1 where a Gaussian is seen.
     """
-    s, view = settings, target.view
+    s, view = settings.loss, target.view
     bundles = []  # of rays: one, or all those that the signal is a mean over
 
     def image_along(rays):
-        footprints = footprints_of(gaussians, rays, s)
+        footprints = footprints_of(gaussians, rays, settings)
         leaf = leaves(footprints.values)  # their derivatives are wanted themselves, for the statistic
         bundles.append((footprints, leaf))
-        return integrals(replace(footprints, values=leaf), rays, s, share)
+        return integrals(replace(footprints, values=leaf), rays, settings, share)
 
     image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.rays import Rays
 from lingo_mi.lingo.density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
 from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -36,36 +36,39 @@ class InitialCloud:
         return len(self.points)
 
 
+LSQ_VIEWS = 8  # evenly spaced, that the factor of 'lsq' and 'fdk' is solved on (own choice: a few determine one number)
+
+
 @dataclass(frozen=True)
-class Settings:
+class LingoSettings:
     """The parameters of the initialisation, each with its source.
 
-    n_points       points of the cloud (paper, implementation details: 50k)
-    high_fraction  share of the points that the high-density set gives (paper: 25 %)
-    low_factor     T_l = low_factor T_h (section III-A: 0.1)
-    resolution     V of the coarse grid for the occupancy (section III-B: 16)
-    V_S            upper bound of the voxel scaling (section III-B: 20)
-    density        'lsq', 'paper', 'raw' or 'fdk', see `density` (the paper is silent on the factor)
-    lsq_views      evenly spaced views that the factor of 'lsq' and 'fdk' is solved on (own choice: a few
-                   determine one number)
-    misses         views that may miss a valid cell (paper: 0)
-    outside        'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`; 'auto' is 'ignore' where the object
-                   reaches the edge of the panel in some view (`masks.truncated`), else 'invalid'
+    n_points           points of the cloud (paper, implementation details: 50k)
+    high_fraction      share of the points that the high-density set gives (paper: 25 %)
+    low_factor         T_l = low_factor T_h (section III-A: 0.1)
+    occupancy_voxels   V of the coarse grid for the occupancy (section III-B: 16)
+    V_S                upper bound of the voxel scaling (section III-B: 20)
+    misses             views that may miss a valid cell (paper: 0)
+    outside            'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`; 'auto' is 'ignore' where the
+                       object reaches the edge of the panel in some view (`masks.truncated`), else 'invalid'
+    init_density       'lsq', 'paper', 'raw' or 'fdk', see `lingo_mi.lingo.density` (the paper is silent on the factor)
+
+    Raises InputError for a value out of its range.
     """
 
     n_points: int = 50_000
     high_fraction: float = 0.25
     low_factor: float = 0.1
-    resolution: int = 16
+    occupancy_voxels: int = 16
     V_S: float = 20.0
-    density: str = 'lsq'
-    lsq_views: int = 8
     misses: int = 0
     outside: str = 'invalid'
+    init_density: str = 'lsq'
 
     def __post_init__(self):
-        if self.n_points < 1 or self.resolution < 1 or self.lsq_views < 1:
-            raise InputError('n_points, resolution and lsq_views must be at least 1')
+        for name in ('n_points', 'occupancy_voxels'):
+            if getattr(self, name) < 1:
+                raise InputError(f'{name} must be at least 1, not {getattr(self, name)}')
         if not 0 <= self.high_fraction <= 1:
             raise InputError(f'high_fraction must lie in [0, 1], not {self.high_fraction}')
         for name in ('low_factor', 'V_S', 'misses'):
@@ -73,8 +76,8 @@ class Settings:
                 raise InputError(f'{name} must not be negative, not {getattr(self, name):g}')
         if self.outside not in ('invalid', 'ignore', 'auto'):
             raise InputError(f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
-        if self.density not in MODES:
-            raise InputError(f'density {self.density!r} is unknown: use one of {", ".join(MODES)}')
+        if self.init_density not in MODES:
+            raise InputError(f'init_density {self.init_density!r} is unknown: use one of {", ".join(MODES)}')
 
 
 def draw(cells, count: int, rng):
@@ -101,19 +104,15 @@ def _outside(wanted: str, found) -> str:
 
 
 def initialise(
-    rays: Rays, projections, nVoxel, half, settings: Settings = Settings(), rng=None, render=None, fdk=None, valid=None
+    scan: Scan, settings: LingoSettings = LingoSettings(), rng=None, render=None, fdk: np.ndarray | None = None
 ) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
-    rays         n views in the normalised frame (`Geometry.normalised_rays`)
-    projections  [n, v, u] normalised line integrals (`Scan.normalised`)
-    nVoxel       V_d, the volume's voxels (x, y, z); a single slice (fan beam) is fine
-    half         half the volume's sides in the normalised frame, [3] (`Geometry.half`)
+    scan         line integrals of n views; a volume of a single slice (fan beam) is fine. Its voxels are the paper's V_d
     rng          numpy Generator (default: seed 0)
-    render       for density 'lsq' and 'fdk': render(points, density, spacing, views) -> projections [len(views), v, u]
+    render       for the init_density 'lsq' and 'fdk': render(points, density, spacing, views) -> projections [len(views), v, u]
                  of that cloud of isotropic Gaussians, for the view indices `views`
-    fdk          for density 'fdk': the reconstruction [x, y, z]
-    valid        bool [n, v, u], pixels to trust; None: all of them
+    fdk          for the init_density 'fdk': the reconstruction [x, y, z]
 
     Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid; points of the low set
     sit at the cell centres, but for repeats (there may be fewer valid cells than points), which are jittered
@@ -124,15 +123,18 @@ def initialise(
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(0) if rng is None else rng
-    projections = np.asarray(projections, np.float32)
-    if settings.density in ('lsq', 'fdk') and render is None:
-        raise InputError(f"density '{settings.density}' needs a render function: give one, or choose 'paper' or 'raw'")
-    if settings.density == 'fdk' and fdk is None:
-        raise InputError("density 'fdk' needs a reconstruction: give one, or choose another density")
+    rays, nVoxel, half = scan.geometry.normalised_rays(), scan.geometry.nVoxel, scan.geometry.half
+    projections, valid = np.asarray(scan.normalised, np.float32), scan.valid
+    if settings.init_density in ('lsq', 'fdk') and render is None:
+        raise InputError(
+            f"init_density '{settings.init_density}' needs a render function: give one, or choose 'paper' or 'raw'"
+        )
+    if settings.init_density == 'fdk' and fdk is None:
+        raise InputError("init_density 'fdk' needs a reconstruction: give one, or choose another init_density")
 
     found = masks(projections, settings.low_factor, valid)
     outside = _outside(settings.outside, found)
-    P = occupancy(rays, found, half, nVoxel, settings.resolution, settings.misses, outside)
+    P = occupancy(rays, found, half, nVoxel, settings.occupancy_voxels, settings.misses, outside)
     S = scale_factor(P, settings.V_S)
     grid = scaled_grid(nVoxel, S)
     low, high = valid_voxels(rays, found, grid, half, settings.misses, outside)
@@ -155,20 +157,20 @@ def initialise(
     jitter = rng.uniform(-0.5, 0.5, centres.shape) * (np.array(grid) > 1)
     points = np.where(jittered[:, None], centres + jitter * size, centres)
 
-    if settings.density == 'fdk':
+    if settings.init_density == 'fdk':
         density = sampled(fdk, points, half)
     else:
         unique, inverse = np.unique(cells, return_inverse=True)
         density = mean_pixel(rays, projections, voxel_centres(grid, half, unique), valid)[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
-    if settings.density in ('lsq', 'fdk'):
+    if settings.init_density in ('lsq', 'fdk'):
         n = len(rays)
-        views = np.unique(np.arange(min(n, settings.lsq_views)) * n // min(n, settings.lsq_views))
+        views = np.unique(np.arange(min(n, LSQ_VIEWS)) * n // min(n, LSQ_VIEWS))
         rendered = render(points, density, spacing, views)
         trusted = ... if valid is None else valid[views]
         factor = least_squares_factor(projections[views][trusted], rendered[trusted])
     else:
-        factor = FACTORS[settings.density]
+        factor = FACTORS[settings.init_density]
     return InitialCloud(
         points,
         density * factor,
@@ -178,7 +180,7 @@ def initialise(
             'P': P,
             'S': S,
             'grid': grid,
-            'density': settings.density,
+            'density': settings.init_density,
             'density_factor': factor,
             'cells_low': len(low),
             'cells_high': len(high),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import platform
 import time
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from lingo_mi.scan import Dataset
 def world_cloud(fitted: Fitted, geometry):
     """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities or opacities [N]."""
     centre, scale, rotation, amount = activate(fitted.state, fitted.settings)
-    unit = fitted.unit if fitted.settings.render == 'integral' else 1
+    unit = fitted.unit if fitted.settings.volumetric else 1
     return centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation, amount * unit
 
 
@@ -49,7 +48,7 @@ def write_results(
     else:
         write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
         write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
-        write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.extent, fitted.effects)
+        write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.model.extent, fitted.effects)
     rendered = None
     if test is not None and len(test):
         rendered = fitted.render(test.geometry)
@@ -64,7 +63,7 @@ def write_results(
         seed=seed,
         views=len(dataset.train),
         variant=mi.variant(),
-        settings=asdict(fitted.settings),
+        settings=fitted.settings.flat(),
         initial=fitted.info,
         command=command,
         **_corrections(fitted),

@@ -10,7 +10,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.measured import density_unit
-from lingo_mi.fit.settings import METHODS, VOLUMETRIC
+from lingo_mi.fit.recipes import METHODS, VOLUMETRIC
 from lingo_mi.fit.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular

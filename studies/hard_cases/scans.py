@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lingo_mi.fit.loop import run as fit
-from lingo_mi.fit.settings import FAST
+from lingo_mi.fit.recipes import FAST
 from lingo_mi.fit.state import activate
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
@@ -71,7 +71,7 @@ def fit_to(scan: Scan, iterations: int, **changes):
     if not len(density):
         raise FloatingPointError('the fit ends without Gaussians')
     # The sigmoid reaches its bounds where float32 saturates.
-    if scale.min() < done.settings.scale_min or scale.max() > done.settings.scale_max:
+    if scale.min() < done.settings.bounds.scale_min or scale.max() > done.settings.bounds.scale_max:
         raise FloatingPointError(f'the fit ends with scales from {scale.min():g} to {scale.max():g}, out of bounds')
     return done
 

@@ -29,8 +29,9 @@ from lingo_mi.fit.checkpoint import CHECKPOINT
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
+from lingo_mi.fit.recipes import settings_of
 from lingo_mi.fit.resume import extensible
-from lingo_mi.fit.settings import Settings, settings_of
+from lingo_mi.fit.settings import Settings
 from lingo_mi.interrupts import between_steps
 from lingo_mi.paths import replacing
 from lingo_mi.phantoms.x3d_scan import scan
@@ -141,7 +142,7 @@ class Cells:
             if fit.method == 'none':
                 return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
-        settings = asdict(recipe(fit, self.scale))
+        settings = recipe(fit, self.scale).flat()
         del settings['checkpoint_seconds']
         iterations = settings.pop('iterations')
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
@@ -204,7 +205,7 @@ class Cells:
 
             fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
         found = measure(fitted, dataset, fitted.volume(), fitted.render(dataset.test.geometry))
-        return found | dict(method=cell.method, settings=asdict(settings), initial=fitted.info)
+        return found | dict(method=cell.method, settings=settings.flat(), initial=fitted.info)
 
     def _begin(self, settings, saved: Path):
         """Without a whole checkpoint, copy that of the longest shorter fit of the same recipe, if its steps are ours."""

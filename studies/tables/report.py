@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.fit.settings import settings_of
+from lingo_mi.fit.recipes import settings_of
 from lingo_mi.paths import replacing
 from lingo_mi.studies.provenance import write_provenance
 from lingo_mi.studies.tables import paper
@@ -126,7 +126,7 @@ def _fit(views, method, iterations):
 
 def _volume(views, method, iterations, algorithm):
     """The cell of an object; of the volume that a fit samples itself, the fit."""
-    if algorithm in ('voxelize', 'refined', 'finer') and (method == 'none' or settings_of(method).render == 'alpha'):
+    if algorithm in ('voxelize', 'refined', 'finer') and (method == 'none' or not settings_of(method).volumetric):
         return lambda name: None  # neither measured views nor opacities are a volume to begin with
     if method == 'none':
         return lambda name: Volume(Fit(name, views, 'none'), algorithm)

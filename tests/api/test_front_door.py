@@ -134,9 +134,9 @@ def test_result(result, data):
 
 def test_the_cloud_by_function(result, data):
     """`lm.project` and `lm.voxelize` of the result's Gaussians are what the result renders."""
-    views = lm.project(*result.gaussians, data.test.geometry, extent=result.settings.extent)
+    views = lm.project(*result.gaussians, data.test.geometry, extent=result.settings.model.extent)
     np.testing.assert_allclose(views, result.render(data.test.geometry), atol=2e-4 * views.max())
-    grid = lm.voxelize(*result.gaussians, data.train.geometry, extent=result.settings.extent)
+    grid = lm.voxelize(*result.gaussians, data.train.geometry, extent=result.settings.model.extent)
     np.testing.assert_allclose(grid, result.volume(), atol=2e-4 * grid.max())
 
 

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.fit.densify import SHRINK, clone, densify, halve, prune, split
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.recipes import R2
 from lingo_mi.fit.state import PARAMETERS, State, activate, start
 from lingo_mi.studies.oracle import whiten
 
-SETTINGS = Settings(densify_threshold=1.0, split_size=0.1)
+SETTINGS = R2.changed(densify_threshold=1.0, split_size=0.1)
 HALF = np.ones(3)
 
 
@@ -19,7 +19,7 @@ def state_of(rng, n, size=None):
     """n Gaussians with moments and a statistic, all different."""
     state = start(rng.uniform(-0.9, 0.9, (n, 3)), np.full(n, 0.05), rng.uniform(0.1, 2, n), SETTINGS)
     size = rng.uniform(0.02, 0.4, (n, 3)) if size is None else np.broadcast_to(size, (n, 3))
-    share = (size - SETTINGS.scale_min) / (SETTINGS.scale_max - SETTINGS.scale_min)
+    share = (size - SETTINGS.bounds.scale_min) / (SETTINGS.bounds.scale_max - SETTINGS.bounds.scale_min)
     values = dict(
         state.values, scale=np.float32(np.log(share / (1 - share))), rotation=np.float32(rng.normal(size=(n, 4)))
     )

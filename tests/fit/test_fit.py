@@ -16,7 +16,7 @@ from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
-from lingo_mi.fit.settings import METHODS, VOLUMETRIC
+from lingo_mi.fit.recipes import METHODS, VOLUMETRIC
 from lingo_mi.fit.state import activate
 from lingo_mi.fit.state import start as start_state
 from lingo_mi.fit.total_variation import random_cube_variation
@@ -113,7 +113,7 @@ def test_total_variation_is_of_every_nth_voxel(scan, stride):
     found = random_cube_variation(gaussians, g, settings, np.random.default_rng(0))[0]
     volume = model.volume(state)[::stride, ::stride, ::stride] / model.unit
     wanted = np.concatenate([np.diff(volume, axis=i).ravel() for i in range(3)])
-    np.testing.assert_allclose(found, settings.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
+    np.testing.assert_allclose(found, settings.loss.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The baselines by alpha compositing: radiance, starts, densification, fits of tiny scans, and what they leave behind."""
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +17,7 @@ from lingo_mi.fit.bounded import scene_radius
 from lingo_mi.fit.densify import clone, prune, reset_opacity, split
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
-from lingo_mi.fit.settings import METHODS, R2
+from lingo_mi.fit.recipes import METHODS, R2
 from lingo_mi.fit.state import activate, harmonics, start
 from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.projectors.radiance import seen
@@ -376,7 +376,7 @@ def test_checkpoints_that_complete_nothing(scan, tmp_path):
     with pytest.raises(InputError, match='result.xml'):
         load_cloud(path)
     state, extra, arrays = checkpoint.load(path)
-    extra['settings'] = asdict(settings_of('3dgs'))
+    extra['settings'] = settings_of('3dgs').flat()
     for damaged in (
         [],
         {},

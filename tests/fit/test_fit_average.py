@@ -6,7 +6,7 @@ import pytest
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.fit import loop
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.settings import AdamSettings
 from lingo_mi.fit.state import PARAMETERS
 
 AVERAGED = SHORT.changed(average=0.8, iterations=16)
@@ -69,4 +69,4 @@ def test_a_resumed_fit_has_the_same_mean(tmp_path, stop):
 @pytest.mark.parametrize('average', [-0.1, 1.0])
 def test_bad_decay(average):
     with pytest.raises(InputError, match='average'):
-        Settings(average=average)
+        AdamSettings(average=average)

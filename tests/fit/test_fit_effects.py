@@ -53,10 +53,10 @@ def kernels(function):
 
 def plain_view(self, gaussians, target, batch):
     """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
-    s, view = self.settings, target.view
-    footprints = project(*gaussians, view, s.extent)
+    s, extent, view = self.settings.loss, self.settings.model.extent, target.view
+    footprints = project(*gaussians, view, extent)
     leaf = leaves(footprints.values)
-    image = splat(replace(footprints, values=leaf), view.height, view.width, s.extent) * view.lengths()
+    image = splat(replace(footprints, values=leaf), view.height, view.width, extent) * view.lengths()
     loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)

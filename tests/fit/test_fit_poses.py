@@ -69,12 +69,12 @@ def test_motions_of_all_views_are_the_objects():
     for i in range(40):
         view = i % 5
         by = {k: rng.normal(size=3) for k in ('source', 'corner', 'u', 'v')}
-        poses.step(view, poses.correct(frames[[view]], view), by, 1e-2, MOVING)
+        poses.step(view, poses.correct(frames[[view]], view), by, 1e-2, MOVING.adam)
     np.testing.assert_allclose(poses.shift.mean(0), 0, atol=1e-12)
     np.testing.assert_allclose(poses.turn.mean(0), 0, atol=1e-4)  # rotations add up to first order
     assert np.abs(poses.turn).max() > 0.02 and np.abs(poses.shift).max() > 0.02
     flat = Poses(5, flat=True)
-    flat.step(1, frames[[1]], by, 1e-2, MOVING)
+    flat.step(1, frames[[1]], by, 1e-2, MOVING.adam)
     assert not flat.turn[:, :2].any() and not flat.shift[:, 2].any() and flat.turn[1, 2] and flat.shift[1, :2].all()
 
 

@@ -3,7 +3,8 @@
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.settings import METHODS, Settings, settings_of
+from lingo_mi.fit.recipes import METHODS, settings_of
+from lingo_mi.fit.settings import Settings
 
 
 @pytest.mark.parametrize(
@@ -18,7 +19,7 @@ from lingo_mi.fit.settings import METHODS, Settings, settings_of
     ],
 )
 def test_values(name, text, value):
-    found = getattr(Settings().changed(**{name: text}), name)
+    found = Settings().changed(**{name: text}).flat()[name]
     assert found == value and type(found) is type(value)
 
 
@@ -67,7 +68,7 @@ def test_bad_values(method, name, text, message):
 
 def test_settings_of():
     found = settings_of('r2:V_S=1,n_points=70', n_points=90, iterations=5)
-    assert (found.V_S, found.n_points, found.iterations) == (1.0, 70, 5)
+    assert (found.start.V_S, found.start.n_points, found.iterations) == (1.0, 70, 5)
     for method in ('R2', 'r2:V=1', 'r2:V_S', ':V_S=1', ''):
         with pytest.raises(InputError):
             settings_of(method)

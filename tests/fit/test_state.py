@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.recipes import R2
 from lingo_mi.fit.state import PARAMETERS, State, activate, inverse_scale, inverse_softplus, softplus, start
 
-SETTINGS = Settings(scale_min=1e-3, scale_max=0.8)
+SETTINGS = R2.changed(scale_min=1e-3, scale_max=0.8)
 
 
 def random_state(rng, n):
@@ -47,7 +47,7 @@ def test_start_has_no_history():
 
 def test_scales_beyond_the_bounds_start_inside_them():
     _, scale, _, _ = activate(start(np.zeros((2, 3)), np.array([1e-9, 1e3]), np.ones(2), SETTINGS), SETTINGS)
-    assert np.all((scale > SETTINGS.scale_min) & (scale < SETTINGS.scale_max))
+    assert np.all((scale > SETTINGS.bounds.scale_min) & (scale < SETTINGS.bounds.scale_max))
 
 
 def test_softplus_at_both_ends():
@@ -66,10 +66,12 @@ def test_scales_stay_between_their_bounds():
     state = random_state(np.random.default_rng(1), 6)
     state.values['scale'][:] = np.float32([-100, -20, -1, 1, 20, 100])[:, None]
     _, scale, _, _ = activate(state, SETTINGS)
-    assert np.all(np.isfinite(scale)) and np.all((scale >= SETTINGS.scale_min) & (scale <= SETTINGS.scale_max))
+    assert np.all(np.isfinite(scale)) and np.all(
+        (scale >= SETTINGS.bounds.scale_min) & (scale <= SETTINGS.bounds.scale_max)
+    )
     assert np.all(np.diff(scale[:, 0]) >= 0)
     inner = np.geomspace(1.01e-3, 0.79, 40)
-    raw = inverse_scale(inner, SETTINGS.scale_min, SETTINGS.scale_max)
+    raw = inverse_scale(inner, SETTINGS.bounds.scale_min, SETTINGS.bounds.scale_max)
     state = start(np.zeros((40, 3)), inner, np.ones(40), SETTINGS)
     np.testing.assert_allclose(state.values['scale'][:, 0], raw, rtol=1e-6)
 
@@ -110,7 +112,7 @@ def test_activation_derivatives():
     dr.backward(dr.sum(scale.x) + 2 * dr.sum(scale.y) + 3 * dr.sum(scale.z) + dr.sum(density))
     raw = state.values['scale'].astype(float)
     share = 1 / (1 + np.exp(-raw))
-    expected = (SETTINGS.scale_max - SETTINGS.scale_min) * share * (1 - share) * [1, 2, 3]
+    expected = (SETTINGS.bounds.scale_max - SETTINGS.bounds.scale_min) * share * (1 - share) * [1, 2, 3]
     np.testing.assert_allclose(np.array(dr.grad(device.values['scale'])).T, expected, rtol=1e-5)
     raw = state.values['density'][:, 0].astype(float)
     np.testing.assert_allclose(dr.grad(device.values['density']).numpy(), 1 / (1 + np.exp(-raw)), rtol=1e-5)
@@ -145,7 +147,7 @@ def test_adam_against_numpy():
         for v in columns.values():
             v[:] = 0
     device, rates = DeviceState(state), dict(centre=1e-2, scale=2e-2, rotation=3e-3, density=5e-2)
-    settings = Settings(**{f'rate_{k}': (rate, rate) for k, rate in rates.items()})
+    settings = R2.changed(**{f'rate_{k}': (rate, rate) for k, rate in rates.items()})
     expected = {k: v.astype(float) for k, v in state.values.items()}
     m, s = ({k: np.zeros_like(v) for k, v in expected.items()} for _ in range(2))
     types = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
@@ -171,5 +173,5 @@ def test_adam_without_a_derivative_stays_finite():
         for v in columns.values():
             v[:] = 0
     device = DeviceState(state)
-    device.adam({'density': dr.zeros(mi.Float, 2)}, Settings(), 0)
+    device.adam({'density': dr.zeros(mi.Float, 2)}, R2, 0)
     np.testing.assert_array_equal(device.host().values['density'], state.values['density'])

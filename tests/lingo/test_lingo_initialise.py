@@ -7,12 +7,14 @@ from lingo_mi.errors import InputError
 from lingo_mi.fit.r2_start import r2_initialise
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.lingo import initialise as initialisation
 from lingo_mi.lingo.density import FAINTEST, least_squares_factor, mean_pixel
-from lingo_mi.lingo.initialise import Settings, draw, initialise
+from lingo_mi.lingo.initialise import LingoSettings, draw, initialise
 from lingo_mi.lingo.ipsd import ipsd, neighbour_distance, reverse_distance
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import occupancy
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.scan import Scan
 
 
 def sphere_scan(radius=0.5, n=6, centre=(0.2, -0.1, 0.15), density=0.8, **changes):
@@ -36,7 +38,7 @@ def sphere_scan(radius=0.5, n=6, centre=(0.2, -0.1, 0.15), density=0.8, **change
     return geometry, frames, np.array(out, np.float32)
 
 
-PAPER = Settings(n_points=2000, density='paper')
+PAPER = LingoSettings(n_points=2000, init_density='paper')
 
 
 def test_mean_pixel_is_the_mean_over_the_views():
@@ -95,7 +97,7 @@ def test_draw_repeats_only_when_it_must_and_evenly():
 
 def test_cloud_follows_the_paper():
     geometry, frames, projections = sphere_scan()
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER, np.random.default_rng(1))
+    cloud = initialise(Scan(geometry, projections), PAPER, np.random.default_rng(1))
     info, found = cloud.info, masks(projections)
     assert info['P'] == occupancy(frames, found, geometry.half, geometry.nVoxel)
     assert info['S'] == max(info['P'] * 20, 1)
@@ -121,7 +123,7 @@ def test_cloud_follows_the_paper():
 
 def test_cloud_lies_in_the_object():
     geometry, frames, projections = sphere_scan(n=20)
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER)
+    cloud = initialise(Scan(geometry, projections), PAPER)
     distance = np.linalg.norm(cloud.points - (0.2, -0.1, 0.15), axis=1)
     assert distance.max() < 0.5 * 1.2 and (distance < 0.5).mean() > 0.9
     np.testing.assert_allclose(cloud.points.mean(0), (0.2, -0.1, 0.15), atol=0.03)
@@ -129,22 +131,19 @@ def test_cloud_lies_in_the_object():
 
 def test_same_seed_same_cloud():
     geometry, frames, projections = sphere_scan()
-    a, b, c = (
-        initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER, np.random.default_rng(seed))
-        for seed in (3, 3, 4)
-    )
+    a, b, c = (initialise(Scan(geometry, projections), PAPER, np.random.default_rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(a.points, b.points)
     assert not np.array_equal(a.points, c.points)
 
 
 def test_more_points_than_cells():
     geometry, frames, projections = sphere_scan(nVoxel=(8, 8, 8), dVoxel=(0.25,) * 3)
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER)
+    cloud = initialise(Scan(geometry, projections), PAPER)
     assert len(cloud) == 2000 and cloud.info['repeats'] > 1000
     assert len(np.unique(cloud.points, axis=0)) == 2000 and (cloud.spacing > 0).all()
 
 
-def test_density_modes():
+def test_density_modes(monkeypatch):
     geometry, frames, projections = sphere_scan()
     calls = []
 
@@ -154,21 +153,16 @@ def test_density_modes():
 
     def cloud(**settings):
         return initialise(
-            frames,
-            projections,
-            geometry.nVoxel,
-            geometry.half,
-            Settings(n_points=300, **settings),
-            np.random.default_rng(0),
-            render,
+            Scan(geometry, projections), LingoSettings(n_points=300, **settings), np.random.default_rng(0), render
         )
 
-    raw, paper, lsq = cloud(density='raw'), cloud(density='paper'), cloud(density='lsq', lsq_views=3)
+    monkeypatch.setattr(initialisation, 'LSQ_VIEWS', 3)
+    raw, paper, lsq = cloud(init_density='raw'), cloud(init_density='paper'), cloud(init_density='lsq')
     np.testing.assert_allclose(paper.density, 0.15 * raw.density)
     np.testing.assert_allclose(lsq.density, 0.25 * raw.density)
     assert calls == [(300, [0, 2, 4])] and lsq.info['density_factor'] == pytest.approx(0.25)
     with pytest.raises(InputError, match='render'):
-        initialise(frames, projections, geometry.nVoxel, geometry.half, Settings())
+        initialise(Scan(geometry, projections), LingoSettings())
 
 
 def test_densities_of_an_fdk_volume():
@@ -180,11 +174,8 @@ def test_densities_of_an_fdk_volume():
 
     def cloud(**more):
         return initialise(
-            frames,
-            projections,
-            geometry.nVoxel,
-            geometry.half,
-            Settings(n_points=300, density='fdk'),
+            Scan(geometry, projections),
+            LingoSettings(n_points=300, init_density='fdk'),
             np.random.default_rng(0),
             lambda points, density, spacing, views: projections[views] / 4,
             **more,
@@ -204,24 +195,24 @@ def test_empty_high_set_leaves_all_to_the_low_set():
     projections[0, :2, :2] = 60.0  # one bright corner: nothing but it is above this view's threshold
     found = masks(projections)
     assert len(valid_voxels(frames, found, (16, 16, 16), geometry.half)[1]) == 0
-    settings = Settings(n_points=100, density='raw', low_factor=0.001)
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, settings)
+    settings = LingoSettings(n_points=100, init_density='raw', low_factor=0.001)
+    cloud = initialise(Scan(geometry, projections), settings)
     assert cloud.info['points_high'] == 0 and len(cloud) == 100
 
 
 def test_errors_say_what_to_do():
     geometry, frames, projections = sphere_scan()
     with pytest.raises(InputError, match='truncated'):
-        initialise(frames, 0 * projections, geometry.nVoxel, geometry.half, PAPER)
+        initialise(Scan(geometry, 0 * projections), PAPER)
     with pytest.raises(InputError, match='paper'):
-        Settings(density='mean')
+        LingoSettings(init_density='mean')
     with pytest.raises(InputError, match='high_fraction'):
-        Settings(high_fraction=2)
+        LingoSettings(high_fraction=2)
 
 
 def test_single_slice():
     geometry, frames, projections = sphere_scan(nDetector=(1, 64), nVoxel=(48, 48, 1), centre=(0.2, -0.1, 0.0))
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER)
+    cloud = initialise(Scan(geometry, projections), PAPER)
     assert len(cloud) == 2000 and cloud.info['grid'][2] == 1
     np.testing.assert_allclose(cloud.points[:, 2], 0, atol=1e-12)
     np.testing.assert_allclose(cloud.points.mean(0), (0.2, -0.1, 0), atol=0.06)
@@ -229,7 +220,7 @@ def test_single_slice():
 
 def test_parallel_beam():
     geometry, frames, projections = sphere_scan(mode='parallel')
-    cloud = initialise(frames, projections, geometry.nVoxel, geometry.half, PAPER)
+    cloud = initialise(Scan(geometry, projections), PAPER)
     np.testing.assert_allclose(cloud.points.mean(0), (0.2, -0.1, 0.15), atol=0.05)
 
 

@@ -14,7 +14,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.recipes import R2
 from lingo_mi.fit.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.sensors import view_of
@@ -376,7 +376,7 @@ def test_axes(axis, mode, offset):
     for image, angle in zip(images, (0, 90)):
         np.testing.assert_allclose(middle(image), expected_pixel(point, angle, g), atol=0.05)
 
-    settings = Settings(extent=6.0, scale_min=1e-4, scale_max=0.5)
+    settings = R2.changed(extent=6.0, scale_min=1e-4, scale_max=0.5)
     normalised = (point - g.offOrigin) * g.scale
     state = DeviceState(start(normalised[None], np.array([4 * g.scale]), np.array([0.1]), settings))
     model = CloudModel(settings, g, 1.0)

@@ -14,7 +14,7 @@ from lingo_mi.fit.densify import clone, densify, halve, split
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.loss_scale import loss_scale, otsu
 from lingo_mi.fit.losses import combined, ssim
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fit.recipes import R2
 from lingo_mi.fit.state import activate, inverse_scale, inverse_softplus, softplus, start
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
@@ -247,7 +247,7 @@ def test_a_long_fit_of_bad_data_ends_finite():
     fit_to(adversarial(), 10_000)
 
 
-SETTINGS = Settings(densify_threshold=1e-3, split_size=0.15)
+SETTINGS = R2.changed(densify_threshold=1e-3, split_size=0.15)
 
 
 def coincident(n=8):
@@ -314,7 +314,10 @@ def test_activations_at_both_ends(raw):
     device = DeviceState(state)
     dr.enable_grad(list(device.values.values()))
     _, scale_there, _, density_there = device.gaussians(SETTINGS)
-    assert np.all((scale >= SETTINGS.scale_min) & (scale <= SETTINGS.scale_max)) and np.isfinite(density).all()
+    assert (
+        np.all((scale >= SETTINGS.bounds.scale_min) & (scale <= SETTINGS.bounds.scale_max))
+        and np.isfinite(density).all()
+    )
     np.testing.assert_allclose(np.array(scale_there).T, scale, rtol=2e-6)
     np.testing.assert_allclose(density_there.numpy(), density, rtol=2e-6, atol=1e-7)
     dr.backward(dr.sum(scale_there.x) + dr.sum(density_there))
@@ -325,7 +328,7 @@ def test_activations_at_both_ends(raw):
 def test_inverses_at_both_ends():
     y = np.array([0, 1e-300, 1e-30, 1e-7, 1, 700, 1e8])
     np.testing.assert_allclose(softplus(inverse_softplus(y)), np.maximum(y, 1e-30), rtol=1e-12)
-    low, high = SETTINGS.scale_min, SETTINGS.scale_max
+    low, high = SETTINGS.bounds.scale_min, SETTINGS.bounds.scale_max
     inner = np.array([low * (1 + 1e-6), low * 1.5, 0.5, high * (1 - 1e-6)])
     raw = inverse_scale(inner, low, high)
     np.testing.assert_allclose(low + (high - low) / (1 + np.exp(-raw)), inner, rtol=1e-9)

@@ -15,7 +15,7 @@ import pytest
 from helpers.script import FIT, run
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import write_volume
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.recipes import METHODS
 from lingo_mi.phantoms import make
 from lingo_mi.studies.tables import cells as tables
 from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, recipe
@@ -318,12 +318,12 @@ def test_recipes():
     assert recipe(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
     assert recipe(Fit('foot', 5, 'fast'), TINY).iterations == METHODS['fast'].iterations
     found = recipe(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
-    assert (found.V_S, found.n_points, found.loss_scale, recipe(Fit('foot', 5, 'r2'), TINY).n_points) == (
-        1,
-        70,
-        'dynamic',
-        200,
-    )
+    assert (
+        found.start.V_S,
+        found.start.n_points,
+        found.loss.loss_scale,
+        recipe(Fit('foot', 5, 'r2'), TINY).start.n_points,
+    ) == (1, 70, 'dynamic', 200)
     with pytest.raises(InputError, match='unknown'):
         recipe(Fit('foot', 5, '3d'), TINY)
 
