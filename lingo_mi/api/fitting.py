@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tempfile
 from os import PathLike
 from pathlib import Path
 
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError
+from lingo_mi.fit.checkpoint import CHECKPOINT
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
 from lingo_mi.fit.recipes import settings_of
@@ -61,11 +63,14 @@ def fit(
     if path is not None and path.exists() and not resume:
         raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
     cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
-    with Progress('Fit', chosen.iterations, shown=progress) as bar, between_steps() as check:
+    with tempfile.TemporaryDirectory() as folder, between_steps() as check:
+        # Kept even where nobody names a file: `Result.save` writes it.
+        file = Path(folder) / CHECKPOINT if path is None else path
+        with Progress('Fit', chosen.iterations, shown=progress) as bar:
 
-        def report(iteration, **fields):
-            bar.update(iteration, **fields)
-            check()
+            def report(iteration, **fields):
+                bar.update(iteration, **fields)
+                check()
 
-        fitted = run(dataset.train, chosen, cloud, seed, quick_measure(dataset), report, path, resume)
-    return Result(fitted, name, dataset)
+            fitted = run(dataset.train, chosen, cloud, seed, quick_measure(dataset), report, file)
+        return Result(fitted, name, dataset, checkpoint=file.read_bytes())

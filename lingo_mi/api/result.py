@@ -16,10 +16,11 @@ from lingo_mi.fit.checkpoint import CHECKPOINT, METRICS
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.settings import Settings
 from lingo_mi.geometry import Geometry
+from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import measure
-from lingo_mi.results.save import report_data, world_cloud, write_results
+from lingo_mi.results.save import world_cloud, write_results
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
 
@@ -49,9 +50,18 @@ class Result:
     result.save('out/foot')
     """
 
-    def __init__(self, fitted: Fitted, recipe: str, data: Dataset | None = None, stored: dict | None = None):
-        """data: the scan and what is held out, for metrics; stored: metrics as they were saved, where there is no data."""
-        self.fitted, self.recipe, self.data, self._stored = fitted, recipe, data, stored
+    def __init__(
+        self,
+        fitted: Fitted,
+        recipe: str,
+        data: Dataset | None = None,
+        *,
+        stored: dict | None = None,
+        checkpoint: bytes | None = None,
+    ):
+        """data: the scan and what is held out; stored: metrics as they were saved; checkpoint: of the finished fit."""
+        self.fitted, self.recipe, self.data = fitted, recipe, data
+        self._stored, self._checkpoint = stored, checkpoint
 
     @property
     def settings(self) -> Settings:
@@ -107,7 +117,9 @@ class Result:
         """
         data = self.data if data is None else data
         if data is not None:
-            return measure(self.fitted, data)
+            test = data.test
+            rendered = None if test is None or not len(test) else self.fitted.render(test.geometry)
+            return measure(self.fitted, data, self.fitted.volume(), rendered)
         if self._stored is None:
             raise InputError('this result was loaded without numbers: give the data to compare with')
         return self._stored
@@ -120,13 +132,23 @@ class Result:
 
         Raises InputError where the folder holds files already, or cannot be written.
         """
-        if self.data is None:
+        if self.data is None or self._checkpoint is None:
             raise InputError('this result was loaded from files: copy its folder')
         folder = Path(folder)
         if folder.is_dir() and any(folder.iterdir()) and not force:
             raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
-        write_results(folder, self.fitted, self.data, title=title or folder.name, method=self.recipe)
-        self.fitted.save_checkpoint(folder / CHECKPOINT)
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(folder / CHECKPOINT) as temporary:
+            temporary.write_bytes(self._checkpoint)
+        write_results(
+            folder,
+            self.fitted,
+            self.data,
+            title=title or folder.name,
+            method=self.recipe,
+            seed=self.fitted.seed,
+            command='lingo_mi.fit(...)',
+        )
         return folder
 
     def __repr__(self) -> str:
@@ -138,7 +160,7 @@ class Result:
     def _repr_html_(self) -> str:
         if self.data is None:
             return f'<pre>{html.escape(repr(self))}\n{html.escape(headline(self._stored or {}))}</pre>'
-        data = report_data(self.fitted, self.data, self.metrics(), title=self.recipe)
+        data = report_data(self.fitted, self.data, title=self.recipe)
         picture = base64.b64encode(overview(data, headline(data.metrics))).decode('ascii')
         return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{picture}">'
 

@@ -2,27 +2,64 @@
 
 from __future__ import annotations
 
-import numpy as np
+from contextlib import nullcontext
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
 
 from lingo_mi.api.result import Result
-from lingo_mi.reconstruction import Algorithm, Reconstruction
+from lingo_mi.completion.clouds import FittedCloud
+from lingo_mi.completion.prepare import prepare_completed, prepare_start
+from lingo_mi.errors import InputError
+from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined, progress_bar
+from lingo_mi.reconstruction import reconstruct as run
+from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.runtime import ensure_variant
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Dataset, Scan
 
 
 def reconstruct(
-    scan: Scan, algorithm: Algorithm, *, start: Result | np.ndarray | None = None, progress: bool = True
+    scan: Scan,
+    algorithm: Algorithm,
+    *,
+    start: Result | ArrayLike | None = None,
+    views: int | None = None,
+    progress: bool = True,
 ) -> Reconstruction:
     """Reconstruct a volume on the voxels of a scan's geometry.
 
-    scan        projections and geometry
+    scan        projections and geometry. Effects of a detector that it knows (beam hardening, scatter, blur) are taken out first
     algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, with its parameters
-    start       the `Result` of a fit, or a volume [x, y, z], to start from; `Refined` needs a result, `FDK` takes none
+    start       the `Result` of a fit to this scan, or a volume [x, y, z] in 1/mm, to start from; `Refined` needs a result
+    views       with a result: how many views to reconstruct from. Those that were not measured are rendered from the cloud (the
+                two stages of the paper), and the algorithm starts from nothing. The scan must be one on a circle
     progress    whether to show a progress bar on standard error
+
+    `Refined` meets the completed views first where `views` is given, and the measured ones alone where it is not.
 
     Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|; `seconds`. It can be
     used as an array. Raises InputError for a scan or a start that the algorithm cannot use, and where memory does not suffice.
 
-        volume = lm.reconstruct(data.train, lm.SART(niter=20), start=result).volume
+        found = lm.reconstruct(data.train, lm.SART(niter=20), start=result)
+        found.volume, found.residuals[-1]
     """
     ensure_variant()
+    inputs = {}
+    if isinstance(start, Result):
+        cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)
+        if views is not None:
+            scan, inputs = prepare_completed(dataset, cloud, views, algorithm)
+        else:
+            if isinstance(algorithm, Refined):
+                algorithm = replace(algorithm, completed_niter=0)
+            scan, inputs = prepare_start(dataset, cloud, algorithm)
+    elif views is not None:
+        raise InputError('views are rendered from a fitted cloud: give the result of a fit as start')
+    elif isinstance(algorithm, Refined):
+        raise InputError('Refined starts from a fitted cloud: give the result of a fit as start')
+    else:
+        if scan.effects is not None:
+            scan = linearised(scan, scan.effects)
+        inputs = {} if start is None else dict(start=start)
+    with progress_bar(algorithm, scan) if progress else nullcontext() as bar:
+        return run(scan, algorithm, progress=bar, **inputs)

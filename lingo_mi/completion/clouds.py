@@ -40,6 +40,15 @@ class FittedCloud:
     effects: Effects | None
     seed: int | None
 
+    @classmethod
+    def of(cls, fitted: Fitted) -> FittedCloud | Fitted:
+        """The cloud of a fit; the fit itself where it composites opacities, which are no Gaussians of density."""
+        gaussians = fitted.cloud()
+        if gaussians is None:
+            return fitted
+        extent = fitted.settings.model.extent
+        return cls(gaussians, fitted.geometry, fitted.corrected, extent, fitted.effects, fitted.seed)
+
     def render(self, geometry: Geometry) -> np.ndarray:
         """Line integrals in any views, float32 [view, v, u]."""
         return render_objects([self.gaussians], geometry, self.extent)

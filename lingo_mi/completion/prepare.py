@@ -23,9 +23,7 @@ def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
     Raises InputError for a cloud of alpha compositing, which has none.
     """
     if isinstance(cloud, Fitted):
-        if cloud.cloud() is None:
-            raise InputError('opacities and radiances make no volume: take the cloud of another method')
-        return cloud.volume
+        raise InputError('opacities and radiances make no volume: take the cloud of another method')
 
     def sample(geometry: Geometry) -> np.ndarray:
         return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
