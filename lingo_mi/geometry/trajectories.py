@@ -10,9 +10,9 @@ from lingo_mi.geometry.rays import Rays
 
 
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
-    """n angles, [n] radians, evenly spaced over [start, start + total) degrees; InputError for n < 1.
+    """n angles, [n] radians, evenly spaced over [start, start + total) degrees: `circular(4)` is 0, pi / 2, pi, 3 pi / 2.
 
-    circular(4)   # 0, pi / 2, pi, 3 pi / 2
+    Raises InputError for n < 1.
     """
     if n < 1:
         raise InputError(f'a scan needs at least one view, not {n}')
