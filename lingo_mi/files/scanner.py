@@ -121,7 +121,7 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
                      z); optional: mode, offOrigin (x, y, z), offDetector; all lengths in mm. With offset_order 'vu', DSO,
                      DSD, offOrigin and offDetector may be lists of one value a view, and rotDetector, COR and tilt (one
                      value or one a view; angles in degrees), pitch (mm a turn) or z (mm) may be given: see
-                     `Geometry.per_view` and `geometry.helix`
+                     `Geometry.per_view` and `trajectories.helix`
     angles           [n] radians; [n, 3] for TIGRE's Euler angles
     where            the file, for messages
     detector_shape   (v, u) pixels of the projections; if nDetector has these the other way round, nDetector

@@ -22,6 +22,9 @@ class Rays:
         parallel   from  corner + x u + y v  along `source`, which then holds the unit beam direction
 
     source, corner, u, v : float64 [n, 3]; corner is the outer corner of pixel (0, 0), u and v are one pixel long steps.
+
+        rays = Rays(source, corner, u, v, parallel=False).checked()
+        x, y = rays.project(points, 0)
     """
 
     source: np.ndarray

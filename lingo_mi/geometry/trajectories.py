@@ -3,34 +3,45 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.rays import Rays
 
 
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
-    """n angles (radians) evenly spaced over [start, start + total) degrees."""
+    """n angles, [n] radians, evenly spaced over [start, start + total) degrees: `circular(4)` is 0, pi / 2, pi, 3 pi / 2.
+
+    Raises InputError for n < 1.
+    """
     if n < 1:
         raise InputError(f'a scan needs at least one view, not {n}')
     return np.radians(start + total * np.arange(n) / n)
 
 
-def helix(angles, pitch: float) -> np.ndarray:
+def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
     """Heights [n] in mm of a helix that climbs `pitch` mm a turn: 0 at the angle 0.
 
     angles   [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi
+
+        helix(circular(8, total=720, start=-360), pitch=40)   # -40, -30, ..., 30
     """
     return pitch * np.asarray(angles, float) / (2 * np.pi)
 
 
 def spread(total: int, n: int) -> np.ndarray:
-    """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses."""
+    """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses.
+
+    Raises InputError unless 1 <= n <= total.
+
+        spread(100, 4)   # 0, 25, 50, 75
+    """
     if not 1 <= n <= total:
         raise InputError(f'{n} views were asked for, but the scan has {total}')
     return np.arange(n) * total // n
 
 
-def rotation(axis: str, angle) -> np.ndarray:
+def rotation(axis: str, angle: ArrayLike) -> np.ndarray:
     """Matrices [n, 3, 3] that turn by `angle` [n] (radians, right-handed) about 'x', 'y' or 'z'."""
     angle = np.atleast_1d(np.asarray(angle, float))
     i = 'xyz'.index(axis)
@@ -44,17 +55,17 @@ def rotation(axis: str, angle) -> np.ndarray:
 
 
 def scanner_rays(
-    angles,
-    DSO,
-    DSD,
-    nDetector,
-    dDetector,
-    parallel=False,
-    offDetector=(0.0, 0.0),
-    rotDetector=(0.0, 0.0, 0.0),
-    COR=0.0,
-    height=0.0,
-    tilt=0.0,
+    angles: ArrayLike,
+    DSO: ArrayLike,
+    DSD: ArrayLike,
+    nDetector: tuple[int, int],
+    dDetector: tuple[float, float],
+    parallel: bool = False,
+    offDetector: ArrayLike = (0.0, 0.0),
+    rotDetector: ArrayLike = (0.0, 0.0, 0.0),
+    COR: ArrayLike = 0.0,
+    height: ArrayLike = 0.0,
+    tilt: ArrayLike = 0.0,
 ) -> Rays:
     """The rays of a scanner's views in the world frame of `lingo_mi.geometry.base`, from TIGRE's numbers.
 
@@ -73,6 +84,8 @@ def scanner_rays(
     The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code), but for `height` and `tilt`,
     which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite sign. The beam of a parallel
     scan is not turned by rotDetector. Raises InputError where an argument has neither one value nor one a view.
+
+        scanner_rays(circular(50), 1000, 1500, (384, 512), (0.8, 0.8), tilt=0.1)
     """
     angles = np.asarray(angles, float)
     n = len(angles)
