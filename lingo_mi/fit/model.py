@@ -12,7 +12,7 @@ from lingo_mi.effects.hardening import hardened, second_share
 from lingo_mi.errors import InputError
 from lingo_mi.fit.scatter import Scattered
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction import effects_correction as corrections
 from lingo_mi.scan import Scan
@@ -56,7 +56,7 @@ class Model:
             parts = [self.factor * q for q in integrals(rays)]
             return hardened(parts, self.bands) if self.bands else parts[0]
 
-        return self.effects.saturated(self.effects.averaged(seen, view, Quality(), scattered), view) / self.factor
+        return self.effects.saturated(self.effects.averaged(seen, view, RenderOptions(), scattered), view) / self.factor
 
     def shares(self, volume, centres, half):
         """The second material's share in every Gaussian's density, Float [N]; None for one material.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from lingo_mi.errors import InputError
 from lingo_mi.lingo import initialise as lingo
 from lingo_mi.parsing import parse
+from lingo_mi.projectors import cutoff
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Settings:
     render: str = 'integral'
     sh_degree: int = 3
     sh_every: int = 1000
-    extent: float = 3.0
+    extent: float = cutoff.FIT
     effects: str = 'model'
     lambda_ssim: float = 0.25
     lambda_tv: float = 0.05

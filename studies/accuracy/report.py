@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.projectors.accuracy import PRESETS
+from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.report.figures import STYLE
 
 GRADIENTS = 'centre', 'scale', 'rotation', 'density'

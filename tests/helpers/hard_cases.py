@@ -32,6 +32,7 @@ from lingo_mi.geometry.base import Geometry, circular
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.scan import Scan
@@ -145,7 +146,7 @@ def run(cloud, frames, shape, weights, panel=True, extent=EXTENT):
     """Image, and derivatives of sum(weights * image) by the cloud."""
     view, gaussians = View.of(frames, 0, *shape, panel), on_device(cloud)
     dr.enable_grad(gaussians)
-    image = line_integrals(*gaussians, view, extent)
+    image = line_integrals(*gaussians, view, RenderOptions(extent))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))
     return image.numpy().astype(float), {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)}
 

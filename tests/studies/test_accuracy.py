@@ -14,7 +14,7 @@ from helpers import oracle
 from helpers.oracle import random_cloud, relative
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.accuracy import PRESETS
+from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies import alternatives
 from lingo_mi.studies.accuracy import Sizes, measure
 from lingo_mi.studies.accuracy.compare import by_function, by_integrator, compare, deviation
