@@ -5,8 +5,8 @@ import mitsuba as mi
 
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
-from lingo_mi.projectors.accuracy import Quality
 from lingo_mi.projectors.objects import find_objects
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.sensors import view_of
 
 
@@ -78,7 +78,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     def __init__(self, props):
         super().__init__(props)
-        self.quality = Quality.of(
+        self.options = RenderOptions.of(
             props.get('accuracy', 'default'),
             props.get('extent', None),
             props.get('footprint', 'exact'),
@@ -115,7 +115,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         if effects is None:
             total = self._ideal(find_objects(scene), view, primal)
         else:
-            total = effects.line_integrals(find_objects(scene), view, self.quality)
+            total = effects.line_integrals(find_objects(scene), view, self.options)
             total = effects.saturated(total, view) if seed is None else effects.measured(total, view, seed)
             if self.output == 'transmission':
                 total = dr.exp(-total)
@@ -128,18 +128,18 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     def _ideal(self, objects, view, primal):
         """Line integrals, or transmissions, of every pixel of a scene without effects."""
-        rays = self.quality.subdivided(view)
+        rays = self.options.subdivided(view)
         total = dr.zeros(mi.Float, rays.height * rays.width)
         for thing in objects:
-            total += self.quality.line_integrals(thing, rays, primal)
+            total += thing.line_integrals(rays, self.options, primal)
         if self.output == 'transmission':
             total = dr.exp(-total)
-        return self.quality.averaged(total, view)
+        return self.options.averaged(total, view)
 
     def to_string(self):
-        q = self.quality
-        pixel = 'area' if q.area else f'{q.pixel} x {q.pixel}'
-        return f'LingoXray[extent = {q.extent:g}, footprint = {q.footprint}, pixel = {pixel}, output = {self.output}]'
+        o = self.options
+        pixel = 'area' if o.area else f'{o.pixel} x {o.pixel}'
+        return f'LingoXray[extent = {o.extent:g}, footprint = {o.footprint}, pixel = {pixel}, output = {self.output}]'
 
 
 create = LingoXray

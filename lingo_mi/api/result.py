@@ -20,7 +20,7 @@ from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import measure
-from lingo_mi.results.save import world_cloud, write_results
+from lingo_mi.results.save import report_data, world_cloud, write_results
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
 
@@ -117,9 +117,7 @@ class Result:
         """
         data = self.data if data is None else data
         if data is not None:
-            test = data.test
-            rendered = None if test is None or not len(test) else self.fitted.render(test.geometry)
-            return measure(self.fitted, data, self.fitted.volume(), rendered)
+            return measure(self.fitted, data).numbers
         if self._stored is None:
             raise InputError('this result was loaded without numbers: give the data to compare with')
         return self._stored
@@ -140,15 +138,7 @@ class Result:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / CHECKPOINT) as temporary:
             temporary.write_bytes(self._checkpoint)
-        write_results(
-            folder,
-            self.fitted,
-            self.data,
-            title=title or folder.name,
-            method=self.recipe,
-            seed=self.fitted.seed,
-            command='lingo_mi.fit(...)',
-        )
+        write_results(folder, self.fitted, self.data, title=title or folder.name, method=self.recipe)
         return folder
 
     def __repr__(self) -> str:
@@ -160,7 +150,7 @@ class Result:
     def _repr_html_(self) -> str:
         if self.data is None:
             return f'<pre>{html.escape(repr(self))}\n{html.escape(headline(self._stored or {}))}</pre>'
-        data = report_data(self.fitted, self.data, title=self.recipe)
+        data = report_data(self.fitted, self.data, measure(self.fitted, self.data), self.recipe)
         picture = base64.b64encode(overview(data, headline(data.metrics))).decode('ascii')
         return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{picture}">'
 

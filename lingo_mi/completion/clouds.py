@@ -63,15 +63,15 @@ def load_cloud(path: Path | str) -> FittedCloud | Fitted:
         return _composited(path)
     loaded = load_scene(Path(path))
     objects = find_objects(loaded.scene)
-    quality = getattr(loaded.scene.integrator(), 'quality', None)
-    if quality is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
+    options = getattr(loaded.scene.integrator(), 'options', None)
+    if options is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
         raise InputError(f'{path}: is no cloud of Gaussians; {WANTED}')
     corrected, record = loaded.scanner.geometry, _record(path)
     return FittedCloud(
         objects[0],
         _as_given(corrected, record, path),
         corrected,
-        quality.extent,
+        options.extent,
         find_effects(loaded.scene, loaded.scanner),
         record.get('seed'),
     )

@@ -13,6 +13,7 @@ from lingo_mi.effects.focal_spot import FocalSpot, aperture_views
 from lingo_mi.effects.hardening import Tube, by_material, hardened
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.errors import InputError
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.scan import Scan
 
 
@@ -66,43 +67,43 @@ class Effects:
             ]
         return views
 
-    def line_integrals(self, objects, view, quality):
+    def line_integrals(self, objects, view, options: RenderOptions):
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
         objects   of `projectors.objects.find_objects`
-        quality   `projectors.accuracy.Quality`; its n x n rays a pixel are averaged as intensities
+        options   whose n x n rays a pixel are averaged as intensities
         """
         groups, bands = {'': objects}, None
         if self.tube and self.tube.hardens:
             groups = by_material(objects, self.tube)
             bands = self.tube.signal(groups, self.response)
 
-        def seen(view):
-            rays = quality.subdivided(view)
+        def along(view):
+            rays = options.subdivided(view)
             integrals = []
             for things in groups.values():
                 total = dr.zeros(mi.Float, rays.height * rays.width)
                 for thing in things:
-                    total += quality.line_integrals(thing, rays)
+                    total += thing.line_integrals(rays, options)
                 integrals.append(total)
             return hardened(integrals, bands) if bands else integrals[0]
 
         scattered = self.scatter and self.scatter.light(objects, self.tube, self.response, view, self.index)
-        return self.averaged(seen, view, quality, scattered)
+        return self.averaged(along, view, options, scattered)
 
-    def averaged(self, seen, view, quality, scattered=None):
+    def averaged(self, along, view, options: RenderOptions, scattered=None):
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
 
-        seen        gives -ln of the intensity along the rays of a View, Float
+        along       gives -ln of the intensity along the rays of a View, Float
         scattered   added to the intensity, over the open beam's, Float [height * width]
         """
         views = self.views(view)
         psf = self.detector.psf if self.detector else 0
-        if len(views) == 1 and quality.pixel == 1 and not psf and scattered is None:
-            return seen(view)
+        if len(views) == 1 and options.pixel == 1 and not psf and scattered is None:
+            return along(view)
         light = mi.Float(0)
         for weight, one in views:
-            light += dr.opaque(mi.Float, weight) * quality.averaged(dr.exp(-seen(one)), view)
+            light += dr.opaque(mi.Float, weight) * options.averaged(dr.exp(-along(one)), view)
             if len(views) > 1:  # one small kernel for all of them, instead of a large one that takes long to compile
                 dr.eval(light)
         if scattered is not None:

@@ -48,7 +48,7 @@ class DeviceState:
     def gaussians(self, settings: Settings):
         """Centres, standard deviations, quaternions (not normalised) and densities; differentiable.
 
-        For alpha compositing opacities in place of densities, followed by what `projectors.radiance.seen` takes.
+        For alpha compositing opacities in place of densities, followed by what `projectors.radiance.radiance_towards` takes.
         """
         v = self.values
         low, high = (

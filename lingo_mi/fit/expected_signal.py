@@ -11,7 +11,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import hardened, second_share
 from lingo_mi.fit.scattered_light import ScatteredLight
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 
 
@@ -52,7 +52,7 @@ class ExpectedSignal:
             parts = [self.factor * q for q in integrals(rays)]
             return hardened(parts, self.bands) if self.bands else parts[0]
 
-        return self.effects.saturated(self.effects.averaged(seen, view, Quality(), scattered), view) / self.factor
+        return self.effects.saturated(self.effects.averaged(seen, view, RenderOptions(), scattered), view) / self.factor
 
     def shares(self, volume: np.ndarray, centres: np.ndarray, half: np.ndarray):
         """The second material's share in every Gaussian's density, Float [N]; None for one material.

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from lingo_mi.errors import InputError
 from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import parse
+from lingo_mi.projectors import cutoff
 
 INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by what is rendered
 
@@ -64,7 +65,7 @@ class ModelSettings:
     normalise: bool = False
     sh_degree: int = 3
     sh_every: int = 1000
-    extent: float = 3.0
+    extent: float = cutoff.FIT
     effects: str = 'model'
 
     def __post_init__(self):

@@ -17,7 +17,7 @@ from lingo_mi.projectors.alpha import composite, flatten
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.frozen import Replay
-from lingo_mi.projectors.radiance import seen
+from lingo_mi.projectors.radiance import radiance_towards
 from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
@@ -74,7 +74,7 @@ def footprints_of(gaussians, rays, settings: Settings):
     """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
     if not settings.volumetric:
         centre, scale, rotation, opacity, *radiance = gaussians
-        return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
+        return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
     return project(*gaussians, rays, settings.model.extent)
 
 
@@ -124,7 +124,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
-        visible = dr.select(footprints.seen, mi.Float(1), 0)
+        visible = dr.select(footprints.visible, mi.Float(1), 0)
     for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
         pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate(gaussians)

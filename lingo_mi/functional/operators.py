@@ -28,6 +28,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable
 from lingo_mi.projectors.view import View, vector64
 
@@ -65,12 +66,12 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's.
     """
     height, width = geometry.nDetector
-    index = _indices(views, len(geometry.rays()))
-    rays = geometry.rays()[index]
-    extent = _extent(extent)
+    rays = geometry.rays()
+    index = _indices(views, len(rays))
+    rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        found = [line_integrals(*gaussians, View.of(rays, i, height, width), extent) for i in range(len(index))]
+        found = [line_integrals(*gaussians, View.of(rays, i, height, width), options) for i in range(len(index))]
         return found[0] if len(found) == 1 else dr.concat(found)
 
     return call(

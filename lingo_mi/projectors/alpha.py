@@ -52,7 +52,7 @@ class Discs:
     count: tuple
 
     @property
-    def seen(self):
+    def visible(self):
         """Whether a Gaussian touches the image, Bool [N]."""
         return self.count[0] * self.count[1] > 0
 

@@ -1,9 +1,9 @@
 """Sharing out uneven work: a fixed number of teams, each with the same share of the total cost.
 
-An *item* (a Gaussian, a triangle) is some *blocks* of LANES rows, each at the item's own cost; the ends of the items' costs
-are a prefix sum. A *team* is LANES lanes that walk one item at a time, a lane a row. Every team takes the blocks that begin
-within its share, so that one enormous item is shared by all, an empty one costs nothing, and neither the launch nor its
-kernel ever changes.
+An *item* (a Gaussian, a triangle) is some *blocks* of rows, each at the item's own cost; the ends of the items' costs are a
+prefix sum. A *team* is as many lanes as a block has rows, which walk one item at a time, a lane a row. Every team takes the
+blocks that begin within its share, so that one enormous item is shared by all, an empty one costs nothing, and neither the
+launch nor its kernel ever changes.
 
 On the CPU, teams add to images of their own without atomics (which would take most of the time), and the copies are summed
 at the end, unless they were too large. On the GPU there are many teams, one image and atomic additions.
@@ -11,14 +11,93 @@ at the end, unless they were too large. On the GPU there are many teams, one ima
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.projectors.depth import scattered
+from lingo_mi.projectors.depth import hashed
 
-LANES = 8  # rows that a team works on side by side
 PACKET = 4  # consecutive elements that a lane reads and writes at a time
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """Into how many shares work is cut, and how wide the teams are that do one each. The images are the same to rounding.
+
+    lanes               of a team: rows that it works on side by side, the rows of a block
+    shares_per_thread   shares for each thread of the CPU: the more, the better they even out, but each has an image of its own
+    shares_on_gpu       shares on a GPU
+    """
+
+    lanes: int = 8
+    shares_per_thread: float = 2
+    shares_on_gpu: int = 4096
+
+    def scaled(self, factor: float) -> Sharing:
+        """`factor` times as many shares."""
+        return replace(
+            self,
+            shares_per_thread=factor * self.shares_per_thread,
+            shares_on_gpu=max(round(factor * self.shares_on_gpu), 1),
+        )
+
+
+SHARING = Sharing()  # as measured: docs/accuracy.md
+
+
+@dataclass
+class Share:
+    """What a kernel's lanes know of their work.
+
+    lane         UInt32, numbers of the lanes; those of a team follow one another
+    begin, end   of the team's share, as (item, block), UInt32
+    blocks       UInt32 [N] of all items
+    lanes        of a team
+    """
+
+    lane: object
+    begin: tuple
+    end: tuple
+    blocks: object
+    lanes: int
+
+    def row(self, block):
+        """The row of an item that a lane works on in a block of it, Int32."""
+        return mi.Int32(block * self.lanes + self.lane % self.lanes)
+
+    def each_item(self, visit):
+        """Call visit(g, block, stop) with each item of the share and the range of its blocks in it; the kernel's result.
+
+        Loops carry what they change and no more: Dr.Jit traces others twice, and nested ones four and eight times.
+        """
+        end = self.end
+
+        def step(g, block):
+            visit(g, block, dr.select(g < end[0], dr.gather(mi.UInt32, self.blocks, g), end[1]))
+            return g + 1, mi.UInt32(0)
+
+        return dr.while_loop(self.begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
+
+
+@dataclass
+class Target:
+    """What a kernel adds packets to.
+
+    values    Float, the images of all teams, or the one image
+    base      Int32, the first packet of a team's own image
+    private   whether it has one, and needs no atomics
+    """
+
+    values: object
+    base: object
+    private: bool
+
+    def add(self, value, index):
+        """Add a packet, Vector4f, at an index that counts from the first packet of `values`."""
+        mode = dr.ReduceMode.NoConflicts if self.private else dr.ReduceMode.Auto
+        dr.scatter_add(self.values, value, index, mode=mode)
 
 
 class Work:
@@ -26,61 +105,65 @@ class Work:
 
     blocks, block_cost   UInt32 [N], costs at least 1
     ends                 UInt64 [N], the sums of cost up to the end of each item
+    sharing              into how many shares, for teams of how many lanes
     """
 
-    def __init__(self, blocks, block_cost, ends):
+    def __init__(self, blocks, block_cost, ends, sharing: Sharing):
         self.count = dr.width(blocks)
         self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        self.teams = 2 * dr.thread_count() if self.on_cpu else 4096
+        self.sharing = sharing
+        per_cpu = max(round(sharing.shares_per_thread * dr.thread_count()), 1)
+        self.teams = per_cpu if self.on_cpu else sharing.shares_on_gpu
         self.arrays = self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
 
     @classmethod
-    def of(cls, blocks, block_cost) -> Work:
+    def of(cls, blocks, block_cost, sharing: Sharing) -> Work:
         ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
         dr.eval(blocks, block_cost, ends)
-        return cls(blocks, block_cost, ends)
+        return cls(blocks, block_cost, ends, sharing)
 
-    def shares(self) -> dict:
-        """The arguments of a kernel for `each_item`: lane, the begin and end of its share as (item, block), and blocks."""
+    def shares(self) -> Share:
+        """What a kernel's lanes know of their work."""
+        lanes = self.sharing.lanes
         total = dr.gather(mi.UInt64, self.ends, dr.opaque(mi.UInt32, self.count - 1))
-        lane = dr.arange(mi.UInt32, self.teams * LANES)
+        lane = dr.arange(mi.UInt32, self.teams * lanes)
         share = total // self.teams + 1
-        begin = mi.UInt64(lane // LANES) * share
+        begin = mi.UInt64(lane // lanes) * share
         begin, end = (
             _cut(dr.minimum(x, total), self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
             for x in (begin, begin + share)
         )
-        return dict(lane=lane, begin=begin, end=end, blocks=self.blocks)
+        return Share(lane, begin, end, self.blocks, lanes)
 
     def add_up(self, kernel, rows: int, width: int, parts: int = 1, /, **arguments):
-        """Run a kernel that adds to rows of so many elements, padded to whole packets; returns them, Float [rows * width].
+        """Run kernel(share, target, **arguments), which adds to rows of so many elements, padded to whole packets.
 
-        The kernel gets `target`, `base` (the first packet of the team's copy) and `private` (whether it needs no atomics).
-        With more than one of the `parts`, items are dealt out to them and each part is added up by itself, their sums in
-        float64.
+        Returns the rows, Float [rows * width]. With more than one of the `parts`, items are dealt out to them and each part is
+        added up by itself, their sums in float64.
         """
         if parts > 1:
-            which, total = scattered(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
+            which, total = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
             for part in range(parts):
-                some = Work.of(dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0), self.block_cost)
+                blocks = dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0)
+                some = Work.of(blocks, self.block_cost, self.sharing)
                 total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
                 dr.eval(total)
             return mi.Float(total)
         size = rows * packets_of(width)
         private = self.on_cpu and self.teams * size <= MOST_COPIED
         copies = self.teams if private else 1
-        target = dr.zeros(mi.Float, copies * size * PACKET)
-        dr.make_opaque(target)
-        shares, stride = self.shares(), dr.opaque(mi.UInt32, size)
-        base = mi.Int32(shares['lane'] // LANES * stride if private else mi.UInt32(0))
-        dr.eval(kernel(**shares, **arguments, target=target, base=base, private=private), target)
+        values = dr.zeros(mi.Float, copies * size * PACKET)
+        dr.make_opaque(values)
+        share, stride = self.shares(), dr.opaque(mi.UInt32, size)
+        base = mi.Int32(share.lane // share.lanes * stride if private else mi.UInt32(0))
+        dr.eval(kernel(share, Target(values, base, private), **arguments), values)
         if copies > 1:
             i, total = dr.arange(mi.UInt32, size), dr.zeros(mi.Vector4f, size)
             for copy in range(copies):
-                total += dr.gather(mi.Vector4f, target, i + copy * stride)
-            target = dr.empty(mi.Float, size * PACKET)
-            dr.scatter(target, total, i, mode=dr.ReduceMode.Permute)
-        return crop(target, rows, width)
+                total += dr.gather(mi.Vector4f, values, i + copy * stride)
+            values = dr.empty(mi.Float, size * PACKET)
+            dr.scatter(values, total, i, mode=dr.ReduceMode.Permute)
+        return crop(values, rows, width)
 
 
 def _cut(position, ends, block_cost, count):
@@ -96,19 +179,6 @@ def _cut(position, ends, block_cost, count):
     # A masked lane reads 0, and an integer division by it would kill the process.
     cost = dr.maximum(mi.UInt64(dr.gather(mi.UInt32, block_cost, g, g < count)), 1)
     return g, mi.UInt32((position - start + cost - 1) // cost)
-
-
-def each_item(begin, end, blocks, visit):
-    """Call visit(g, block, stop) with each item of a share and the range of its blocks in the share; the kernel's result.
-
-    Loops carry what they change and no more: Dr.Jit traces others twice, and nested ones four and eight times.
-    """
-
-    def step(g, block):
-        visit(g, block, dr.select(g < end[0], dr.gather(mi.UInt32, blocks, g), end[1]))
-        return g + 1, mi.UInt32(0)
-
-    return dr.while_loop(begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
 
 
 def repeat(first, last, body, *state):
@@ -177,13 +247,13 @@ def times(high, low, n):
     return product, dr.fma(low, n, dr.fma(high, n, -product))
 
 
-def pair(a, b):
-    """Two corrections in one number, eight binary digits each; `unpair` gives them back."""
+def pack_halves(a, b):
+    """Two corrections in one number, eight binary digits each; `unpack_halves` gives them back."""
     a, b = (dr.reinterpret_array(mi.UInt32, x) & 0xFFFF0000 for x in (a, b))
     return dr.reinterpret_array(mi.Float, a | (b >> 16))
 
 
-def unpair(both):
+def unpack_halves(both):
     bits = dr.reinterpret_array(mi.UInt32, both)
     return dr.reinterpret_array(mi.Float, bits & 0xFFFF0000), dr.reinterpret_array(mi.Float, bits << 16)
 
@@ -202,8 +272,3 @@ def position(packet, column, offset):
     """t of the elements of a packet: exact to its last digit wherever the whole elements cancel."""
     whole = mi.Float(packet * PACKET - column)
     return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)
-
-
-def deposit(target, value, index, private):
-    """Add a packet to a target, without atomics where the target is the team's own."""
-    dr.scatter_add(target, value, index, mode=dr.ReduceMode.NoConflicts if private else dr.ReduceMode.Auto)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +13,7 @@ from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project
 from lingo_mi.projectors.frozen import Replay
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.segment import add_straddling
 from lingo_mi.projectors.splat import Plan, by_values, prepare, splat
 from lingo_mi.projectors.view import View
@@ -30,48 +31,51 @@ def columns(rows):
     return mi.Point3f(*c[:3]), mi.Vector3f(*c[3:6]), mi.Vector4f(*c[6:])
 
 
-def line_integrals(
-    centre,
-    scale,
-    rotation,
-    density,
-    view,
-    extent: float = 4.0,
-    primal: bool = True,
-    affine: bool = False,
-    area: bool = False,
-    rows=None,
-):
+def line_integrals(centre, scale, rotation, density, view: View, options: RenderOptions, primal: bool = True):
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
     rotation        Vector4f [N], quaternion (x, y, z, w)
     density         Float [N], value at the centre
-    view            `frame.View`
-    extent          cut-off in standard deviations
+    view            whose pixels: one ray each, or its mean over their area; `options.subdivided` gives more rays
+    options         cut-off, footprint, area and sharing
     primal          False where only derivatives are wanted: the image is then left at zero
-    affine          the model of Gaussian splatting (EWA): |d|^2 frozen at each Gaussian's centre
-    area            the mean over each pixel's area instead of the ray through its centre: the footprint convolved with a
-                    Gaussian of the pixel's variance
-    rows            Float [10 N], what the first three are the `columns` of, if that is so; saves a copy of them
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
     no extent or no rotation leaves no finite pixel. Raises InputError for an empty cloud.
     """
-    if dr.width(density) == 0:
+    return _of_inputs((centre, scale, rotation, density), view, options, primal)
+
+
+def line_integrals_of_rows(rows, density, view: View, options: RenderOptions, primal: bool = True):
+    """`line_integrals` of rows of ten numbers, Float [10 N], whose `columns` are centres, scales and rotations: saves a copy of
+    them."""
+    return _of_inputs((rows, density), view, options, primal)
+
+
+def _of_inputs(gaussians, view, options, primal):
+    if dr.width(gaussians[-1]) == 0:
         raise InputError('the cloud is empty: it needs at least one Gaussian')
-    gaussians = (centre, scale, rotation, density) if rows is None else (rows, density)
     inputs = *gaussians, view.source, view.corner, view.u, view.v
-    settings = dict(
-        width=view.width,
-        height=view.height,
-        parallel=view.parallel,
-        panel=view.panel,
-        extent=extent,
-        affine=affine,
-        area=area,
-    )
+    settings = dict(panel=_Panel(view.width, view.height, view.parallel, view.panel), options=options)
     return dr.custom(_LineIntegrals, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """What recordings know of a view: all but its pose. As for `View`."""
+
+    width: int
+    height: int
+    parallel: bool
+    panel: bool
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+    def view(self, pose) -> View:
+        return View(*pose, self.width, self.height, self.parallel, self.panel)
 
 
 class _LineIntegrals(dr.CustomOp):
@@ -84,15 +88,16 @@ class _LineIntegrals(dr.CustomOp):
     def eval(self, inputs, wanted, settings, primal):
         self.inputs, self.wanted, self.settings, self.parts, self.known = inputs, wanted, settings, 1, None
         if not primal:
-            return dr.zeros(mi.Float, settings['width'] * settings['height'])
+            return dr.zeros(mi.Float, settings['panel'].pixels)
         prepared, straddling = self._look()
-        if (settings['affine'] or settings['area']) and dr.width(straddling):
+        options = settings['options']
+        if (options.footprint == 'affine' or options.area) and dr.width(straddling):
             warnings.warn(
                 AccuracyWarning(
-                    f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the ray through '
-                    f'the pixel\'s centre is taken, whatever "pixel" and "footprint" say'
+                    f'{dr.width(straddling)} Gaussians reach to the source or the panel: of them the integral along the '
+                    f'ray through the pixel\'s centre is taken, whatever "pixel" and "footprint" say'
                 ),
-                stacklevel=4,
+                stacklevel=5,
             )
         image = _DRAW(*prepared, *inputs[-POSE:], parts=self.parts, **settings)
         if any(wanted):
@@ -103,7 +108,8 @@ class _LineIntegrals(dr.CustomOp):
         leaf = leaves(self.inputs)
         dr.set_grad(leaf, self.grad_in('inputs'))
         view, footprints = _footprints(*leaf, **self.settings)
-        image = splat(footprints, view.height, view.width, self.settings['extent'], self.parts) * view.lengths()
+        options = self.settings['options']
+        image = splat(footprints, view.height, view.width, options.extent, self.parts, options.sharing) * view.lengths()
         image = _with_rest(image, leaf, self.settings, dr.compress(footprints.straddles))
         dr.forward_to(image)
         self.set_grad_out(dr.grad(image))
@@ -114,8 +120,8 @@ class _LineIntegrals(dr.CustomOp):
         self.known, upstream = None, self.grad_out()
         found = _GATHER(*prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings)
         del prepared  # as large as all that follows
-        gradients = _CHAIN(*self.inputs, *found, wanted=self.wanted, **self.settings)
-        if dr.width(straddling) and not self.settings['parallel']:
+        gradients = _BY_INPUTS(*self.inputs, *found, wanted=self.wanted, **self.settings)
+        if dr.width(straddling) and not self.settings['panel'].parallel:
             leaf = leaves(self.inputs)
             dr.backward_from(_with_rest(mi.Float(0), leaf, self.settings, straddling) * upstream)
             gradients = [a + dr.grad(b) for a, b in zip(gradients, leaf)]
@@ -133,17 +139,17 @@ class _LineIntegrals(dr.CustomOp):
         return prepared, dr.compress(straddles)
 
 
-def _read(*inputs, width, height, parallel, panel, **_):
+def _read(*inputs, panel, **_):
     """Centres, scales, rotations and densities, and the view, that the inputs are."""
     *shapes, density = inputs[:-POSE]
     shapes = columns(*shapes) if len(shapes) == 1 else shapes
-    return (*shapes, density), View(*inputs[-POSE:], width, height, parallel, panel)
+    return (*shapes, density), panel.view(inputs[-POSE:])
 
 
-def _footprints(*inputs, extent, affine, area, **of_view):
-    gaussians, view = _read(*inputs, **of_view)
-    footprints = project(*gaussians, view, extent, PIXEL_VARIANCE if area else 0.0)
-    return view, _affine(footprints) if affine else footprints
+def _footprints(*inputs, panel, options):
+    gaussians, view = _read(*inputs, panel=panel)
+    footprints = project(*gaussians, view, options.extent, PIXEL_VARIANCE if options.area else 0.0)
+    return view, _affine(footprints) if options.footprint == 'affine' else footprints
 
 
 def _with_rest(image, inputs, settings, indices):
@@ -154,27 +160,33 @@ def _with_rest(image, inputs, settings, indices):
     return image + dr.nan if view.parallel else add_straddling(image, *gaussians, view, indices)
 
 
-def _prepare(*inputs, deep, **settings):
+def _prepare(*inputs, deep, panel, options):
     """What `splat.Plan` takes, then which Gaussians cannot be splatted, Bool [N], and how deep they lie."""
-    view, f = _footprints(*inputs, **settings)
-    found = prepare(f.values, replace(f, values=()))
+    view, f = _footprints(*inputs, panel=panel, options=options)
+    found = prepare(f.values, replace(f, values=()), options.sharing)
     return *found, f.straddles, deepest((f.column, f.row), f.area, (view.width, view.height)) if deep else None
 
 
-def _draw(*arrays, width, height, parallel, panel, extent, parts, **_):
-    view = View(*arrays[-POSE:], width, height, parallel, panel)
-    return Plan(arrays[:-POSE], height, width, extent).image(parts) * view.lengths()
+def _plan(prepared, panel, options):
+    return Plan(prepared, panel.height, panel.width, options.extent, options.sharing)
 
 
-def _gather(*arrays, width, height, parallel, panel, extent, image, parts, **_):
-    """What `Plan.gradient` gives, then the derivative by the rays' lengths, Float [pixels], where the `image` is wanted for it."""
+def _draw(*arrays, panel, options, parts):
+    view = panel.view(arrays[-POSE:])
+    return _plan(arrays[:-POSE], panel, options).image(parts) * view.lengths()
+
+
+def _gather(*arrays, panel, options, image, parts):
+    """What `Plan.gradient` gives, then the derivative by the rays' lengths, Float [pixels], where the `image` is wanted for
+    it."""
     *prepared, source, corner, u, v, upstream = arrays
-    plan = Plan(prepared, height, width, extent)
-    lengths = View(source, corner, u, v, width, height, parallel, panel).lengths()
+    plan = _plan(prepared, panel, options)
+    lengths = panel.view((source, corner, u, v)).lengths()
     return *plan.gradient(upstream * lengths), plan.image(parts) * upstream if image else None
 
 
-def _chain(*arrays, wanted, **settings):
+def _by_inputs(*arrays, wanted, **settings):
+    """Derivatives by the inputs from what `_gather` gives, which follow the inputs in `arrays`."""
     inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
     view, footprints = _footprints(*inputs, **settings)
@@ -185,7 +197,7 @@ def _chain(*arrays, wanted, **settings):
     return [dr.grad(x) for x in inputs]
 
 
-_PREPARE, _DRAW, _GATHER, _CHAIN = map(Replay, (_prepare, _draw, _gather, _chain))
+_PREPARE, _DRAW, _GATHER, _BY_INPUTS = map(Replay, (_prepare, _draw, _gather, _by_inputs))
 
 
 def _affine(footprints):

@@ -18,7 +18,7 @@ CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by the number of axes, along each o
 SAMPLE = 16384  # items that are looked at
 
 
-def scattered(i):
+def hashed(i):
     """Numbers that follow in no order from those that do, UInt32 (Knuth's multiplicative hash): clouds may be periodic."""
     return i * 2654435761 // 65536
 
@@ -47,7 +47,7 @@ def deepest(places, covered, shape):
     with dr.suspend_grad():
         step = count // SAMPLE + 1
         i, every = dr.arange(mi.UInt32, count // step), dr.opaque(mi.UInt32, step)
-        i = i * every + scattered(i) % every
+        i = i * every + hashed(i) % every
         covered = dr.gather(mi.Float, covered, i)
         inside = [dr.clip(dr.gather(mi.Int32, p, i), 0, n - 1) for p, n in zip(places, shape)]
         depth = dr.zeros(mi.Float, sum(cells ** len(shape) for cells, _ in levels) + 1)

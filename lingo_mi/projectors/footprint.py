@@ -66,7 +66,7 @@ class Footprints:
     straddles: object
 
     @property
-    def seen(self):
+    def visible(self):
         """Whether a Gaussian has pixels in the image, Bool [N]."""
         return self.row_end > self.row_begin
 

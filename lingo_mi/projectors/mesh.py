@@ -22,12 +22,14 @@ only grows.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.projectors.balance import LANES, PACKET, Work, deposit, each_item, pack, packets_of, repeat
+from lingo_mi.projectors.balance import PACKET, SHARING, Share, Sharing, Target, Work, pack, packets_of, repeat
 from lingo_mi.projectors.view import vector64
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
@@ -42,13 +44,14 @@ class MeshPaths:
     faces      [F, 3] indices of vertices, anticlockwise seen from the empty side; a mesh that is inside out as a
                whole is turned, but all its parts must agree
     name       what error messages call it
+    sharing    how the work of projecting it is shared out
 
     Where parts overlap, lengths add up. Raises InputError where the mesh is empty, not finite, or not closed: every
     edge must be used as often in one direction as in the other.
     """
 
-    def __init__(self, vertices, faces, name: str):
-        self.name = name
+    def __init__(self, vertices, faces, name: str, sharing: Sharing = SHARING):
+        self.name, self.sharing = name, sharing
         vertices, faces = _closed(np.asarray(vertices, float), np.asarray(faces, np.int64), name)
         Float64 = dr.value_t(mi.Vector3d)
         centre = (vertices.min(0) + vertices.max(0)) / 2
@@ -108,24 +111,41 @@ class MeshPaths:
     def _draw(self, vertices, view):
         """The sum over triangles of sign (t - t0) / t0, or of sign (t - t0) for a parallel beam."""
         packets = packets_of(view.width)
-        size = dict(height=dr.opaque(mi.Int32, view.height), width=dr.opaque(mi.Int32, view.width))
-        triangles, blocks, cost = _plan(vertices, self._faces, **size)
+        height, width = dr.opaque(mi.Int32, view.height), dr.opaque(mi.Int32, view.width)
+        triangles, blocks, cost = _plan(vertices, self._faces, height, width, self.sharing)
         drawn = dr.compress(blocks > 0)  # fine meshes have many triangles that fall between the pixel centres
         if dr.width(drawn) == 0:
             return dr.zeros(mi.Float, view.height * view.width)
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
         dr.eval(triangles)
-        work = Work.of(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn))
-        return work.add_up(
-            _fill,
-            view.height,
-            view.width,
-            vertices=vertices,
-            triangles=triangles,
-            **size,
-            packets=dr.opaque(mi.Int32, packets),
-            bend=dr.opaque(mi.Float, 0.0 if view.parallel else 1.0),
-        )
+        work = Work.of(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn), self.sharing)
+        packets, bend = dr.opaque(mi.Int32, packets), dr.opaque(mi.Float, 0.0 if view.parallel else 1.0)
+        mesh = _Packed(vertices, triangles, height, width, packets, bend)
+        return work.add_up(_fill, view.height, view.width, mesh=mesh)
+
+
+@dataclass
+class _Packed:
+    """A mesh as a kernel reads it.
+
+    vertices        Float64 [V * 4], packed (x, y, q, 0)
+    triangles       Int32 [4 T]: vertices from the least to the largest y, and the parity of that order
+    height, width   Int32, of the image
+    packets         Int32, of a row of it
+    bend            Float, 1 for a cone beam, 0 for a parallel one
+    """
+
+    vertices: object
+    triangles: object
+    height: object
+    width: object
+    packets: object
+    bend: object
+
+    def corners(self, i):
+        """The vertices (x, y, q, 0) of a triangle."""
+        Vector4d = dr.float64_array_t(mi.Vector4f)
+        return (dr.gather(Vector4d, self.vertices, mi.UInt32(k)) for k in (i.x, i.y, i.z))
 
 
 def from_mitsuba(shape) -> MeshPaths:
@@ -200,7 +220,7 @@ def _first_centre(position, size):
     return mi.Int32(dr.clip(dr.ceil(position - 0.5), 0, type(position)(size)))
 
 
-def _plan(vertices, faces, height, width):
+def _plan(vertices, faces, height, width, sharing: Sharing):
     """Per triangle: vertices from the least to the largest y, parity of that order; blocks of rows; their cost."""
     Float64 = type(vertices)
     i = [mi.UInt32(k) for k in faces]
@@ -216,7 +236,7 @@ def _plan(vertices, faces, height, width):
         y[j], y[j + 1] = dr.select(swap, y[j + 1], y[j]), dr.select(swap, y[j], y[j + 1])
         i[j], i[j + 1] = dr.select(swap, i[j + 1], i[j]), dr.select(swap, i[j], i[j + 1])
     rows = _first_centre(y[2], height) - _first_centre(y[0], height)
-    blocks = dr.select(reach > 0, (mi.UInt32(rows) + (LANES - 1)) // LANES, 0)
+    blocks = dr.select(reach > 0, (mi.UInt32(rows) + (sharing.lanes - 1)) // sharing.lanes, 0)
     mean_width = dr.minimum(0.5 * area / (y[2] - y[0]), Float64(reach))
     cost = mi.UInt32(dr.select(blocks > 0, mean_width, 0)) // PACKET + SETUP
     triangles = pack(mi.Vector4i, mi.Int32, (*(mi.Int32(k) for k in i), dr.select(odd, mi.Int32(-1), 1)))
@@ -259,31 +279,25 @@ def _row(long, lower, upper, parity, row, row_end, width):
     return first, last, sign, anchor, mi.Float(q), mi.Float(slope)
 
 
-def _fill(lane, begin, end, blocks, vertices, triangles, height, width, packets, bend, target, base, private):
+def _fill(share: Share, target: Target, mesh: _Packed):
     def draw(g, block, stop):
-        i = dr.gather(mi.Vector4i, triangles, g)
-        a, b, c = _corners(vertices, i)
+        i = dr.gather(mi.Vector4i, mesh.triangles, g)
+        a, b, c = mesh.corners(i)
         long, lower, upper = _edge(a, c), _edge(a, b), _edge(b, c)
-        row_begin, row_end = _first_centre(a.y, height), _first_centre(c.y, height)
+        row_begin, row_end = _first_centre(a.y, mesh.height), _first_centre(c.y, mesh.height)
 
         def rows(block):
-            row = row_begin + mi.Int32(block * LANES + lane % LANES)
-            first, last, sign, anchor, q0, slope = _row(long, lower, upper, i.w, row, row_end, width)
+            row = row_begin + share.row(block)
+            first, last, sign, anchor, q0, slope = _row(long, lower, upper, i.w, row, row_end, mesh.width)
 
             def pixels(packet):
                 column = packet * PACKET + mi.Vector4i(0, 1, 2, 3)
                 q = dr.fma(slope, mi.Vector4f(column - anchor), q0)
-                value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-bend, q, 1), 0)
-                deposit(target, value, base + row * packets + packet, private)
+                value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-mesh.bend, q, 1), 0)
+                target.add(value, target.base + row * mesh.packets + packet)
 
             repeat(first // PACKET, (last + (PACKET - 1)) // PACKET, pixels)
 
         repeat(block, stop, rows)
 
-    return each_item(begin, end, blocks, draw)
-
-
-def _corners(vertices, i):
-    """The vertices (x, y, q, 0) of a triangle."""
-    Vector4d = dr.float64_array_t(mi.Vector4f)
-    return (dr.gather(Vector4d, vertices, mi.UInt32(k)) for k in (i.x, i.y, i.z))
+    return share.each_item(draw)

@@ -10,6 +10,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors import cloud, grid
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable
 
 # Caches by shape, since shapes hold no Python attributes of ours: the edges of a mesh, and that a cloud is usable. Keeping an
@@ -76,10 +77,10 @@ class Ellipsoids:
         self.second, self.name, self.rows = second, name, None
         return self
 
-    def line_integrals(self, view, extent, primal, affine=False, area=False):
-        return cloud.line_integrals(
-            self.centre, self.scale, self.rotation, self.density, view, extent, primal, affine, area, self.rows
-        )
+    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+        if self.rows is not None:
+            return cloud.line_integrals_of_rows(self.rows, self.density, view, options, primal)
+        return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, options, primal)
 
 
 class GridInCube:
@@ -95,7 +96,7 @@ class GridInCube:
         box, cube = volume.bbox(), shape.bbox()
         if not (
             str(shape).startswith('Cube')
-            and _upright(shape, volume)
+            and _axis_aligned(shape, volume)
             and np.allclose(box.min, cube.min, atol=1e-4 * np.abs(cube.max - cube.min))
             and np.allclose(box.max, cube.max, atol=1e-4 * np.abs(cube.max - cube.min))
         ):
@@ -116,8 +117,8 @@ class GridInCube:
         self.low, self.high = mi.ScalarPoint3f(low), mi.ScalarPoint3f(high)
         return self
 
-    def line_integrals(self, view, extent, primal, affine=False, area=False):
-        _no_area(area)
+    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+        _no_area(options)
         nx, ny, nz = self.size
         # The projector wants z fastest, Mitsuba stores x fastest.
         i = dr.arange(mi.UInt32, nx * ny * nz)
@@ -127,14 +128,14 @@ class GridInCube:
         return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
 
 
-def _no_area(area):
-    if area:
+def _no_area(options):
+    if options.area:
         raise InputError(
             "lingo_xray: pixel = 'area' is for scenes of ellipsoids alone; with grids or meshes give n, for n x n rays"
         )
 
 
-def _upright(cube, volume) -> bool:
+def _axis_aligned(cube, volume) -> bool:
     """Whether neither a cube nor a gridvolume is turned, and the volume not mirrored: boxes alone do not tell."""
     corners = np.array(mi.traverse(cube)['vertex_positions']).reshape(-1, 3)
     low, high = corners.min(0), corners.max(0)
@@ -179,8 +180,8 @@ class HomogeneousMesh:
         vertices, faces = (np.array(a).reshape(-1, 3) for a in self._arrays)
         return vertices[faces].astype(float)
 
-    def line_integrals(self, view, extent, primal, affine=False, area=False):
-        _no_area(area)
+    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+        _no_area(options)
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 
-def seen(centre, view, radiance, harmonics=None):
+def radiance_towards(centre, view, radiance, harmonics=None):
     """Radiance of N Gaussians along the rays of a view, Float [N]; differentiable in everything, the view's pose included.
 
     centre      Point3f [N]

@@ -8,15 +8,14 @@ import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
 from lingo_mi.geometry import triangles
+from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.objects import Ellipsoids, GridInCube, HomogeneousMesh
 from lingo_mi.projectors.rotation import rows_of
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
-BOUND = 4.0  # standard deviations where a box may cut a Gaussian: 0.02 % of its mass lies outside
 
-
-def on_grid(thing, corner, step, shape, extent: float = 6.0) -> np.ndarray:
+def on_grid(thing, corner, step, shape, extent: float = cutoff.SAMPLE) -> np.ndarray:
     """Density of an object of `objects` on a grid, float32 [x, y, z].
 
     corner, step   [3] the outer corner of the first voxel, and the voxel size, mm
@@ -70,7 +69,7 @@ def _box(thing):
     if isinstance(thing, HomogeneousMesh):
         points = thing.triangles().reshape(-1, 3)
         return points.min(0), points.max(0)
-    reach = mi.Vector3f(*(BOUND * dr.norm(thing.scale * row) for row in rows_of(thing.rotation, mi.Vector3f)))
+    reach = mi.Vector3f(*(cutoff.BOX * dr.norm(thing.scale * row) for row in rows_of(thing.rotation, mi.Vector3f)))
     low, high = thing.centre - reach, thing.centre + reach
     return (
         np.array([float(dr.min(low[i])[0]) for i in range(3)]),

@@ -15,28 +15,29 @@ row to row in twice float32's digits. In a row, t is then the whole pixels from 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.balance import (
-    LANES,
     PACKET,
+    SHARING,
+    Share,
+    Sharing,
+    Target,
     Work,
-    deposit,
-    each_item,
     high_low,
     load,
     pack,
+    pack_halves,
     packets_of,
     pad,
-    pair,
     position,
     repeat,
     span,
     times,
-    unpair,
+    unpack_halves,
     whole,
 )
 from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
@@ -45,18 +46,22 @@ from lingo_mi.projectors.footprint import DOUBLE, NAMES, Footprints
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float, parts: int = 1):
+def splat(footprints: Footprints, height: int, width: int, extent: float, parts: int = 1, sharing: Sharing = SHARING):
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
-    Differentiable in `footprints.values`, in forward and in reverse mode. The footprints are added up in that many `parts`
-    (`depth`).
+    extent    cut-off in standard deviations
+    parts     in how many parts the footprints are added up (`depth`)
+    sharing   how the work is shared out
+
+    Differentiable in `footprints.values`, in forward and in reverse mode.
     """
-    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, parts)
+    return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, parts, sharing)
 
 
 class _Splat(dr.CustomOp):
-    def eval(self, values, rest, height, width, extent, parts):
-        self.plan, self.shear, self.parts = Plan(prepare(values, rest), height, width, extent), values[3], parts
+    def eval(self, values, rest, height, width, extent, parts, sharing):
+        self.plan = Plan(prepare(values, rest, sharing), height, width, extent, sharing)
+        self.shear, self.parts = values[3], parts
         return self.plan.image(parts)
 
     def forward(self):
@@ -69,37 +74,53 @@ class _Splat(dr.CustomOp):
         return 'splat'
 
 
-def prepare(values, rest):
+def prepare(values, rest, sharing: Sharing):
     """Footprints as the kernels take them, evaluated arrays for `Plan`; those of `rest` are evaluated with them."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
     ridge = x + shear * y
     steps = whole(ridge)
     (high, low), (ridge, ridge_low) = high_low(shear), high_low(ridge - steps)
-    columns = (amplitude, mx, my, high, e1, e2, e11, e12, e22, ridge, mi.Float(y), pair(low, ridge_low))
+    columns = (amplitude, mx, my, high, e1, e2, e11, e12, e22, ridge, mi.Float(y), pack_halves(low, ridge_low))
     packed = pack(mi.Vector4f, mi.Float, columns)
     places = pack(mi.Vector4i, mi.Int32, (rest.column + mi.Int32(steps), rest.row, rest.row_begin, rest.row_end))
-    blocks = mi.UInt32(rest.row_end - rest.row_begin + (LANES - 1)) // LANES
+    blocks = mi.UInt32(rest.row_end - rest.row_begin + (sharing.lanes - 1)) // sharing.lanes
     cost = mi.UInt32(rest.width) // PACKET + SETUP
     dr.eval(packed, places, blocks, cost, rest)  # together: each alone would project all Gaussians again
-    return packed, places, *Work.of(blocks, cost).arrays
+    return packed, places, *Work.of(blocks, cost, sharing).arrays
+
+
+@dataclass
+class _Packed:
+    """Footprints as a kernel reads them.
+
+    numbers   Float [12 N], those of `Footprints` with the ridge in the place of the centre's x
+    places    Int32 [4 N]: column of the ridge, row of the centre, first row and end of the rows
+    extent2   Float, the cut-off squared
+    packets   Int32, of a row of the image
+    """
+
+    numbers: object
+    places: object
+    extent2: object
+    packets: object
+
+    def load(self, g):
+        """The numbers and the places of footprint g."""
+        return load(self.numbers, g), dr.gather(mi.Vector4i, self.places, g)
 
 
 class Plan:
     """The work of one image: footprints that `prepare` packed, shared out by their pixels."""
 
-    def __init__(self, prepared, height: int, width: int, extent: float):
+    def __init__(self, prepared, height: int, width: int, extent: float, sharing: Sharing):
         packed, places, *work = prepared
-        self.height, self.width, self.work = height, width, Work(*work)
-        self.arguments = dict(
-            packed=packed,
-            whole=places,
-            extent2=dr.opaque(mi.Float, extent * extent),
-            packets=dr.opaque(mi.Int32, packets_of(width)),
-        )
+        self.height, self.width, self.work = height, width, Work(*work, sharing)
+        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(width))
+        self.packed = _Packed(packed, places, extent2, packets)
 
     def image(self, parts: int = 1):
         """Float [height * width]."""
-        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments)
+        return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed)
 
     def tangent(self, tangents, shear, parts: int = 1):
         """The image's derivative in a direction of the footprints' numbers, of which `shear` is one."""
@@ -109,7 +130,7 @@ class Plan:
         zeros = dr.zeros(mi.Float, self.work.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self.work.add_up(_draw, self.height, self.width, parts, **self.arguments, moved=moved)
+        return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed, moved=moved)
 
     def gradient(self, grad_image):
         """Derivatives by the footprints' numbers from that by the image, Float [N] each, the last with the ridge left where it
@@ -117,7 +138,7 @@ class Plan:
         upstream = pad(grad_image, self.height, self.width)
         out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
-        dr.eval(_gather(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
+        dr.eval(_gather(self.work.shares(), self.packed, upstream, out), out)
         return out
 
 
@@ -128,28 +149,28 @@ def by_values(found, shear):
     return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
 
 
-def _row(c, w, y, extent2, packets):
+def _row(c, w, y, f: _Packed):
     """Constants of row y of a footprint and its packets [begin, end).
 
     Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin,
     end.
     """
     _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
-    shear_low, ridge_low = unpair(low)
+    shear_low, ridge_low = unpack_halves(low)
     n = mi.Float(y - w.y)
     dy = n - fy
     m = dr.square(my * dy)
     d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
     d1 = dr.fma(2 * e12, dy, e1)
     # num <= extent^2 den, a quadratic in t
-    a, b, c0 = dr.square(mx) - extent2 * e11, 0.5 * extent2 * d1, extent2 * d0 - m
+    a, b, c0 = dr.square(mx) - f.extent2 * e11, 0.5 * f.extent2 * d1, f.extent2 * d0 - m
     root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
     along, along_low = times(shear, shear_low, n)
     steps = whole(along - ridge)
     # Where the ridge is close to a pixel's centre, so that t needs its digits, these differences are exact.
     offset = (ridge - (along - steps)) + (ridge_low - along_low)
     column = w.x - mi.Int32(steps)
-    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, packets)
+    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, f.packets)
     return dy, m, d0, d1, column, offset, begin, end
 
 
@@ -163,43 +184,44 @@ def _shape(t, c, m, d0, d1):
     return inverse, exponent, root * exp2_of_negative(exponent)
 
 
-def _draw(lane, begin, end, blocks, packed, whole, extent2, packets, target, base, private, moved=None):
+def _draw(share: Share, target: Target, f: _Packed, moved=None):
     """Add all footprints to the target; with `moved`, packed like them, their derivatives in that direction."""
 
     def draw(g, block, stop):
-        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+        c, w = f.load(g)
         dc = None if moved is None else load(moved, g)
 
         def rows(block):
-            y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
-            line = base + y * packets
+            y = w.z + share.row(block)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, f)
+            line = target.base + y * f.packets
 
             def pixels(packet):
                 t = position(packet, column, offset)
                 inverse, exponent, shape = _shape(t, c, m, d0, d1)
                 factor = c[0] if moved is None else _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
-                deposit(target, factor * shape, line + packet, private)
+                target.add(factor * shape, line + packet)
 
             repeat(first, last, pixels)
 
         repeat(block, stop, rows)
 
-    return each_item(begin, end, blocks, draw)
+    return share.each_item(draw)
 
 
-def _gather(lane, begin, end, blocks, packed, whole, extent2, packets, upstream, out):
+def _gather(share: Share, f: _Packed, upstream, out):
     """Add the derivatives of sum(upstream * image) by the footprints' numbers to `out`."""
 
     def gather(g, block, stop):
-        c, w = load(packed, g), dr.gather(mi.Vector4i, whole, g)
+        c, w = f.load(g)
 
         def rows(block, *sums):
-            y = w.z + mi.Int32(block * LANES + lane % LANES)
-            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, extent2, packets)
-            line = y * packets
+            y = w.z + share.row(block)
+            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, f)
+            line = y * f.packets
 
-            def pixels(packet, s, n0, n1, n2, q0, q1, q2):
+            def pixels(packet, *moments):
+                s, n0, n1, n2, q0, q1, q2 = moments
                 t = position(packet, column, offset)
                 inverse, exponent, shape = _shape(t, c, m, d0, d1)
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), but for the amplitude
@@ -218,17 +240,18 @@ def _gather(lane, begin, end, blocks, packed, whole, extent2, packets, upstream,
                     q2 + dr.dot(qt, t),
                 )
 
-            return _chain(sums, c, dy, *repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
+            return _add_row(sums, c, dy, repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
 
         sums = repeat(block, stop, rows, *(mi.Float(0) for _ in NAMES))
         for target, value in zip(out, sums):
             dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
 
-    return each_item(begin, end, blocks, gather)
+    return share.each_item(gather)
 
 
-def _chain(sums, c, dy, s, n0, n1, n2, q0, q1, q2):
+def _add_row(sums, c, dy, moments):
     """Add a row's part to the eleven sums, from its moments in t."""
+    s, n0, n1, n2, q0, q1, q2 = moments
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     half = -0.5 * amplitude
     h0, h1, h2 = (dr.fma(1 / HALF_LOG2E, q, n) for q, n in zip((q0, q1, q2), (n0, n1, n2)))

@@ -20,11 +20,12 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.projectors.balance import (
-    LANES,
     PACKET,
+    SHARING,
+    Share,
+    Sharing,
+    Target,
     Work,
-    deposit,
-    each_item,
     high_low,
     load,
     pack,
@@ -46,11 +47,18 @@ NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s
 
 @dataclass
 class Grid:
-    """Voxels: the outer corner of the first one, the step (both Vector3d, opaque) and the number along x, y and z."""
+    """Voxels.
+
+    corner    Vector3d, opaque: the outer corner of the first one
+    step      Vector3d, opaque: their size
+    shape     their number along x, y and z
+    sharing   how the work on them is shared out
+    """
 
     corner: object
     step: object
     shape: tuple[int, int, int]
+    sharing: Sharing = SHARING
 
     def volume(self, values):
         """Float [nz * ny * nx] as a host volume, float32 [x, y, z]."""
@@ -95,14 +103,14 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float, deep: 
         s3,
         *(at[i] - (Float64(middle[i]) + 0.5) for i in range(3)),
     )
-    out = dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), covered, grid.shape, extent, deep)
+    out = dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), covered, grid, (extent, deep))
     return out + dr.sum(dr.select(sound, 0, mi.Float(dr.nan)))
 
 
 class _Voxelize(dr.CustomOp):
-    def eval(self, values, rest, length, covered, shape, extent, deep):
+    def eval(self, values, rest, length, covered, grid, settings):
+        shape, (extent, deep) = grid.shape, settings
         self.shape, (nx, ny, nz) = shape, shape
-        self.packets = packets_of(nx)
         rho, m1, m2, m3, s1, s2, s3, x, y, z = values
         self.slopes = s1, s2, s3
         ridge, spine = x + s1 * y + s2 * z, y + s3 * z
@@ -113,25 +121,21 @@ class _Voxelize(dr.CustomOp):
         # (column of the ridge, row, slice, lines) and (first row, first slice, rows, row of the spine)
         column, row, *others = rest
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
-        blocks, cost = (mi.UInt32(rest[3]) + (LANES - 1)) // LANES, length // PACKET + SETUP
+        lanes = grid.sharing.lanes
+        blocks, cost = (mi.UInt32(rest[3]) + (lanes - 1)) // lanes, length // PACKET + SETUP
         dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
-        self.work = Work.of(blocks, cost)
+        self.work = Work.of(blocks, cost, grid.sharing)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
-        self.arguments = dict(
-            packed=packed,
-            places=places,
-            extent2=dr.opaque(mi.Float, extent * extent),
-            packets=dr.opaque(mi.Int32, self.packets),
-            rows=dr.opaque(mi.Int32, ny),
-        )
-        return self.work.add_up(_fill, ny * nz, nx, parts, **self.arguments)
+        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(nx))
+        self.packed = _Packed(packed, places, extent2, packets, dr.opaque(mi.Int32, ny))
+        return self.work.add_up(_fill, ny * nz, nx, parts, f=self.packed)
 
     def backward(self):
         nx, ny, nz = self.shape
         upstream = pad(self.grad_out(), ny * nz, nx)
         out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
         dr.make_opaque(upstream, out)
-        dr.eval(_collect(**self.work.shares(), **self.arguments, upstream=upstream, out=out), out)
+        dr.eval(_collect(self.work.shares(), self.packed, upstream, out), out)
         # The kernel's derivatives by y and z leave ridge and spine where they are; that by s1 leaves t at r = 0.
         s1, s2, s3 = self.slopes
         by_s1, by_s2, by_s3, x, y, z = (type(s1)(v) for v in out[4:])
@@ -142,7 +146,30 @@ class _Voxelize(dr.CustomOp):
         return 'voxelize'
 
 
-def _line(c, w, v, index, extent2, packets, rows):
+@dataclass
+class _Packed:
+    """Gaussians as a kernel reads them.
+
+    numbers   Float [16 N]
+    places    Int32 [8 N]: column of the ridge, row, slice, lines; first row, first slice, rows, row of the spine
+    extent2   Float, the cut-off squared
+    packets   Int32, of a line of voxels
+    rows      Int32, of a slice
+    """
+
+    numbers: object
+    places: object
+    extent2: object
+    packets: object
+    rows: object
+
+    def load(self, g):
+        """The numbers and the places of Gaussian g, these in two parts."""
+        c = load(self.numbers, g, 4)
+        return c, dr.gather(mi.Vector4i, self.places, 2 * g), dr.gather(mi.Vector4i, self.places, 2 * g + 1)
+
+
+def _line(c, w, v, index, f: _Packed):
     """A line of voxels of a Gaussian: what is constant along it, where t is 0 (a column and a fraction), its span in
     packets and its first packet."""
     _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
@@ -163,9 +190,9 @@ def _line(c, w, v, index, extent2, packets, rows):
     steps_z = whole(along_z + rest)
     offset = (ridge_low - low_y - low_z - low) - ((along_z - steps_z) + rest)
     column = w.x - mi.Int32(steps_y) - mi.Int32(steps_z)
-    half = dr.sqrt(dr.maximum(extent2 - m, 0)) / m1
-    begin, end = span(-half, half, offset, column, (index >= w.w) | (m > extent2), packets)
-    return dz, r, m, column, offset, begin, end, (z * rows + y) * packets
+    half = dr.sqrt(dr.maximum(f.extent2 - m, 0)) / m1
+    begin, end = span(-half, half, offset, column, (index >= w.w) | (m > f.extent2), f.packets)
+    return dz, r, m, column, offset, begin, end, (z * f.rows + y) * f.packets
 
 
 def _sum(a, b):
@@ -175,35 +202,33 @@ def _sum(a, b):
     return total, (a - (total - part)) + (b - part)
 
 
-def _fill(lane, begin, end, blocks, packed, places, extent2, packets, rows, target, base, private):
+def _fill(share: Share, target: Target, f: _Packed):
     def draw(g, block, stop):
-        c = load(packed, g, 4)
-        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
+        c, w, v = f.load(g)
 
         def lines(block):
-            index = mi.Int32(block * LANES + lane % LANES)
-            _, _, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+            index = share.row(block)
+            _, _, m, column, offset, first, last, line = _line(c, w, v, index, f)
 
             def voxels(packet):
                 u = c[1] * position(packet, column, offset)
                 value = c[0] * exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
-                deposit(target, value, base + line + packet, private)
+                target.add(value, target.base + line + packet)
 
             repeat(first, last, voxels)
 
         repeat(block, stop, lines)
 
-    return each_item(begin, end, blocks, draw)
+    return share.each_item(draw)
 
 
-def _collect(lane, begin, end, blocks, packed, places, extent2, packets, rows, upstream, out):
+def _collect(share: Share, f: _Packed, upstream, out):
     def gather(g, block, stop):
-        c = load(packed, g, 4)
-        w, v = dr.gather(mi.Vector4i, places, 2 * g), dr.gather(mi.Vector4i, places, 2 * g + 1)
+        c, w, v = f.load(g)
 
         def lines(block, *sums):
-            index = mi.Int32(block * LANES + lane % LANES)
-            dz, r, m, column, offset, first, last, line = _line(c, w, v, index, extent2, packets, rows)
+            index = share.row(block)
+            dz, r, m, column, offset, first, last, line = _line(c, w, v, index, f)
 
             def voxels(packet, n0, n1, n2):
                 t = position(packet, column, offset)
@@ -213,17 +238,18 @@ def _collect(lane, begin, end, blocks, packed, places, extent2, packets, rows, u
                 nt = n * t
                 return n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t)
 
-            return _chain(sums, c, dz, r, *repeat(first, last, voxels, *(mi.Float(0) for _ in range(3))))
+            return _add_line(sums, c, dz, r, repeat(first, last, voxels, *(mi.Float(0) for _ in range(3))))
 
         sums = repeat(block, stop, lines, *(mi.Float(0) for _ in range(NUMBERS)))
         for target, value in zip(out, sums):
             dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
 
-    return each_item(begin, end, blocks, gather)
+    return share.each_item(gather)
 
 
-def _chain(sums, c, dz, r, n0, n1, n2):
+def _add_line(sums, c, dz, r, moments):
     """Add a line's part to the sums, from its moments in t: d/d(exponent's square) is -rho/2 times a moment."""
+    n0, n1, n2 = moments
     rho, m1, m2, m3, *_ = c
     a0, a1, a2 = -rho * n0, -rho * n1, -rho * n2
     dt = dr.square(m1) * a1

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lingo_mi.effects.forward import Effects
+from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.objects import GridInCube
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.rectify import can_rectify
@@ -17,7 +18,7 @@ from lingo_mi.scene.simulate import render_objects, render_with
 PASSES = 2  # over the scattered light; from the third on, FDK's own errors grow
 
 
-def corrected(scan: Scan, effects: Effects, objects, extent: float = 8.0) -> Scan:
+def corrected(scan: Scan, effects: Effects, objects, extent: float = cutoff.SIMULATE) -> Scan:
     """The line integrals of measured views at the reference energy, by objects that resemble what was scanned.
 
     Linearised, less what linearising leaves of the effects in the objects' own views: blur, scatter, and the second material,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lingo_mi import metrics
@@ -28,17 +30,33 @@ def quick_measure(dataset: Dataset, most: int = 4):
     return measure
 
 
-def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
-    """The numbers of a finished fit; None where there is no truth to compare with."""
+@dataclass(frozen=True)
+class Measured:
+    """A finished fit, measured.
+
+    numbers   by name; None where there is no truth to compare with
+    volume    float32 [x, y, z], density per mm; None where the fit makes none
+    views     the held-out views as the fit renders them, float32 [view, v, u]; None where there are none
+    """
+
+    numbers: dict
+    volume: np.ndarray | None
+    views: np.ndarray | None
+
+
+def measure(fitted: Fitted, dataset: Dataset) -> Measured:
+    """The volume and the held-out views of a finished fit, and its numbers."""
     born = fitted.state.values['centre'][fitted.state.born]
-    test = dataset.test
-    truth = test.projections if rendered is not None else None
-    rendered = None if rendered is None else comparable(rendered, test)
+    test, volume, views = dataset.test, fitted.volume(), None
+    if test is not None and len(test):
+        views = fitted.render(test.geometry)
+    truth = None if test is None or views is None else test.projections
+    rendered = None if views is None else comparable(views, test)
 
     def of(function, result, reference):
         return None if result is None or reference is None else _number(function(result, reference))
 
-    return dict(
+    numbers = dict(
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth),
         psnr_2d=of(metrics.psnr_2d, rendered, truth),
         ssim_2d=of(metrics.ssim_2d, rendered, truth),
@@ -53,6 +71,7 @@ def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
         history=fitted.history,
     )
+    return Measured(numbers, volume, views)
 
 
 def compared(volume, truth) -> dict:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fit.checkpoint import METRICS
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.state import activate, harmonics
+from lingo_mi.paths import replacing
 from lingo_mi.report.page import ReportData, write_report
-from lingo_mi.results.measure import measure
+from lingo_mi.results.measure import Measured, measure
 from lingo_mi.results.scene_file import write_scene
 from lingo_mi.scan import Dataset
 
@@ -31,36 +33,41 @@ def world_cloud(fitted: Fitted, geometry):
 
 
 def write_results(
-    folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, seed: int, command: str
+    folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, command: str = ''
 ) -> dict:
     """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
 
+    dataset   that was fitted, with what is held out
+    title     of the report
+    method    the recipe's name
+    command   that makes the result again, for the report
+
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
     """
-    geometry, test = dataset.train.geometry, dataset.test
-    volume = fitted.volume()
+    geometry = dataset.train.geometry
+    measured = measure(fitted, dataset)
     cloud = world_cloud(fitted, geometry)
-    if volume is None:
+    if measured.volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
             (folder / stale).unlink(missing_ok=True)
         write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state))
     else:
-        write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+        write_volume(
+            folder / 'volume.nii.gz', measured.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm'
+        )
         write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
         write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.model.extent, fitted.effects)
-    rendered = None
-    if test is not None and len(test):
-        rendered = fitted.render(test.geometry)
+    if measured.views is not None:
         views = folder / 'views'
         views.mkdir(exist_ok=True)
         for stale in views.glob('*.exr'):
             stale.unlink()
-        for i, image in enumerate(rendered):
+        for i, image in enumerate(measured.views):
             write_exr(views / f'{i:04d}.exr', image)
-    measured = measure(fitted, dataset, volume, rendered) | dict(
+    numbers = measured.numbers | dict(
         method=method,
-        seed=seed,
+        seed=fitted.seed,
         views=len(dataset.train),
         variant=mi.variant(),
         settings=fitted.settings.flat(),
@@ -68,31 +75,38 @@ def write_results(
         command=command,
         **_corrections(fitted),
         angles=_degrees(geometry),
-        test_angles=_degrees(test.geometry) if rendered is not None else [],
+        test_angles=_degrees(dataset.test.geometry) if dataset.test is not None and len(dataset.test) else [],
         versions=versions(),
     )
-    report = ReportData(
+    write_report(folder, report_data(fitted, dataset, replace(measured, numbers=numbers), title))
+    with replacing(folder / METRICS) as temporary:
+        temporary.write_text(json.dumps(numbers, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
+    return numbers
+
+
+def report_data(fitted: Fitted, dataset: Dataset, measured: Measured, title: str) -> ReportData:
+    """What the report of a measured fit shows."""
+    geometry, test = dataset.train.geometry, dataset.test
+    held_out = {}
+    if measured.views is not None and test is not None:
+        angles = np.degrees(test.geometry.angles)
+        held_out = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
+    centres, _, _, density = world_cloud(fitted, geometry)
+    return ReportData(
         title=title,
-        metrics=measured,
-        volume=volume,
-        truth=None if volume is None else dataset.volume,
+        metrics=measured.numbers,
+        volume=measured.volume,
+        truth=None if measured.volume is None else dataset.volume,
         shape=geometry.nVoxel,
         spacing=geometry.dVoxel,
         centre=geometry.offOrigin,
-        views=rendered,
-        views_truth=test.projections if rendered is not None else None,
-        views_angles=np.degrees(test.geometry.angles) if rendered is not None else None,
         pixel=geometry.dDetector,
-        cloud_centres=cloud[0],
-        cloud_density=cloud[3],
-        cloud_unit='opacity' if volume is None else 'density at the centre [1/mm]',
-        command=command,
+        cloud_centres=centres,
+        cloud_density=density,
+        cloud_unit='opacity' if measured.volume is None else 'density at the centre [1/mm]',
+        command=measured.numbers.get('command', ''),
+        **held_out,
     )
-    write_report(folder, report)
-    temporary = folder / (METRICS + '.partial')
-    temporary.write_text(json.dumps(measured, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
-    temporary.replace(folder / METRICS)
-    return measured
 
 
 def _corrections(fitted) -> dict:

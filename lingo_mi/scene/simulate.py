@@ -10,9 +10,9 @@ from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.progress import Progress
-from lingo_mi.projectors import grid
-from lingo_mi.projectors.accuracy import Quality
+from lingo_mi.projectors import cutoff, grid
 from lingo_mi.projectors.objects import GridInCube, find_objects
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.sampling import grid_values
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Dataset, Scan
@@ -89,7 +89,7 @@ def choose_views(dataset: Dataset, views: int) -> Dataset:
     return Dataset(train.subset(chosen), test if test is not None else train.subset(rest), volume)
 
 
-def render_objects(objects, geometry, extent: float = 8.0) -> np.ndarray:
+def render_objects(objects, geometry, extent: float = cutoff.SIMULATE) -> np.ndarray:
     """Line integrals of all objects in all views, float32 [view, v, u]; Gaussians end at `extent` standard deviations."""
     total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
     with Progress('Scan', len(geometry) * len(objects)) as bar:
@@ -107,12 +107,12 @@ def render_objects(objects, geometry, extent: float = 8.0) -> np.ndarray:
                 rays = geometry.rays()
                 for i in range(len(geometry)):
                     view = View.of(rays, i, *geometry.nDetector)
-                    total[i] += thing.line_integrals(view, extent, True).numpy().reshape(geometry.nDetector)
+                    total[i] += thing.line_integrals(view, RenderOptions(extent)).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
 
 
-def render_with(effects: Effects, objects, geometry, keys, seed, extent: float = 8.0) -> np.ndarray:
+def render_with(effects: Effects, objects, geometry, keys, seed, extent: float = cutoff.SIMULATE) -> np.ndarray:
     """`render_objects` as a detector measures it; keys are those of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
@@ -121,7 +121,7 @@ def render_with(effects: Effects, objects, geometry, keys, seed, extent: float =
         for i in range(len(geometry)):
             view = View.of(rays, i, *geometry.nDetector)
             one = replace(effects, index=int(keys[i]))
-            expected = one.line_integrals(objects, view, Quality(extent))
+            expected = one.line_integrals(objects, view, RenderOptions(extent))
             out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])
             bar.update(i + 1)
     return out

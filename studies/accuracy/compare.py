@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import gc
 import time
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.projectors.balance import SHARING, Sharing
 from lingo_mi.studies.accuracy.sizes import Sizes
 from lingo_mi.studies.accuracy.workload import Workload
 from lingo_mi.studies.closed_form import NAMES
@@ -55,20 +55,19 @@ def by_function(name, work: Workload, function, differentiable=True) -> Method:
     return Method(name, image, gradients if differentiable else None)
 
 
-def by_integrator(name, work: Workload, around=None, **settings) -> Method:
+def by_integrator(name, work: Workload, sharing: Sharing = SHARING, **settings) -> Method:
     """A method from `lingo_xray` with these parameters, through `mi.render` and `dr.backward`.
 
-    around   a context manager, made anew for every call
+    sharing   how its work is shared out
     """
     integrator = mi.load_dict(dict(type='lingo_xray', **settings))
+    integrator.options = replace(integrator.options, sharing=sharing)
     params = mi.traverse(work.scene)
     weights = mi.TensorXf(work.weights[..., None])
-    around = around or _nothing
 
     def image():
-        with around():
-            out = mi.render(work.scene, integrator=integrator).array
-            dr.eval(out)
+        out = mi.render(work.scene, integrator=integrator).array
+        dr.eval(out)
         return out
 
     def gradients():
@@ -76,8 +75,7 @@ def by_integrator(name, work: Workload, around=None, **settings) -> Method:
         for key in keys:
             dr.enable_grad(params[key])
             dr.set_grad(params[key], 0)
-        with around():
-            dr.backward(mi.render(work.scene, params, integrator=integrator) * weights)
+        dr.backward(mi.render(work.scene, params, integrator=integrator) * weights)
         out = [dr.grad(params[key]) for key in keys]
         dr.eval(out)
         for key in keys:
@@ -85,11 +83,6 @@ def by_integrator(name, work: Workload, around=None, **settings) -> Method:
         return split(*out)
 
     return Method(name, image, gradients)
-
-
-@contextmanager
-def _nothing():
-    yield
 
 
 def split(data, density):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-from unittest import mock
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.projectors import balance, grid, splat
+from lingo_mi.projectors import grid
+from lingo_mi.projectors.balance import SHARING
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import alternatives
@@ -128,30 +128,11 @@ def pixel(sizes: Sizes) -> list[dict]:
 def teams(work: Workload, sizes: Sizes) -> list[dict]:
     """Into how many shares the work is cut, in parts of the usual number, and how many lanes work on one."""
     found = [
-        by_integrator(f'{factor:g}', work, lambda f=factor: _teams(f, balance.LANES), extent=EXTENT)
+        by_integrator(f'{factor:g}', work, sharing=SHARING.scaled(factor), extent=EXTENT)
         for factor in (0.25, 0.5, 1, 2, 4, 16)
     ]
-    found += [
-        by_integrator(
-            f'{balance.LANES / lanes:g}, of {lanes} lanes',
-            work,
-            lambda n=lanes: _teams(balance.LANES / n, n),
-            extent=EXTENT,
-        )
-        for lanes in (4, 16)
-    ]
+    for lanes in (4, 16):
+        factor = SHARING.lanes / lanes
+        sharing = replace(SHARING.scaled(factor), lanes=lanes)
+        found.append(by_integrator(f'{factor:g}, of {lanes} lanes', work, sharing=sharing, extent=EXTENT))
     return compare(work, found, sizes)
-
-
-@contextmanager
-def _teams(factor: float, lanes: int):
-    """The splat's work cut into `factor` times as many shares as usual, each for so many lanes."""
-
-    class Work(balance.Work):
-        def __init__(self, *args):
-            super().__init__(*args)
-            self.teams = max(round(factor * self.teams), 1)
-
-    unfrozen = dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)  # a recording would not notice
-    with unfrozen, mock.patch.multiple(splat, Work=Work, LANES=lanes), mock.patch.object(balance, 'LANES', lanes):
-        yield

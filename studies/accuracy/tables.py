@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.projectors.accuracy import PRESETS
+from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies.closed_form import NAMES
 from lingo_mi.studies.markdown import table
 

@@ -19,8 +19,8 @@ import numpy as np
 from lingo_mi.functional import project
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.runtime import use_variant
@@ -70,7 +70,7 @@ def _native(cloud, geometry, upstream):
     def run():
         leaf = [dr.detach(x) for x in gaussians]
         dr.enable_grad(leaf)
-        image = line_integrals(*leaf, view, cutoff.RENDER)
+        image = line_integrals(*leaf, view, RenderOptions())
         dr.set_grad(image, upstream)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)

@@ -24,6 +24,7 @@ from scipy.special import erf
 from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import oracle
@@ -90,7 +91,7 @@ def image_and_gradients(cloud: Cloud, frames: Rays, shape, weights, panel: bool 
     """
     view, gaussians = View.of(frames, 0, *shape, panel), on_device(cloud)
     dr.enable_grad(gaussians)
-    image = line_integrals(*gaussians, view, extent)
+    image = line_integrals(*gaussians, view, RenderOptions(extent))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))
     return image.numpy().astype(float), {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)}
 

@@ -204,7 +204,7 @@ class Cells:
                 check()
 
             fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
-        found = measure(fitted, dataset, fitted.volume(), fitted.render(dataset.test.geometry))
+        found = measure(fitted, dataset).numbers
         return found | dict(method=cell.method, settings=settings.flat(), initial=fitted.info)
 
     def _begin(self, settings, saved: Path):

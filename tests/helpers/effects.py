@@ -7,6 +7,7 @@ import mitsuba as mi
 import pytest
 
 from lingo_mi.projectors.objects import find_objects
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.sensors import view_of
 
 physics = pytest.mark.skipif(
@@ -28,7 +29,7 @@ def direct(scene, extent=6.0):
     view = view_of(scene.sensors()[0])
     total = dr.zeros(mi.Float, view.height * view.width)
     for thing in find_objects(scene):
-        total += thing.line_integrals(view, extent, True)
+        total += thing.line_integrals(view, RenderOptions(extent))
     dr.eval(mi.TensorXf(total, shape=(view.height, view.width, 1)))
 
 

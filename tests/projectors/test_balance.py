@@ -1,36 +1,85 @@
-"""Teams of lanes that are narrower than the processor's vectors, as teams of 8 are with AVX-512, or wider."""
+"""Work shared out among teams of any width, in any number of shares: the same images and derivatives."""
 
-import subprocess
-import sys
-from pathlib import Path
-
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
+import trimesh
 
-# In a process of its own: what this guards against, an integer division by zero in a lane whose team is done, ends it.
-PROGRAM = """
-import sys
-from lingo_mi.runtime import use_variant
-use_variant(sys.argv[1])
-from lingo_mi.projectors import balance, mesh, splat, voxelize
-for module in (balance, mesh, splat, voxelize):
-    module.LANES = int(sys.argv[2])
-from test_mesh import BOX, test_convex_bodies_at_every_pixel
-from test_splat import test_exact as splat_exact
-from test_voxelize import test_exact as voxelize_exact
-voxelize_exact((13, 7, 9))
-splat_exact('cone')
-test_convex_bodies_at_every_pixel(BOX, 'cone')
-"""
+from helpers import oracle
+from helpers.hard_cases import on_device, scanner
+from helpers.oracle import Pose, random_cloud, relative
+from lingo_mi.projectors.balance import Sharing
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.mesh import MeshPaths
+from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.projectors.view import View, vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+
+# 2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors. A lane whose team is done
+# must divide by nothing: an integer division by zero ends the process.
+SHARINGS = {
+    'narrow teams': Sharing(lanes=2),
+    'wide teams': Sharing(lanes=32),
+    'few shares': Sharing(shares_per_thread=0.25, shares_on_gpu=3),
+    'many shares': Sharing(shares_per_thread=40, shares_on_gpu=50_000),
+}
+by_sharing = pytest.mark.parametrize('sharing', SHARINGS.values(), ids=SHARINGS)
+NAMES = 'centre', 'scale', 'rotation', 'density'
 
 
-@pytest.mark.parametrize('lanes', [2, 32])
-def test_teams_of_any_width(lanes):
-    """2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors."""
-    found = subprocess.run(
-        [sys.executable, '-c', PROGRAM, mi.variant(), str(lanes)],
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parent,
-    )
-    assert found.returncode == 0, found.stderr
+def differentiated(cloud, function):
+    """function(*cloud) and the derivatives of its sum with fixed weights, float64; and the weights."""
+    gaussians = on_device(cloud)
+    dr.enable_grad(gaussians)
+    values = function(*gaussians)
+    weights = np.float32(np.random.default_rng(0).normal(size=dr.width(values))).astype(float)
+    dr.backward(dr.sum(values * mi.Float(weights.tolist())))
+    return values.numpy(), [np.array(dr.grad(x), float).T for x in gaussians], weights
+
+
+def check(found, expected, found_gradients, expected_gradients):
+    assert relative(found, expected) < 2e-6
+    for name, value in zip(NAMES, found_gradients):
+        assert relative(value, expected_gradients[name]) < 1e-5, name
+
+
+@by_sharing
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_images(sharing, mode):
+    frames, shape = scanner(mode)
+    cloud, pose = random_cloud(np.random.default_rng(1), 12), Pose.of(frames, 0, *shape)
+    view, options = View.of(frames, 0, *shape), RenderOptions(6.0, sharing=sharing)
+    image, gradients, weights = differentiated(cloud, lambda *x: line_integrals(*x, view, options))
+    check(image, oracle.line_integrals(cloud, pose), gradients, oracle.gradients(cloud, pose, weights))
+
+
+@by_sharing
+def test_voxels(sharing):
+    low, step, shape = np.array([-1.0, -0.9, -0.8]), np.array([0.15, 0.26, 0.18]), (13, 7, 9)
+    cloud, grid = random_cloud(np.random.default_rng(1), 8, size=0.2), Grid(*map(vector64, (low, step)), shape, sharing)
+    values, gradients, weights = differentiated(cloud, lambda *x: voxelize(*x, grid, 6.0))
+    z, y, x = np.indices(shape[::-1])
+    points = low + (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) * step
+    check(values, oracle.values_at(cloud, points), gradients, oracle.value_gradients(cloud, points, weights))
+
+
+@by_sharing
+def test_meshes(sharing):
+    """Chords of a box, by the slabs between its faces."""
+    frames, shape = scanner()
+    low, high = np.array([-0.7, -0.5, -0.4]), np.array([0.6, 0.8, 0.5])
+    box = trimesh.creation.box(bounds=[low, high])
+    paths = MeshPaths(box.vertices, box.faces, 'box', sharing)
+    found = paths.lengths(View.of(frames, 0, *shape)).numpy()
+    start, direction = Pose.of(frames, 0, *shape).rays()
+    a, b = (low - start) / direction, (high - start) / direction
+    inside = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+    chords = np.maximum(inside[1] - inside[0], 0) * np.linalg.norm(direction, axis=1)
+    assert chords.max() > 1
+    np.testing.assert_allclose(found, chords, rtol=0, atol=2e-6)
+
+
+def test_as_many_shares_as_asked():
+    assert Sharing().scaled(0.25) == Sharing(shares_per_thread=0.5, shares_on_gpu=1024)
+    assert Sharing(shares_on_gpu=1).scaled(0.1).shares_on_gpu == 1

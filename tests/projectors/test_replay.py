@@ -9,8 +9,9 @@ import pytest
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors import frozen as replay
-from lingo_mi.projectors.cloud import columns, line_integrals
+from lingo_mi.projectors.cloud import columns, line_integrals, line_integrals_of_rows
 from lingo_mi.projectors.frozen import Replay
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 
@@ -36,14 +37,14 @@ def cloud(n, seed=0):
     return mi.Point3f(centre), mi.Vector3f(scale), mi.Vector4f(rotation), *density
 
 
-def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, **settings):
+def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, primal=True, **options):
     """The image and the derivatives by those of the inputs that are wanted, evaluated."""
     with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
         inputs = *(dr.detach(x) for x in gaussians), *(dr.detach(x) for x in (rays.source, rays.corner, rays.u, rays.v))
         leaves = [inputs[i] for i in wanted]
         dr.enable_grad(leaves)
         rays = View(*inputs[4:], rays.width, rays.height, rays.parallel, rays.panel)
-        image = line_integrals(*inputs[:4], rays, **settings)
+        image = line_integrals(*inputs[:4], rays, RenderOptions(**{'extent': 4.0, **options}), primal)
         weights = mi.Float(np.random.default_rng(1).normal(size=dr.width(image)).astype(np.float32))
         dr.backward(image * (weights if weight is None else weight))
         found = [dr.detach(image), *(dr.grad(x) for x in leaves)]
@@ -65,7 +66,7 @@ def calls():
         'more pixels': (cloud(200), view(side=32), CLOUD, {}),
         'parallel': (cloud(200), view(parallel=True), CLOUD, {}),
         'another cut-off': (cloud(200), view(), CLOUD, dict(extent=3.0)),
-        'affine': (cloud(200), view(), CLOUD, dict(affine=True)),
+        'affine': (cloud(200), view(), CLOUD, dict(footprint='affine')),
         'area': (cloud(200), view(), CLOUD, dict(area=True)),
         'by the density alone': (cloud(200), view(), (3,), {}),
         'by the pose, too': (cloud(200), view(), ALL, {}),
@@ -112,7 +113,11 @@ def test_from_rows():
     for by_rows in (False, True, True):
         dr.disable_grad(rows)
         dr.enable_grad(rows)
-        image = line_integrals(*columns(rows), cloud(200)[3], view(), rows=rows if by_rows else None)
+        density, options = cloud(200)[3], RenderOptions(4.0)
+        if by_rows:
+            image = line_integrals_of_rows(rows, density, view(), options)
+        else:
+            image = line_integrals(*columns(rows), density, view(), options)
         dr.backward(image * upstream)
         found.append((image.numpy(), dr.grad(rows).numpy()))
     for other in found[1:]:
@@ -132,7 +137,7 @@ def test_derivatives_alone():
 
 def test_an_empty_cloud_is_refused():
     with pytest.raises(InputError, match='at least one Gaussian'):
-        line_integrals(mi.Point3f(), mi.Vector3f(), mi.Vector4f(), mi.Float(), view())
+        line_integrals(mi.Point3f(), mi.Vector3f(), mi.Vector4f(), mi.Float(), view(), RenderOptions())
 
 
 def test_exceptions_are_those_of_the_function():

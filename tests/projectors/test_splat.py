@@ -12,6 +12,7 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.exponential import exp2_of_negative
 from lingo_mi.projectors.footprint import NAMES, project
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.view import View
 from lingo_mi.studies import oracle
@@ -60,7 +61,7 @@ def run(cloud, frames, shape, weights, panel=True, pose=False):
     dr.enable_grad(gaussians)
     if pose:
         dr.enable_grad([getattr(view, name) for name in POSE])
-    image = line_integrals(*gaussians, view, EXTENT)
+    image = line_integrals(*gaussians, view, RenderOptions(EXTENT))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))
     return (
         image.numpy().astype(float),
@@ -165,7 +166,10 @@ def test_cut_off_bounds_the_error():
     cloud = random_cloud(np.random.default_rng(9), 30)
     exact = oracle.line_integrals(cloud, Pose.of(frames, 0, *shape))
     view, gaussians = View.of(frames, 0, *shape), on_device(cloud)
-    errors = [relative(line_integrals(*gaussians, view, extent).numpy(), exact) for extent in (3.0, 4.0, 5.0, 6.0)]
+    errors = [
+        relative(line_integrals(*gaussians, view, RenderOptions(extent)).numpy(), exact)
+        for extent in (3.0, 4.0, 5.0, 6.0)
+    ]
     assert all(error < bound for error, bound in zip(errors, (1.2e-2, 4e-4, 8e-6, 1e-6)))
     assert errors == sorted(errors, reverse=True)
 
@@ -273,7 +277,9 @@ def test_tangent_of_line_integrals(name):
     by = {k: np.float32(v).astype(float) for k, v in by.items()}
     directions = [mi.Float(c.tolist()) for v in by.values() for c in (v.T if v.ndim > 1 else [v])]
     view = View.of(frames, 0, *shape)
-    tangent = adjoint(lambda x: line_integrals(*x, view, EXTENT), list(on_device(cloud)), directions, rng)
+    tangent = adjoint(
+        lambda x: line_integrals(*x, view, RenderOptions(EXTENT)), list(on_device(cloud)), directions, rng
+    )
     pose, ends = Pose.of(frames, 0, *shape), (-np.inf, np.inf) if frames.parallel else (0, 1)
     rays = pose.rays()
     expected = sum(
@@ -295,7 +301,7 @@ def test_derivatives_without_the_image(mode):
     for primal in (True, False):
         gaussians = on_device(cloud)
         dr.enable_grad(gaussians)
-        image = line_integrals(*gaussians, view, EXTENT, primal)
+        image = line_integrals(*gaussians, view, RenderOptions(EXTENT), primal)
         assert bool(dr.any(image != 0)) == primal
         dr.backward(dr.sum(image * weights))
         grads.append([host(dr.grad(x)) for x in gaussians])

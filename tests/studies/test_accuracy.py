@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.projectors.accuracy import PRESETS
+from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies import alternatives, oracle
 from lingo_mi.studies.accuracy import Sizes, measure
 from lingo_mi.studies.accuracy.compare import by_function, by_integrator, compare, deviation

@@ -23,6 +23,7 @@ from lingo_mi.lingo.otsu import otsu as otsu_of_paper
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
 from lingo_mi.metrics import ssim_map
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import oracle
@@ -113,12 +114,12 @@ def test_a_gaussian_that_is_no_number_is_never_skipped(mode, name, value):
     assert not np.isfinite(voxelize(*on_device(cloud), grid, 3.0).numpy()).any()
 
 
-@pytest.mark.parametrize('model', ['affine', 'area'])
+@pytest.mark.parametrize('model', [dict(footprint='affine'), dict(area=True)], ids=['affine', 'area'])
 def test_models_that_do_not_reach_a_gaussian_on_the_panel(model):
     frames, shape = scanner()
     on_panel = Cloud(-0.5 * frames.source, [[0.02] * 3], [[0, 0, 0, 1]], [1.0])
     with pytest.warns(AccuracyWarning, match='1 Gaussians reach to the source or the panel'):
-        line_integrals(*on_device(on_panel), View.of(frames, 0, *shape), **{model: True})
+        line_integrals(*on_device(on_panel), View.of(frames, 0, *shape), RenderOptions(4.0, **model))
 
 
 @pytest.mark.parametrize('side, sigma', [(33, 1.0), (513, 0.1)])
@@ -133,7 +134,7 @@ def test_a_pile_of_gaussians_is_summed_as_accurately_as_one(side, sigma):
     def image(copies):
         parts = [[x[np.zeros(copies, int)] for x in (c.centre, c.scale, c.rotation, c.density)] for c in (one, away)]
         cloud = Cloud(*(np.stack(pair, 1).reshape(-1, *pair[0].shape[1:]) for pair in zip(*parts)))
-        return line_integrals(*on_device(cloud), view).numpy().astype(float)
+        return line_integrals(*on_device(cloud), view, RenderOptions(4.0)).numpy().astype(float)
 
     assert relative(image(count), count * image(1)) < 3e-6
 

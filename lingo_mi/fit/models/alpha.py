@@ -16,7 +16,7 @@ from lingo_mi.fit.models.base import SHAPE, ForwardModel
 from lingo_mi.fit.settings import Settings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.alpha import composite, flatten
-from lingo_mi.projectors.radiance import seen
+from lingo_mi.projectors.radiance import radiance_towards
 
 OPACITY = 0.1  # of all Gaussians at the start of a fit (3DGS)
 
@@ -62,13 +62,13 @@ class AlphaCompositing(ForwardModel):
         )
 
     def gaussians(self, values):
-        """Followed by what `projectors.radiance.seen` takes."""
+        """Followed by what `projectors.radiance.radiance_towards` takes."""
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
         return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
 
     def footprints(self, gaussians, rays):
         centre, scale, rotation, opacity, *radiance = gaussians
-        return flatten(centre, scale, rotation, opacity, seen(centre, rays, *radiance), rays)
+        return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
 
     def integrals(self, footprints, rays, share=None):
         """The grey image, taken for line integrals."""

@@ -1,4 +1,4 @@
-"""What a scene may pay for accuracy: the cut-off, the model of a footprint, the rule for a pixel, and presets."""
+"""How line integrals are computed: the cut-off, the model of a footprint, the rule for a pixel."""
 
 from __future__ import annotations
 
@@ -9,43 +9,42 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.errors import InputError
+from lingo_mi.projectors import cutoff
+from lingo_mi.projectors.balance import SHARING, Sharing
 
-# Cut-off in standard deviations; why these, in docs/accuracy.md.
-PRESETS = {'draft': 3.0, 'default': 5.0, 'reference': 7.0}
 FOOTPRINTS = 'exact', 'affine'
 MOST_SUBPIXELS = 16
 
 
 @dataclass(frozen=True)
-class Quality:
-    """The knobs of `lingo_xray`.
+class RenderOptions:
+    """The parameters of `lingo_xray`, and how its work is shared out.
 
     extent      cut-off of Gaussians in standard deviations
     footprint   'exact', or 'affine': the ray's whitened length |d|^2 frozen at a Gaussian's centre (EWA)
     pixel       n: the mean of n x n rays a pixel, those through the centres of its n x n parts
-    area        the mean over each pixel's area, for Gaussians: see `cloud.line_integrals`
+    area        the mean over each pixel's area instead of the ray through its centre, for Gaussians: the footprint convolved
+                with a Gaussian of the pixel's variance
+    sharing     how the work of Gaussians is shared out
     """
 
-    extent: float = PRESETS['default']
+    extent: float = cutoff.RENDER
     footprint: str = 'exact'
     pixel: int = 1
     area: bool = False
+    sharing: Sharing = SHARING
 
     @staticmethod
-    def of(accuracy='default', extent=None, footprint='exact', pixel='centre') -> Quality:
-        """The knobs from plugin parameters; what is None comes from the preset `accuracy`. Raises InputError."""
-        if accuracy not in PRESETS:
-            raise InputError(f'lingo_xray: accuracy is one of {", ".join(PRESETS)}, not {accuracy!r}')
-        extent = PRESETS[accuracy] if extent is None else extent
+    def of(accuracy='default', extent=None, footprint='exact', pixel='centre') -> RenderOptions:
+        """The options from plugin parameters; what is None comes from the preset `accuracy`. Raises InputError."""
+        if accuracy not in cutoff.PRESETS:
+            raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
+        extent = cutoff.PRESETS[accuracy] if extent is None else extent
         if not 1 <= extent <= 20:
             raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {extent:g}')
         if footprint not in FOOTPRINTS:
             raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')
-        return Quality(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
-
-    def line_integrals(self, thing, view, primal: bool = True):
-        """Line integrals of an object of `objects.find_objects` along all rays of a view, Float [height * width]."""
-        return thing.line_integrals(view, self.extent, primal, self.footprint == 'affine', self.area)
+        return RenderOptions(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
 
     def subdivided(self, view):
         """The view with every pixel divided into its n x n parts."""
