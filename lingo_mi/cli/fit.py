@@ -118,7 +118,6 @@ def main():
         scan,
         title=Path(args.volume or args.projections or scene.name).name,
         method=args.method,
-        seed=args.seed,
         command=command_line(),
     )
     print(summary(result))

@@ -20,7 +20,7 @@ from lingo_mi.fit.loop import run
 from lingo_mi.fit.recipes import METHODS, R2
 from lingo_mi.fit.state import activate, harmonics, start
 from lingo_mi.fit.uniform_start import cuboid, random_points
-from lingo_mi.projectors.radiance import seen
+from lingo_mi.projectors.radiance import radiance_towards
 from lingo_mi.projectors.view import View, vector64
 
 ALPHA = '3dgs', 'xgaussian'
@@ -71,7 +71,7 @@ def basis(directions, mode='cone'):
     values = []
     for index in range(16):
         unit = [dr.full(mi.Float, 0.2 * (i == index), len(directions)) for i in range(16)]  # small enough not to be cut
-        values.append((seen(centre, view, unit[0], mi.ArrayXf(*unit[1:])).numpy() - 0.5) / 0.2)
+        values.append((radiance_towards(centre, view, unit[0], mi.ArrayXf(*unit[1:])).numpy() - 0.5) / 0.2)
     return np.array(values)
 
 
@@ -95,10 +95,12 @@ def test_harmonics_are_orthonormal():
 
 def test_radiance_is_never_negative_and_a_sigmoid_without_harmonics():
     centre, view = towards(np.array([[0, 0, 1]]))
-    black = seen(centre, view, mi.Float(-9), mi.ArrayXf(mi.Float(0), mi.Float(0), mi.Float(0)))
+    black = radiance_towards(centre, view, mi.Float(-9), mi.ArrayXf(mi.Float(0), mi.Float(0), mi.Float(0)))
     np.testing.assert_array_equal(black.numpy(), 0)
     np.testing.assert_allclose(
-        seen(centre, view, mi.Float(np.float32([-1, 0, 2]))).numpy(), 1 / (1 + np.exp([1, 0, -2])), rtol=1e-6
+        radiance_towards(centre, view, mi.Float(np.float32([-1, 0, 2]))).numpy(),
+        1 / (1 + np.exp([1, 0, -2])),
+        rtol=1e-6,
     )
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from helpers import oracle
-from helpers.hard_cases import on_device, scanner
-from helpers.oracle import Pose, random_cloud, relative
 from lingo_mi.projectors.balance import Sharing
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.studies import oracle
+from lingo_mi.studies.hard_cases import on_device, scanner
+from lingo_mi.studies.oracle import Pose, random_cloud, relative
 
 # 2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors. A lane whose team is done
 # must divide by nothing: an integer division by zero ends the process.
