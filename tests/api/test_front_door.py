@@ -112,7 +112,7 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'n_pints'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), resume=True), 'checkpoint'),
         (lambda g: lm.fit(lm.Scan(g, np.zeros((10, 24, 30)))), 'zero everywhere'),
-        (lambda g: lm.load_result('missing'), 'no checkpoint'),
+        (lambda g: lm.load_result('missing'), 'no such file'),
     ],
 )
 def test_bad_input_is_one_line(geometry, call, message):
