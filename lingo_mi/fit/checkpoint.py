@@ -31,7 +31,7 @@ def save(path, state: State, extra: dict, arrays: dict | None = None):
             np.savez(
                 file,
                 gradient=state.gradient,
-                seen=state.seen,
+                seen=state.visits,  # the name of earlier versions
                 born=state.born,
                 extra=np.array(json.dumps(extra, default=np.generic.item)),
                 **columns,

@@ -16,7 +16,8 @@ from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fit.checkpoint import METRICS
 from lingo_mi.fit.fitted import Fitted
-from lingo_mi.fit.state import activate, harmonics
+from lingo_mi.fit.models.alpha import harmonics
+from lingo_mi.fit.state import activate
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import measure
 from lingo_mi.results.scene_file import write_scene
@@ -44,7 +45,7 @@ def write_results(
     if volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
             (folder / stale).unlink(missing_ok=True)
-        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state))
+        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state.values))
     else:
         write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
         write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())

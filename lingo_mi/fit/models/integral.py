@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fit.activations import inverse_softplus, softplus
