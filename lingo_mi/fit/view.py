@@ -68,7 +68,7 @@ class Target:
 
 
 def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
-    """Add the gradient of one view's loss to that of the Gaussians, which are leaves.
+    """Add the gradient of one view's loss to that of the Gaussians, whose gradients are enabled.
 
     batch   views of a step, over which the loss is a mean
     signal  `ExpectedSignal` of the detector; None: line integrals
@@ -82,7 +82,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
 
     def image_along(rays):
         footprints = forward.footprints(gaussians, rays)
-        leaf = leaves(footprints.values)  # their derivatives are wanted themselves, for the statistic
+        leaf = leaves(footprints.values)  # the statistic is made of their derivatives
         bundles.append((footprints, leaf))
         return forward.integrals(replace(footprints, values=leaf), rays, share)
 

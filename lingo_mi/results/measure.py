@@ -7,11 +7,11 @@ import numpy as np
 from lingo_mi import metrics
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.lingo.ipsd import ipsd, reverse_distance
-from lingo_mi.scan import Dataset
+from lingo_mi.scan import Dataset, Scan
 
 
 def quick_measure(dataset: Dataset, most: int = 4):
-    """A function for `fit.loop.run` that gives 2D PSNR on a few held-out views and 3D PSNR where the truth is known."""
+    """A function for `fit.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where the truth is known."""
     test = dataset.test
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)
@@ -28,34 +28,39 @@ def quick_measure(dataset: Dataset, most: int = 4):
     return measure
 
 
-def measure(fitted: Fitted, dataset: Dataset, volume, rendered) -> dict:
-    """The numbers of a finished fit; None where there is no truth to compare with."""
+def measure(
+    fitted: Fitted,
+    volume: np.ndarray | None = None,
+    truth: np.ndarray | None = None,
+    rendered: np.ndarray | None = None,
+    test: Scan | None = None,
+) -> dict:
+    """The numbers of a finished fit; None where there is nothing to compare.
+
+    volume     of the fit, 1/mm, [x, y, z]; truth: what it should be
+    rendered   held-out views of the fit, [view, v, u]; test: the same as measured
+    """
     born = fitted.state.values['centre'][fitted.state.born]
-    test = dataset.test
-    truth = test.projections if rendered is not None else None
-    rendered = None if rendered is None else comparable(rendered, test)
-
-    def of(function, result, reference):
-        return None if result is None or reference is None else _number(function(result, reference))
-
+    views = dict.fromkeys(('psnr_2d_r2', 'psnr_2d', 'ssim_2d'))
+    if rendered is not None and test is not None:
+        shown = comparable(rendered, test)
+        views = {name: _number(getattr(metrics, name)(shown, test.projections)) for name in views}
     return dict(
-        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth),
-        psnr_2d=of(metrics.psnr_2d, rendered, truth),
-        ssim_2d=of(metrics.ssim_2d, rendered, truth),
-        **compared(volume, dataset.volume),
+        **views,
+        **compared(volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
         gaussians=len(fitted.state),
         iterations=fitted.settings.iterations,
-        seconds_init=fitted.info['seconds'],
+        seconds_init=fitted.info.get('seconds', 0.0),
         seconds_fit=fitted.seconds,
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
         history=fitted.history,
     )
 
 
-def compared(volume, truth) -> dict:
+def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:
     """PSNR and SSIM of a volume, in both of their forms; None where there is nothing to compare, or no number."""
     names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
     if volume is None or truth is None:
@@ -84,8 +89,8 @@ def volume_quality(result: dict) -> str:
     )
 
 
-def comparable(rendered, test):
-    """Rendered views with the pixels that were not measured at zero, as in the scan."""
+def comparable(rendered: np.ndarray, test: Scan) -> np.ndarray:
+    """Rendered views [view, v, u] with the pixels that were not measured at zero, as in the scan."""
     return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
 
 

@@ -17,31 +17,35 @@ from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fit.checkpoint import METRICS
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.models.alpha import harmonics
-from lingo_mi.fit.state import activate
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import measure
 from lingo_mi.results.scene_file import write_scene
-from lingo_mi.scan import Dataset
+from lingo_mi.scan import Scan
 
 
-def world_cloud(fitted: Fitted, geometry):
-    """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities or opacities [N]."""
-    centre, scale, rotation, amount = activate(fitted.state, fitted.settings)
-    unit = fitted.unit if fitted.settings.volumetric else 1
-    return centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation, amount * unit
-
-
-def write_results(
-    folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, seed: int, command: str
+def save(
+    folder: Path,
+    fitted: Fitted,
+    test: Scan | None = None,
+    truth: np.ndarray | None = None,
+    title: str = 'fit',
+    method: str = '',
+    command: str = '',
 ) -> dict:
     """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
 
+    folder    which is there already
+    test      held-out views to compare with
+    truth     the true density in 1/mm on the grid of the fit's geometry, [x, y, z]
+    title     of the report
+    method    name of the recipe, and command: what makes the result again; both for metrics.json and the report
+
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
+    Raises InputError where a file cannot be written.
     """
-    geometry, test = dataset.train.geometry, dataset.test
-    volume = fitted.volume()
-    cloud = world_cloud(fitted, geometry)
+    geometry, test = fitted.geometry, test if test is not None and len(test) else None
+    volume, cloud = fitted.volume(), fitted.world_gaussians()
     if volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
             (folder / stale).unlink(missing_ok=True)
@@ -50,39 +54,33 @@ def write_results(
         write_volume(folder / 'volume.nii.gz', volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
         write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
         write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.model.extent, fitted.effects)
-    rendered = None
-    if test is not None and len(test):
-        rendered = fitted.render(test.geometry)
-        views = folder / 'views'
-        views.mkdir(exist_ok=True)
-        for stale in views.glob('*.exr'):
-            stale.unlink()
-        for i, image in enumerate(rendered):
-            write_exr(views / f'{i:04d}.exr', image)
-    measured = measure(fitted, dataset, volume, rendered) | dict(
+    rendered = None if test is None else fitted.render(test.geometry)
+    if rendered is not None:
+        _write_views(folder / 'views', rendered)
+    measured = measure(fitted, volume, truth, rendered, test) | dict(
         method=method,
-        seed=seed,
-        views=len(dataset.train),
+        seed=fitted.seed,
+        views=len(geometry),
         variant=mi.variant(),
         settings=fitted.settings.flat(),
         initial=fitted.info,
         command=command,
         **_corrections(fitted),
-        angles=_degrees(geometry),
-        test_angles=_degrees(test.geometry) if rendered is not None else [],
+        angles=np.degrees(geometry.angles).tolist(),
+        test_angles=[] if test is None else np.degrees(test.geometry.angles).tolist(),
         versions=versions(),
     )
     report = ReportData(
         title=title,
         metrics=measured,
         volume=volume,
-        truth=None if volume is None else dataset.volume,
+        truth=None if volume is None else truth,
         shape=geometry.nVoxel,
         spacing=geometry.dVoxel,
         centre=geometry.offOrigin,
         views=rendered,
-        views_truth=test.projections if rendered is not None else None,
-        views_angles=np.degrees(test.geometry.angles) if rendered is not None else None,
+        views_truth=None if test is None else test.projections,
+        views_angles=None if test is None else np.degrees(test.geometry.angles),
         pixel=geometry.dDetector,
         cloud_centres=cloud[0],
         cloud_density=cloud[3],
@@ -96,16 +94,23 @@ def write_results(
     return measured
 
 
-def _corrections(fitted) -> dict:
+def _write_views(folder: Path, rendered: np.ndarray):
+    """One image a view, in place of those of an earlier result."""
+    folder.mkdir(exist_ok=True)
+    for stale in folder.glob('*.exr'):
+        stale.unlink()
+    for i, image in enumerate(rendered):
+        write_exr(folder / f'{i:04d}.exr', image)
+
+
+def _corrections(fitted: Fitted) -> dict:
     """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
     poses = fitted.poses
-    return (
-        {}
-        if poses is None
-        else dict(
-            pose_turns_degrees=np.degrees(poses.turn).tolist(),
-            pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
-        )
+    if poses is None:
+        return {}
+    return dict(
+        pose_turns_degrees=np.degrees(poses.turn).tolist(),
+        pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
     )
 
 
@@ -116,7 +121,3 @@ def versions() -> dict:
         **{name: version(name) for name in ('lingo_mi', 'mitsuba', 'drjit', 'numpy', 'scipy', 'scikit-image')},
         date=time.strftime('%Y-%m-%d'),
     )
-
-
-def _degrees(geometry) -> list[float]:
-    return np.degrees(geometry.angles).tolist()

@@ -261,7 +261,7 @@ class Cells:
                 check()
 
             fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
-        found = measure(fitted, dataset, fitted.volume(), fitted.render(dataset.test.geometry))
+        found = measure(fitted, fitted.volume(), dataset.volume, fitted.render(dataset.test.geometry), dataset.test)
         return found | dict(method=cell.method, settings=settings.flat(), initial=fitted.info)
 
     def _begin(self, settings, saved: Path):
