@@ -20,7 +20,7 @@ from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import measure
-from lingo_mi.results.save import report_data, world_cloud, write_results
+from lingo_mi.results.save import report_data, write_results
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
 
@@ -86,7 +86,7 @@ class Result:
     @property
     def gaussians(self) -> Gaussians:
         """The cloud, for `lm.project(*result.gaussians, geometry)`."""
-        return Gaussians(*world_cloud(self.fitted, self.geometry))
+        return Gaussians(*self.fitted.world_gaussians())
 
     def __len__(self) -> int:
         return len(self.fitted.state)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.settings import Settings
-from lingo_mi.geometry.base import Geometry
 from lingo_mi.scan import Scan
 
 
@@ -18,13 +18,7 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     What is in units of the scene's radius becomes a length. Raises InputError where the source is in the volume.
     """
     g = scan.geometry
-    if not settings.volumetric:
-        radius = scene_radius(g)
-        settings = settings.changed(
-            rate_centre=tuple(radius * r for r in settings.adam.rate_centre),
-            split_size=radius * settings.densification.split_size,
-            prune_size=radius * settings.densification.prune_size,
-        )
+    settings = forward_model(settings).with_lengths(g)
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:
         most = min(max(int(scan.projections.size / control.values_per_gaussian), 1), control.max_gaussians)
@@ -37,14 +31,3 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     if largest <= bounds.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
     return settings.changed(scale_max=min(bounds.scale_max, largest))
-
-
-def scene_radius(geometry: Geometry) -> float:
-    """3DGS's unit of length: 1.1 times the largest distance of a source from the mean of all, in the normalised frame.
-
-    1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
-    """
-    rays = geometry.normalised_rays()
-    if rays.parallel:
-        return 1.0
-    return 1.1 * float(np.linalg.norm(rays.source - rays.source.mean(0), axis=1).max()) or 1.0

@@ -31,7 +31,7 @@ def save(path, state: State, extra: dict, arrays: dict | None = None):
             np.savez(
                 file,
                 gradient=state.gradient,
-                seen=state.seen,
+                seen=state.visits,  # the name of earlier versions
                 born=state.born,
                 extra=np.array(json.dumps(extra, default=np.generic.item)),
                 **columns,
@@ -64,10 +64,9 @@ def load(path) -> tuple[State, dict, dict]:
         )
         extra = json.loads(str(data['extra']))
     except FileNotFoundError:
-        raise InputError(f'{path}: there is no checkpoint to resume from; run without --resume') from None
+        raise InputError(f'{path}: no such file, so there is no checkpoint to go on from') from None
     except (OSError, KeyError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(
-            f'{path}: this is not a checkpoint of a fit ({type(error).__name__}); remove it and start '
-            'again without --resume'
+            f'{path}: this is not a checkpoint of a fit ({type(error).__name__}); remove it and start again'
         ) from None
     return state, extra, {k[6:]: v for k, v in data.items() if k.startswith('array.')}

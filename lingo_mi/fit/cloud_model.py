@@ -9,9 +9,9 @@ import numpy as np
 from lingo_mi.effects.forward import Effects
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.expected_signal import ExpectedSignal
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.scattered_light import light_at_pixels
 from lingo_mi.fit.settings import Settings
-from lingo_mi.fit.view import footprints_of, integrals
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.upload import uploaded
@@ -40,8 +40,9 @@ class CloudModel:
 
         progress   called as progress(views done, views in all)
         """
-        rays, (height, width) = geometry.normalised_rays(), geometry.nDetector
-        gaussians, share = state.gaussians(self.settings), self.shares(state)
+        every, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        forward = forward_model(self.settings)
+        gaussians, share = forward.gaussians(state.values), self.shares(state)
 
         scattered = [None] * len(geometry)
         if self.signal is not None and self.signal.scattered:
@@ -49,11 +50,11 @@ class CloudModel:
             scattered = [uploaded(image.ravel()) for image in light_at_pixels(found, geometry)]
 
         def along(rays):
-            return integrals(footprints_of(gaussians, rays, self.settings), rays, self.settings, share)
+            return forward.integrals(forward.footprints(gaussians, rays), rays, share)
 
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
-            view = View.of(rays, i, height, width, panel=False)
+            view = View.of(every, i, height, width, panel=False)
             image = along(view)[0] if self.signal is None else self.signal.image(along, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:

@@ -15,10 +15,14 @@ Gaussians outside the volume stay, and from time to time all opacities are lower
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from lingo_mi.fit.activations import inverse_scale, inverse_sigmoid
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.settings import Settings
-from lingo_mi.fit.state import State, activate, inverse_scale, inverse_sigmoid, inverse_softplus
+from lingo_mi.fit.state import State, activate
 
 RESET = 0.01  # 3DGS: opacity that `reset_opacity` leaves at most
 APART = 0.7  # distance of a half's centre from its parent's, in the parent's standard deviations
@@ -34,7 +38,7 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     largest   standard deviation above which the Gaussians of alpha compositing vanish
     """
     control = settings.densification
-    mean = np.divide(state.gradient, state.seen, out=np.zeros_like(state.gradient), where=state.seen > 0)
+    mean = np.divide(state.gradient, state.visits, out=np.zeros_like(state.gradient), where=state.visits > 0)
     strong = mean >= control.densify_threshold
     room = max(control.max_gaussians - len(state), 0)  # each adds one
     strong[np.argsort(-mean, kind='stable')[room:]] = False
@@ -42,7 +46,7 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
         return prune(halve(state, strong, settings, flat), settings, half, largest)
     large = activate(state, settings)[1].max(1) > control.split_size
     state = split(
-        clone(state, strong & ~large),
+        clone(state, strong & ~large, settings),
         np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
         settings,
         rng,
@@ -51,9 +55,9 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     return prune(state, settings, half, largest)
 
 
-def clone(state: State, chosen) -> State:
+def clone(state: State, chosen, settings: Settings) -> State:
     """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
-    halved = _with_density(state, chosen, 0.5)
+    halved = _shared(state, chosen, 0.5, settings)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
@@ -63,7 +67,7 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation, _ = activate(state, settings)
     shrink = np.array([SHRINK, SHRINK, 1.0 if flat else SHRINK])
-    children = _fresh(_with_density(state, chosen, 0.5), parents)
+    children = _fresh(_shared(state, chosen, 0.5, settings), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
     if flat:
         offset[:, 2] = 0
@@ -80,7 +84,7 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
     centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
     axis = np.eye(3)[scale[:, : 2 if flat else 3].argmax(1)]
     shrink = np.where(axis > 0, np.sqrt(1 - APART**2), 1)
-    children = _take(_with_density(state, chosen, 0.5 / np.sqrt(1 - APART**2)), parents.repeat(2))
+    children = _take(_shared(state, chosen, 0.5 / np.sqrt(1 - APART**2), settings), parents.repeat(2))
     offset = _rotate(rotation, APART * axis * scale)
     children.values['centre'] = np.stack([centre + offset, centre - offset], 1).reshape(-1, 3).astype(np.float32)
     smaller = np.clip(scale * shrink, low * 1.01, high * 0.99)
@@ -90,15 +94,13 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
 
 
 def prune(state: State, settings: Settings, half, largest: float = np.inf) -> State:
-    """Remove Gaussians whose density is below the bound or whose centre left the volume; clear the statistic.
-
-    For alpha compositing: those whose opacity is below the bound or a standard deviation above `largest`.
-    """
-    centre, scale, _, density = activate(state, settings)
-    inside = (np.abs(centre) <= np.asarray(half)).all(1) if settings.volumetric else scale.max(1) <= largest
-    keep = (density >= settings.densification.prune_density) & inside
+    """Remove Gaussians whose density or opacity is below the bound, and those that the forward model does not let stay: whose
+    centre left the volume, or a standard deviation of which is above `largest`. Clear the statistic."""
+    centre, scale, _, amount = activate(state, settings)
+    inside = forward_model(settings).inside(centre, scale, half, largest)
+    keep = (amount >= settings.densification.prune_density) & inside
     kept = _take(state, keep)
-    kept.gradient[:], kept.seen[:] = 0, 0
+    kept.gradient[:], kept.visits[:] = 0, 0
     return kept
 
 
@@ -110,25 +112,18 @@ def reset_opacity(state: State) -> State:
 
     opacity = state.values['opacity']
     zeros = np.zeros_like(opacity)
-    return State(
-        with_opacity(state.values, np.minimum(opacity, np.float32(inverse_sigmoid(RESET)))),
-        with_opacity(state.first, zeros),
-        with_opacity(state.second, zeros.copy()),
-        state.gradient,
-        state.seen,
-        state.born,
+    return replace(
+        state,
+        values=with_opacity(state.values, np.minimum(opacity, np.float32(inverse_sigmoid(RESET)))),
+        first=with_opacity(state.first, zeros),
+        second=with_opacity(state.second, zeros.copy()),
     )
 
 
-def _with_density(state, chosen, factor):
-    """The state with the chosen densities multiplied; opacities are not shared."""
-    if 'density' not in state.values:
-        return state
-    values = dict(state.values)
-    raw = values['density'].astype(float)
-    raw[chosen] = inverse_softplus(np.logaddexp(0.0, raw[chosen]) * factor)
-    values['density'] = raw.astype(np.float32)
-    return State(values, state.first, state.second, state.gradient, state.seen, state.born)
+def _shared(state, chosen, factor, settings):
+    """The state with the chosen densities multiplied, where the forward model has densities."""
+    values = forward_model(settings).shared(state.values, chosen, factor)
+    return replace(state, values=values)
 
 
 def _take(state, index):
@@ -140,7 +135,7 @@ def _take(state, index):
         pick(state.first),
         pick(state.second),
         state.gradient[index],
-        state.seen[index],
+        state.visits[index],
         state.born[index],
     )
 
@@ -169,7 +164,7 @@ def _append(state, more):
         join(state.first, more.first),
         join(state.second, more.second),
         np.concatenate([state.gradient, more.gradient]),
-        np.concatenate([state.seen, more.seen]),
+        np.concatenate([state.visits, more.visits]),
         np.concatenate([state.born, more.born]),
     )
 

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.settings import Settings
 from lingo_mi.fit.state import State
 from lingo_mi.projectors.upload import uploaded
@@ -24,11 +25,11 @@ def _types():
 
 
 class DeviceState:
-    """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `seen` Float [N]."""
+    """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `visits` Float [N]."""
 
     def __init__(self, state: State):
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
-        self.gradient, self.seen = uploaded(state.gradient), uploaded(state.seen)
+        self.gradient, self.visits = uploaded(state.gradient), uploaded(state.visits)
         self.born = state.born
 
     def __len__(self) -> int:
@@ -41,25 +42,14 @@ class DeviceState:
             download(self.first),
             download(self.second),
             self.gradient.numpy(),
-            self.seen.numpy(),
+            self.visits.numpy(),
             self.born,
         )
 
-    def gaussians(self, settings: Settings):
-        """Centres, standard deviations, quaternions (not normalised) and densities; differentiable.
-
-        For alpha compositing opacities in place of densities, followed by what `projectors.radiance.radiance_towards` takes.
-        """
-        v = self.values
-        low, high = (
-            dr.opaque(mi.Float, settings.bounds.scale_min),
-            dr.opaque(mi.Float, settings.bounds.scale_max - settings.bounds.scale_min),
-        )
-        scale = low + high / (1 + dr.exp(-v['scale']))
-        if not settings.volumetric:
-            radiance = [v[k] for k in ('radiance', 'harmonics') if k in v]
-            return v['centre'], scale, v['rotation'], 1 / (1 + dr.exp(-v['opacity'])), *radiance
-        return v['centre'], scale, v['rotation'], _softplus(v['density'])
+    def gaussians(self, settings: Settings) -> tuple:
+        """Centres, standard deviations, quaternions (not normalised) and densities, or what else the forward model takes (see
+        `models.base.ForwardModel.gaussians`); differentiable."""
+        return forward_model(settings).gaussians(self.values)
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""
@@ -78,7 +68,7 @@ class DeviceState:
                 dr.sqrt(v * c2) + settings.adam.epsilon
             )
             self.first[name], self.second[name] = m, v
-        dr.eval(self.values, self.first, self.second, self.gradient, self.seen)
+        dr.eval(self.values, self.first, self.second, self.gradient, self.visits)
 
 
 def upload(columns: dict) -> dict:
@@ -91,11 +81,3 @@ def download(columns: dict) -> dict:
     """What `upload` was given."""
     # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
     return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1) for k, x in columns.items()}
-
-
-def _softplus(x):
-    """ln(1 + e^x) without overflow, to float32's relative precision at both ends."""
-    above = x > 0  # not by maximum and abs, whose derivatives at 0 add up to 0
-    small = dr.exp(dr.select(above, -x, x))
-    series = small * (1 - small * (1 / 2 - small * (1 / 3 - small / 4)))  # 1 + small would round small away
-    return dr.select(above, x, 0) + dr.select(small < 0.01, series, dr.log(1 + small))

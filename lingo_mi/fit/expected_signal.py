@@ -5,12 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import ndimage
 
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import hardened, second_share
 from lingo_mi.fit.scattered_light import ScatteredLight
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.lingo.density import trilinear
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 
@@ -62,6 +62,4 @@ class ExpectedSignal:
         """
         if self.split is None:
             return None
-        place = (np.asarray(centres, float) / half + 1) / 2 * volume.shape - 0.5
-        density = ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
-        return uploaded(second_share(density.astype(float), self.split))
+        return uploaded(second_share(trilinear(volume, centres, half).astype(float), self.split))

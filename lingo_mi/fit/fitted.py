@@ -15,7 +15,7 @@ from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.poses import Poses
 from lingo_mi.fit.settings import Settings
-from lingo_mi.fit.state import State
+from lingo_mi.fit.state import State, activate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import Ellipsoids
 
@@ -92,6 +92,13 @@ class Fitted:
         share = self.model.shares(DeviceState(self.state))
         return None if share is None else share.numpy()
 
+    def world_gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres and standard deviations in mm, quaternions (x, y, z, w), and densities in 1/mm, or opacities where there are
+        none: float64 [N, 3], [N, 3], [N, 4], [N]."""
+        centre, scale, rotation, amount = activate(self.state, self.settings)
+        size, unit = self.geometry.scale, self.unit if self.settings.volumetric else 1
+        return centre / size + self.geometry.offOrigin, scale / size, rotation, amount * unit
+
     @classmethod
     def from_checkpoint(cls, path: Path | str, effects: Effects | None = None) -> Fitted:
         """The fit that a checkpoint.npz keeps, as far as it had come; needs no scan.
@@ -100,8 +107,6 @@ class Fitted:
 
         Raises InputError where the file is missing or no checkpoint, and where the fit has modelled effects that are not given.
         """
-        if not Path(path).exists():
-            raise InputError(f'{path}: no such file; give the checkpoint.npz of a fit')
         state, extra, arrays = checkpoint.load(path)
         try:
             settings = _settings(extra['settings'])

@@ -64,7 +64,7 @@ def run(
     else:
         points, order = initial.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0.0, [], dict(initial.info)
-        density = initial.density / stepper.model.unit if settings.volumetric else None
+        density = None if initial.density is None else initial.density / stepper.model.unit
         state = DeviceState(start(points, initial.spacing, density, settings))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()

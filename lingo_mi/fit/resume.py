@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.settings import Settings
-from lingo_mi.fit.state import State, parameters
+from lingo_mi.fit.state import State
 
 
 def extensible(settings: Settings) -> bool:
@@ -47,9 +48,9 @@ def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict
             f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
             'settings, or remove it and start again'
         )
-    shapes = {k: (len(host), size) for k, size in parameters(settings).items()}
+    shapes = {k: (len(host), size) for k, size in forward_model(settings).parameters.items()}
     if not (
-        len(host.gradient) == len(host.seen) == len(host)
+        len(host.gradient) == len(host.visits) == len(host)
         and all(
             {k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
             for group in (host.values, host.first, host.second)

@@ -260,6 +260,10 @@ class Settings:
             'render=alpha composites grey images and knows no densities: it needs normalise=true, lambda_tv=0 and '
             'effects=ignore, as in the method 3dgs',
         )
+        _require(
+            not (self.volumetric and self.densification.reset_every),
+            'reset_every lowers opacities, which only render=alpha has: leave it out',
+        )
 
     @property
     def volumetric(self) -> bool:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.measured import density_unit, modelled_effects, trusted, weights_of
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.poses import Poses, gathered, place
 from lingo_mi.fit.scattered_light import RENEWED as LIGHT_RENEWED
 from lingo_mi.fit.scattered_light import light_at_pixels
@@ -40,6 +39,7 @@ class Stepper:
         scan = trusted(scan, settings)
         unit = density_unit(scan, settings)
         self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
+        self.forward = forward_model(settings)
         self.share = self.scattered = None
         self.targets = _targets(scan, unit, settings)
         self.coarse_until = round(settings.coarse_share * settings.iterations)
@@ -62,7 +62,7 @@ class Stepper:
             self.renew_light(state)
         for value in state.values.values():
             dr.enable_grad(value)
-        gaussians = state.gaussians(s)
+        gaussians = self.forward.gaussians(state.values)
         # Each view and the cube add their derivatives to these; then one pass takes them to the raw parameters.
         leaf = leaves(gaussians)
         total = mi.Float(0)
@@ -75,7 +75,7 @@ class Stepper:
             loss, norm, visible = self._view(leaf, target, len(views))
             total += loss
             state.gradient += norm
-            state.seen += visible
+            state.visits += visible
             if self.poses is not None:
                 self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s.adam)
         if s.loss.lambda_tv > 0:
@@ -85,13 +85,7 @@ class Stepper:
         if self.flat:
             gradients['centre'].z, gradients['scale'].z = 0, 0
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
-        if 'harmonics' in gradients:  # those of a degree that has not joined in stay at zero
-            joined = [
-                dr.opaque(mi.Float, float((iteration + 1) // s.model.sh_every >= k))
-                for k in range(1, s.model.sh_degree + 1)
-            ]
-            for i in range(len(gradients['harmonics'])):
-                gradients['harmonics'][i] *= joined[math.isqrt(i + 1) - 1]
+        self.forward.hold_back(gradients, iteration)
         state.adam(gradients, s, iteration)
         return total
 
@@ -129,7 +123,7 @@ class Stepper:
 
     def _view(self, leaf, target, batch):
         """`differentiate` a view: replayed, where nothing but line integrals from known poses is fitted."""
-        if self.model.signal is None and self.poses is None and self.settings.volumetric:
+        if self.model.signal is None and self.poses is None and self.forward.replayable:
             return differentiate_replayed(leaf, target, self.settings, batch)
         return differentiate(leaf, target, self.settings, batch, self.model.signal, self.share)
 

@@ -12,13 +12,10 @@ import numpy as np
 
 from lingo_mi.fit import losses
 from lingo_mi.fit.loss_scale import loss_scale
+from lingo_mi.fit.models import forward_model
 from lingo_mi.fit.settings import Settings
-from lingo_mi.projectors.alpha import composite, flatten
 from lingo_mi.projectors.backprop import leaves, pass_on
-from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.frozen import Replay
-from lingo_mi.projectors.radiance import radiance_towards
-from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
@@ -60,7 +57,7 @@ class Target:
         # panel would otherwise leave the fast path.
         return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), weights, valid, rays)
 
-    def seen(self, image):
+    def masked(self, image):
         """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
 
         To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
@@ -70,30 +67,8 @@ class Target:
         return image if self.valid is None else dr.select(self.valid, image, 0)
 
 
-def footprints_of(gaussians, rays, settings: Settings):
-    """A cloud on a view's panel, `Footprints` or `Discs`, the last two of whose values are x and y in pixels."""
-    if not settings.volumetric:
-        centre, scale, rotation, opacity, *radiance = gaussians
-        return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
-    return project(*gaussians, rays, settings.model.extent)
-
-
-def integrals(footprints, rays, settings: Settings, share=None) -> list:
-    """Line integrals along the rays of a view, a list of Float [height * width]: of the cloud, or of each of its two materials,
-    where `share` is the second one's share in every Gaussian; or the grey image that alpha compositing takes for them."""
-    if not settings.volumetric:
-        return [composite(footprints, rays.height, rays.width)]
-    amplitude, *others = footprints.values
-    parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
-    return [
-        splat(replace(footprints, values=(part, *others)), rays.height, rays.width, settings.model.extent)
-        * rays.lengths()
-        for part in parts
-    ]
-
-
 def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
-    """Add the gradient of one view's loss to that of the Gaussians, which are leaves.
+    """Add the gradient of one view's loss to that of the Gaussians, whose gradients are enabled.
 
     batch   views of a step, over which the loss is a mean
     signal  `ExpectedSignal` of the detector; None: line integrals
@@ -102,17 +77,17 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
     Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
     footprint's place, and 1 where a Gaussian is seen.
     """
-    s, view = settings.loss, target.view
+    s, view, forward = settings.loss, target.view, forward_model(settings)
     bundles = []  # of rays: one, or all those that the signal is a mean over
 
     def image_along(rays):
-        footprints = footprints_of(gaussians, rays, settings)
-        leaf = leaves(footprints.values)  # their derivatives are wanted themselves, for the statistic
+        footprints = forward.footprints(gaussians, rays)
+        leaf = leaves(footprints.values)  # the statistic is made of their derivatives
         bundles.append((footprints, leaf))
-        return integrals(replace(footprints, values=leaf), rays, settings, share)
+        return forward.integrals(replace(footprints, values=leaf), rays, share)
 
     image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
-    loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
     # Bundles share what leads to a view's pose, so its edges must outlast all but the last.

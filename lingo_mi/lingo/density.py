@@ -46,15 +46,19 @@ def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
     return total / np.maximum(seen, 1)
 
 
-def sampled(volume, points, half) -> np.ndarray:
-    """A volume's trilinear values at points, [N], at least FAINTEST of its largest one.
+def trilinear(volume: np.ndarray, points, half) -> np.ndarray:
+    """A volume's trilinear values at points, [N]; beyond the outermost voxels' centres, those voxels'.
 
-    volume  [x, y, z], densities
+    volume  [x, y, z]
     points  [N, 3] and half, [3], half the volume's sides: both in the normalised frame
     """
     place = (np.asarray(points, float) / half + 1) / 2 * volume.shape - 0.5
-    value = ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
-    return np.maximum(value, FAINTEST * volume.max())
+    return ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
+
+
+def sampled(volume: np.ndarray, points, half) -> np.ndarray:
+    """The `trilinear` values of a volume of densities, at least FAINTEST of its largest one."""
+    return np.maximum(trilinear(volume, points, half), FAINTEST * volume.max())
 
 
 def least_squares_factor(measured, rendered) -> float:

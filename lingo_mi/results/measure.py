@@ -9,11 +9,11 @@ import numpy as np
 from lingo_mi import metrics
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.lingo.ipsd import ipsd, reverse_distance
-from lingo_mi.scan import Dataset
+from lingo_mi.scan import Dataset, Scan
 
 
 def quick_measure(dataset: Dataset, most: int = 4):
-    """A function for `fit.loop.run` that gives 2D PSNR on a few held-out views and 3D PSNR where the truth is known."""
+    """A function for `fit.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where the truth is known."""
     test = dataset.test
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)
@@ -66,7 +66,7 @@ def measure(fitted: Fitted, dataset: Dataset) -> Measured:
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
         gaussians=len(fitted.state),
         iterations=fitted.settings.iterations,
-        seconds_init=fitted.info['seconds'],
+        seconds_init=fitted.info.get('seconds', 0.0),
         seconds_fit=fitted.seconds,
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
         history=fitted.history,
@@ -74,7 +74,7 @@ def measure(fitted: Fitted, dataset: Dataset) -> Measured:
     return Measured(numbers, volume, views)
 
 
-def compared(volume, truth) -> dict:
+def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:
     """PSNR and SSIM of a volume, in both of their forms; None where there is nothing to compare, or no number."""
     names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
     if volume is None or truth is None:
@@ -103,8 +103,8 @@ def volume_quality(result: dict) -> str:
     )
 
 
-def comparable(rendered, test):
-    """Rendered views with the pixels that were not measured at zero, as in the scan."""
+def comparable(rendered: np.ndarray, test: Scan) -> np.ndarray:
+    """Rendered views [view, v, u] with the pixels that were not measured at zero, as in the scan."""
     return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
 
 

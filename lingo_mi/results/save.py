@@ -17,19 +17,12 @@ from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fit.checkpoint import METRICS
 from lingo_mi.fit.fitted import Fitted
-from lingo_mi.fit.state import activate, harmonics
+from lingo_mi.fit.models.alpha import harmonics
 from lingo_mi.paths import replacing
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import Measured, measure
 from lingo_mi.results.scene_file import write_scene
 from lingo_mi.scan import Dataset
-
-
-def world_cloud(fitted: Fitted, geometry):
-    """Centres [N, 3] and standard deviations [N, 3] in mm, quaternions (x, y, z, w) and densities or opacities [N]."""
-    centre, scale, rotation, amount = activate(fitted.state, fitted.settings)
-    unit = fitted.unit if fitted.settings.volumetric else 1
-    return centre / geometry.scale + geometry.offOrigin, scale / geometry.scale, rotation, amount * unit
 
 
 def write_results(
@@ -44,14 +37,15 @@ def write_results(
     command   that makes the result again, for the report
 
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
+    Raises InputError where a file cannot be written.
     """
     geometry = dataset.train.geometry
     measured = measure(fitted, dataset)
-    cloud = world_cloud(fitted, geometry)
+    cloud = fitted.world_gaussians()
     if measured.volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
             (folder / stale).unlink(missing_ok=True)
-        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state))
+        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state.values))
     else:
         write_volume(
             folder / 'volume.nii.gz', measured.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm'
@@ -74,8 +68,10 @@ def write_results(
         initial=fitted.info,
         command=command,
         **_corrections(fitted),
-        angles=_degrees(geometry),
-        test_angles=_degrees(dataset.test.geometry) if dataset.test is not None and len(dataset.test) else [],
+        angles=np.degrees(geometry.angles).tolist(),
+        test_angles=np.degrees(dataset.test.geometry.angles).tolist()
+        if dataset.test is not None and len(dataset.test)
+        else [],
         versions=versions(),
     )
     write_report(folder, report_data(fitted, dataset, replace(measured, numbers=numbers), title))
@@ -91,7 +87,7 @@ def report_data(fitted: Fitted, dataset: Dataset, measured: Measured, title: str
     if measured.views is not None and test is not None:
         angles = np.degrees(test.geometry.angles)
         held_out = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
-    centres, _, _, density = world_cloud(fitted, geometry)
+    centres, _, _, density = fitted.world_gaussians()
     return ReportData(
         title=title,
         metrics=measured.numbers,
@@ -109,16 +105,23 @@ def report_data(fitted: Fitted, dataset: Dataset, measured: Measured, title: str
     )
 
 
-def _corrections(fitted) -> dict:
+def _write_views(folder: Path, rendered: np.ndarray):
+    """One image a view, in place of those of an earlier result."""
+    folder.mkdir(exist_ok=True)
+    for stale in folder.glob('*.exr'):
+        stale.unlink()
+    for i, image in enumerate(rendered):
+        write_exr(folder / f'{i:04d}.exr', image)
+
+
+def _corrections(fitted: Fitted) -> dict:
     """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
     poses = fitted.poses
-    return (
-        {}
-        if poses is None
-        else dict(
-            pose_turns_degrees=np.degrees(poses.turn).tolist(),
-            pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
-        )
+    if poses is None:
+        return {}
+    return dict(
+        pose_turns_degrees=np.degrees(poses.turn).tolist(),
+        pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
     )
 
 
@@ -129,7 +132,3 @@ def versions() -> dict:
         **{name: version(name) for name in ('lingo_mi', 'mitsuba', 'drjit', 'numpy', 'scipy', 'scikit-image')},
         date=time.strftime('%Y-%m-%d'),
     )
-
-
-def _degrees(geometry) -> list[float]:
-    return np.degrees(geometry.angles).tolist()

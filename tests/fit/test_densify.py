@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.fit.densify import SHRINK, clone, densify, halve, prune, split
+from lingo_mi.fit.models.integral import PARAMETERS
 from lingo_mi.fit.recipes import R2
-from lingo_mi.fit.state import PARAMETERS, State, activate, start
+from lingo_mi.fit.state import State, activate, start
 from lingo_mi.studies.oracle import whiten
 
 SETTINGS = R2.changed(densify_threshold=1.0, split_size=0.1)
@@ -44,7 +45,7 @@ def mass(state):
 
 def arrays(state):
     yield from ((f'{g}.{k}', v) for g in ('values', 'first', 'second') for k, v in getattr(state, g).items())
-    yield from ((name, getattr(state, name)) for name in ('gradient', 'seen', 'born'))
+    yield from ((name, getattr(state, name)) for name in ('gradient', 'visits', 'born'))
 
 
 def assert_same(a, b):
@@ -61,7 +62,7 @@ def assert_consistent(state):
 def test_clone_keeps_the_mass():
     state = state_of(np.random.default_rng(0), 40)
     chosen = np.arange(40) % 3 == 0
-    after = clone(state, chosen)
+    after = clone(state, chosen, SETTINGS)
     n = chosen.sum()
     assert len(after) == 40 + n
     assert_consistent(after)
@@ -123,7 +124,7 @@ def test_children_are_drawn_from_their_parent():
     state = state_of(rng, 1, size=[0.2, 0.05, 0.01])
     many = State(
         *({k: v.repeat(n, 0) for k, v in g.items()} for g in (state.values, state.first, state.second)),
-        *(x.repeat(n) for x in (state.gradient, state.seen, state.born)),
+        *(x.repeat(n) for x in (state.gradient, state.visits, state.born)),
     )
     after = split(many, np.ones(n, bool), SETTINGS, rng)
     centre, scale, rotation, _ = (x[0] for x in activate(state, SETTINGS))
@@ -137,7 +138,7 @@ def test_moments_travel_and_the_newborn_have_none(operation):
     state = state_of(np.random.default_rng(3), 12)
     chosen = np.arange(12) % 2 == 0
     if operation == 'clone':
-        after, old = clone(state, chosen), np.ones(12, bool)
+        after, old = clone(state, chosen, SETTINGS), np.ones(12, bool)
     else:
         after, old = split(state, chosen, SETTINGS, np.random.default_rng(0)), ~chosen
     n = old.sum()
@@ -146,7 +147,7 @@ def test_moments_travel_and_the_newborn_have_none(operation):
             np.testing.assert_array_equal(getattr(after, group)[k][:n], getattr(state, group)[k][old])
             assert not getattr(after, group)[k][n:].any()
     np.testing.assert_array_equal(after.born[:n], state.born[old])
-    assert after.born[n:].all() and not after.gradient[n:].any() and not after.seen[n:].any()
+    assert after.born[n:].all() and not after.gradient[n:].any() and not after.visits[n:].any()
 
 
 def test_prune_rules():
@@ -159,7 +160,7 @@ def test_prune_rules():
         for k in PARAMETERS:
             np.testing.assert_array_equal(getattr(after, group)[k], getattr(state, group)[k][[0, 4]])
     np.testing.assert_array_equal(after.born, state.born[[0, 4]])
-    assert not after.gradient.any() and not after.seen.any()
+    assert not after.gradient.any() and not after.visits.any()
 
 
 def test_prune_may_leave_nothing():
@@ -175,12 +176,12 @@ def test_densify_clones_the_small_and_splits_the_large():
     state.values['centre'][:] *= 0.01
     state.values['scale'][1, 1:] = state.values['scale'][0, 1:]  # one long axis is enough to be large
     state.gradient[:] = [3, 3, 0.9, 0.9, 30]
-    state.seen[:] = [2, 2, 1, 1, 0]  # the last was never seen: its mean gradient is unknown
+    state.visits[:] = [2, 2, 1, 1, 0]  # the last was never seen: its mean gradient is unknown
     after = densify(state, SETTINGS, HALF, np.random.default_rng(0))
     assert_consistent(after)
     assert len(after) == 5 + 2
     assert after.born.sum() - state.born[[0, 2, 3, 4]].sum() == 3  # one copy, two halves
-    assert not after.gradient.any() and not after.seen.any()
+    assert not after.gradient.any() and not after.visits.any()
     density = activate(state, SETTINGS)[3]
     expected = [*[density[0] / 2] * 2, *[density[1] / 2] * 2, *density[2:]]
     np.testing.assert_allclose(np.sort(activate(after, SETTINGS)[3]), np.sort(expected), rtol=2e-6)
@@ -189,13 +190,13 @@ def test_densify_clones_the_small_and_splits_the_large():
 def test_the_mean_gradient_decides():
     """At the threshold a Gaussian is chosen, just below it is not, however often it was seen."""
     state = state_of(np.random.default_rng(6), 4, size=0.05)
-    state.gradient[:], state.seen[:] = [1, 0.999, 10, 9.99], [1, 1, 10, 10]
+    state.gradient[:], state.visits[:] = [1, 0.999, 10, 9.99], [1, 1, 10, 10]
     assert len(densify(state, SETTINGS, HALF, np.random.default_rng(0))) == 6
 
 
 def test_no_growth_beyond_the_maximum():
     state = state_of(np.random.default_rng(7), 10, size=0.05)
-    state.gradient[:], state.seen[:] = 5, 1
+    state.gradient[:], state.visits[:] = 5, 1
     assert len(densify(state, SETTINGS.changed(max_gaussians=20), HALF, np.random.default_rng(0))) == 20
     state.gradient[:] = np.arange(10, 20)
     after = densify(state, SETTINGS.changed(max_gaussians=13), HALF, np.random.default_rng(0))
@@ -208,7 +209,7 @@ def test_no_growth_beyond_the_maximum():
 @pytest.mark.parametrize(
     'operation',
     [
-        lambda s, c: clone(s, c),
+        lambda s, c: clone(s, c, SETTINGS),
         lambda s, c: split(s, c, SETTINGS, np.random.default_rng(0)),
         lambda s, c: halve(s, c, SETTINGS),
         lambda s, c: prune(s, SETTINGS, HALF),
@@ -238,7 +239,7 @@ def test_coincident_gaussians_stay_distinct():
     for group in (state.values, state.first, state.second):
         for v in group.values():
             v[:] = v[0]
-    state.gradient[:], state.seen[:] = 5, 1
+    state.gradient[:], state.visits[:] = 5, 1
     state.values['centre'][:] = 0
     after = densify(state, SETTINGS, HALF, np.random.default_rng(0))
     assert len(after) == 16 and len(np.unique(after.values['centre'], axis=0)) == 16
@@ -248,7 +249,7 @@ def test_coincident_gaussians_stay_distinct():
 def test_nothing_chosen_changes_nothing():
     state = state_of(np.random.default_rng(11), 9)
     none = np.zeros(9, bool)
-    assert_same(clone(state, none), state)
+    assert_same(clone(state, none, SETTINGS), state)
     assert_same(split(state, none, SETTINGS, np.random.default_rng(0)), state)
     state.gradient[:] = 0
     after = densify(state, SETTINGS, HALF, np.random.default_rng(0))

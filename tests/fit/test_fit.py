@@ -245,7 +245,7 @@ def test_replayed_steps_are_the_traced_ones(scan, changes, masked):
     assert len(traced) != 0 and len(traced) == len(replayed)
     for name, values in traced.values.items():
         assert np.array_equal(values, replayed.values[name]), name
-    assert np.array_equal(traced.gradient, replayed.gradient) and np.array_equal(traced.seen, replayed.seen)
+    assert np.array_equal(traced.gradient, replayed.gradient) and np.array_equal(traced.visits, replayed.visits)
 
 
 def test_a_fit_that_loses_everything_says_so(scan):

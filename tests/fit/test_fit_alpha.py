@@ -13,12 +13,12 @@ from helpers.script import FIT, fit
 from helpers.script import run as run_script
 from lingo_mi.errors import InputError
 from lingo_mi.fit import checkpoint
-from lingo_mi.fit.bounded import scene_radius
 from lingo_mi.fit.densify import clone, prune, reset_opacity, split
 from lingo_mi.fit.initial import initial_cloud
 from lingo_mi.fit.loop import run
+from lingo_mi.fit.models.alpha import harmonics, scene_radius
 from lingo_mi.fit.recipes import METHODS, R2
-from lingo_mi.fit.state import activate, harmonics, start
+from lingo_mi.fit.state import activate, start
 from lingo_mi.fit.uniform_start import cuboid, random_points
 from lingo_mi.projectors.radiance import radiance_towards
 from lingo_mi.projectors.view import View, vector64
@@ -125,7 +125,7 @@ def test_start_is_half_grey():
     for method in ALPHA:
         state = start(np.zeros((3, 3)), np.full(3, 0.1), None, METHODS[method])
         np.testing.assert_allclose(activate(state, METHODS[method])[3], 0.1, rtol=1e-6)
-        raw, more = harmonics(state)
+        raw, more = harmonics(state.values)
         assert not raw.any() and not more.any()
     assert more.shape == (3, 0)
 
@@ -154,7 +154,7 @@ def some_state(n=12):
 def test_clones_and_halves_keep_the_opacity():
     state, settings = some_state(), METHODS['3dgs']
     chosen = np.arange(12) % 3 == 0
-    copied = clone(state, chosen)
+    copied = clone(state, chosen, settings)
     halved = split(state, chosen, settings, np.random.default_rng(0))
     for name in ('opacity', 'radiance', 'harmonics'):
         np.testing.assert_array_equal(
@@ -272,6 +272,7 @@ def test_fan_beam():
         ('xgaussian', dict(cuboid_step=0), 'cuboid_step'),
         ('3dgs', dict(reset_every=-1), 'reset_every'),
         ('3dgs', dict(sh_every=0), 'sh_every'),
+        ('fast', dict(reset_every=5), 'reset_every'),
     ],
 )
 def test_bad_combinations(method, change, message):

@@ -6,8 +6,8 @@ import pytest
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.fit import loop
+from lingo_mi.fit.models.integral import PARAMETERS
 from lingo_mi.fit.settings import AdamSettings
-from lingo_mi.fit.state import PARAMETERS
 
 AVERAGED = SHORT.changed(average=0.8, iterations=16)
 

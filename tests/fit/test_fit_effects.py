@@ -57,7 +57,7 @@ def plain_view(self, gaussians, target, batch):
     footprints = project(*gaussians, view, extent)
     leaf = leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, extent) * view.lengths()
-    loss = losses.combined(target.seen(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
     dr.backward(loss * weight * (1 / batch))
@@ -236,7 +236,7 @@ def test_noise_is_weighed():
     np.testing.assert_allclose((weights * scan.projections).max(), 3, rtol=1e-6)
     np.testing.assert_allclose(weights[0, 5:7, 9:15], weights[0, 20, 12], rtol=1e-6)
     target = Stepper(scan, settings).targets[0]
-    np.testing.assert_allclose(target.seen(target.pixels / target.weights).numpy(), target.pixels.numpy(), rtol=1e-6)
+    np.testing.assert_allclose(target.masked(target.pixels / target.weights).numpy(), target.pixels.numpy(), rtol=1e-6)
     for without in (None, Effects(None, None, detector(psf=1.0))):
         with pytest.raises(InputError, match='weights=noise needs a ct_detector with photons or bits'):
             Stepper(replace(scan, effects=without), settings)

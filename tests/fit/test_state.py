@@ -5,9 +5,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from lingo_mi.fit.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fit.device import DeviceState
+from lingo_mi.fit.models.integral import PARAMETERS
 from lingo_mi.fit.recipes import R2
-from lingo_mi.fit.state import PARAMETERS, State, activate, inverse_scale, inverse_softplus, softplus, start
+from lingo_mi.fit.state import State, activate, start
 
 SETTINGS = R2.changed(scale_min=1e-3, scale_max=0.8)
 
@@ -39,7 +41,7 @@ def test_start_then_activate_gives_the_cloud_back():
 
 def test_start_has_no_history():
     state = start(np.zeros((3, 3)), np.full(3, 0.1), np.ones(3), SETTINGS)
-    assert len(state) == 3 and not state.born.any() and not state.gradient.any() and not state.seen.any()
+    assert len(state) == 3 and not state.born.any() and not state.gradient.any() and not state.visits.any()
     assert all(not v.any() for columns in (state.first, state.second) for v in columns.values())
     assert {k: v.shape for k, v in state.values.items()} == {k: (3, m) for k, m in PARAMETERS.items()}
     assert all(v.dtype == np.float32 for c in (state.values, state.first, state.second) for v in c.values())
@@ -84,7 +86,7 @@ def test_there_and_back_again(n):
     for group in ('values', 'first', 'second'):
         for k in PARAMETERS:
             np.testing.assert_array_equal(getattr(back, group)[k], getattr(state, group)[k])
-    for name in ('gradient', 'seen', 'born'):
+    for name in ('gradient', 'visits', 'born'):
         np.testing.assert_array_equal(getattr(back, name), getattr(state, name))
 
 

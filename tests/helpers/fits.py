@@ -70,7 +70,7 @@ def assert_equal_states(a, b):
     for group in ('values', 'first', 'second'):
         for k in a.values:
             np.testing.assert_array_equal(getattr(a, group)[k], getattr(b, group)[k])
-    for name in ('gradient', 'seen', 'born'):
+    for name in ('gradient', 'visits', 'born'):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 

@@ -10,12 +10,13 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from lingo_mi.errors import AccuracyWarning
+from lingo_mi.fit.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fit.densify import clone, densify, halve, split
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.loss_scale import loss_scale, otsu
 from lingo_mi.fit.losses import combined, ssim
 from lingo_mi.fit.recipes import R2
-from lingo_mi.fit.state import activate, inverse_scale, inverse_softplus, softplus, start
+from lingo_mi.fit.state import activate, start
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.masks import Masks, masks
@@ -253,7 +254,7 @@ SETTINGS = R2.changed(densify_threshold=1e-3, split_size=0.15)
 
 def coincident(n=8):
     state = start(np.zeros((n, 3)), np.where(np.arange(n) % 2, 0.1, 0.3), np.full(n, 0.5), SETTINGS)
-    state.gradient[:], state.seen[:] = 1, 1
+    state.gradient[:], state.visits[:] = 1, 1
     return state
 
 
@@ -267,7 +268,7 @@ def test_coincident_gaussians_densify():
     after = densify(state, SETTINGS, np.ones(3), np.random.default_rng(0))
     assert len(after) == 16 and all(np.isfinite(v).all() for v in after.values.values())
     everyone = np.ones(8, bool)
-    assert abs(mass(clone(state, everyone)) / mass(state) - 1) < 1e-5
+    assert abs(mass(clone(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
     assert abs(mass(halve(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
     halves = split(state, everyone, SETTINGS, np.random.default_rng(0))
     assert len(np.unique(halves.values['centre'], axis=0)) == 16  # drawn from their parents, so no longer at one place
