@@ -7,10 +7,10 @@ import numpy as np
 from lingo_mi.geometry.base import Geometry
 
 
-def gaps(geometry: Geometry, turn: float):
+def gaps(geometry: Geometry, turn: float) -> tuple[np.ndarray, np.ndarray, bool]:
     """The order of the views around the circle, the step after each in that order, and whether the circle is open.
 
-    Angles are taken modulo `turn`. An open arc begins with the first view; the views at its ends stand for a typical
+    Angles are taken modulo `turn`, radians. An open arc begins with the first view; the views at its ends stand for a typical
     step.
     """
     angle = np.mod(geometry.angles, turn)

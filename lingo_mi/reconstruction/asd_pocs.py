@@ -41,13 +41,13 @@ def _differences(volume, before):
     return mi.Vector3f([volume - dr.gather(mi.Float, volume, i) for i in before])
 
 
-def tv_floor(volume, size):
+def tv_floor(volume: mi.Float, size: tuple[int, int, int]) -> mi.Float:
     """What `tv_gradient` adds to squared gradients, a number on the device: `EPSILON` of the largest in the volume."""
     before, _ = _neighbours(size)
     return evaluated(dr.maximum(EPSILON * dr.max(dr.squared_norm(_differences(volume, before))), 1e-30))
 
 
-def tv_gradient(volume, size, floor):
+def tv_gradient(volume: mi.Float, size: tuple[int, int, int], floor: mi.Float) -> mi.Float:
     """Derivative of the total variation, mi.Float [voxels], times voxels' own unit.
 
     TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + floor), with backward differences that are zero at the
@@ -62,7 +62,7 @@ def tv_gradient(volume, size, floor):
     return evaluated(total)
 
 
-def minimise_tv(volume, size, step: float, tviter: int):
+def minimise_tv(volume: mi.Float, size: tuple[int, int, int], step: float, tviter: int) -> mi.Float:
     """`tviter` steps of length `step` (a norm of the change) down the total variation."""
     floor = tv_floor(volume, size)
     for _ in range(tviter):

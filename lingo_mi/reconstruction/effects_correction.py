@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from lingo_mi.scene.simulate import render_objects, render_with
 PASSES = 2  # over the scattered light; from the third on, FDK's own errors grow
 
 
-def corrected(scan: Scan, effects: Effects, objects, extent: float = cutoff.SIMULATE) -> Scan:
+def corrected(scan: Scan, effects: Effects, objects: Sequence, extent: float = cutoff.SIMULATE) -> Scan:
     """The line integrals of measured views at the reference energy, by objects that resemble what was scanned.
 
     Linearised, less what linearising leaves of the effects in the objects' own views: blur, scatter, and the second material,

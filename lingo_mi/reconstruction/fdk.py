@@ -145,7 +145,7 @@ def extended(scan: Scan) -> Scan:
     return Scan(wider, np.pad(scan.projections, ((0, 0), (0, 0), columns)))
 
 
-def filtered(projections, geometry: Geometry, window: str = 'ram-lak') -> np.ndarray:
+def filtered(projections: np.ndarray, geometry: Geometry, window: str = 'ram-lak') -> np.ndarray:
     """Cosine-weighted, ramp-filtered projections, float32 [view, v, u], per mm."""
     n_v, n_u = geometry.nDetector
     tau = geometry.dDetector[1]

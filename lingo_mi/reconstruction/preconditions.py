@@ -19,20 +19,20 @@ def is_circular(scan: Scan) -> bool:
     return isinstance(scan.geometry, CircularGeometry) and scan.valid is None
 
 
-def require_circle(scan: Scan, what: str):
+def require_circle(scan: Scan, what: str) -> None:
     """Raises InputError, naming what needs it, for a scan that is not `is_circular`."""
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)
 
 
-def require_pixels(scan: Scan, what: str):
+def require_pixels(scan: Scan, what: str) -> None:
     """Raises InputError, naming what needs them, where not all pixels are valid."""
     if scan.valid is not None:
         raise InputError(f'{what} needs every pixel, and some of this scan are not valid: fill them first')
 
 
-def require_rays(geometry: Geometry):
+def require_rays(geometry: Geometry) -> None:
     """Raises InputError where a source is in the volume, and where no view's rays meet it."""
     rays, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
     if not rays.parallel and (np.abs(rays.source - centre) < half).all(1).any():
@@ -46,7 +46,7 @@ def require_rays(geometry: Geometry):
     raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')
 
 
-def require_signal(scan: Scan, purpose: str = 'reconstruct'):
+def require_signal(scan: Scan, purpose: str = 'reconstruct') -> None:
     """Raises InputError for projections of nothing, which leave nothing to do for that purpose."""
     if not scan.projections.any():
         raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')

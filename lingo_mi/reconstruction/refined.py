@@ -159,7 +159,7 @@ def _continued(progress: Progress | None, before: int, steps: int) -> Progress |
     return lambda done, _, residual: progress(before + done, steps, residual)
 
 
-def _on_completed(scan: Scan, niter: int, volume, blur, seed: int, progress: Progress | None) -> np.ndarray:
+def _on_completed(scan: Scan, niter: int, volume: np.ndarray, blur, seed: int, progress: Progress | None) -> np.ndarray:
     """A volume after passes of SART from this one, weighted by its own `structure`; without residuals, which nobody reads."""
     system, order = System(scan, structure(volume), blur), passes(scan.geometry.angles, 1, 'random', seed)
     x = system.start(volume)
@@ -170,7 +170,7 @@ def _on_completed(scan: Scan, niter: int, volume, blur, seed: int, progress: Pro
     return system.volume(x)
 
 
-def structure(volume) -> np.ndarray:
+def structure(volume: np.ndarray) -> np.ndarray:
     """How much a volume [x, y, z] changes around each voxel, as weights for SART: the root of the mean square gradient there.
 
     Nowhere below `FLOOR` of its own root mean square, so that nothing is held fast; ones where a volume is the same throughout.

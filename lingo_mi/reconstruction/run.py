@@ -39,7 +39,7 @@ def reconstruct(
     return algorithm.run(scan, start=start, progress=progress, **inputs)
 
 
-def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None):
+def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
     """Raises InputError where no ray meets the volume, where the source is in it, and where memory is too small.
 
     algorithm   whose memory is asked for (None: the least that any needs)

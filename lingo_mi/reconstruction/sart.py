@@ -5,7 +5,7 @@ block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray meets is left alone. With weights s of the voxels these are the
+where division is by voxel and by pixel, and what no ray crosses is left alone. With weights s of the voxels these are the
 same steps for z in x = x_0 + diag(s) z, A diag(s) in A's place:
 
     x  <-  x + lmbda s (A_b^T W (b - A_b x)) / (A_b^T 1),  W = 1 / (A_b s)
@@ -27,7 +27,7 @@ that of TIGRE for MATLAB.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
@@ -43,7 +43,7 @@ from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
 
 
-def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
+def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Generator) -> list[np.ndarray]:
     """The views [block][views of it] of one pass: blocks of consecutive views, in one of three orders.
 
     order   'ordered'; 'random'; or 'angularDistance', which takes next the block that is farthest from all before (the most
@@ -67,7 +67,7 @@ def blocks(angles, blocksize: int, order: str, rng) -> list[np.ndarray]:
     return [parts[i] for i in out]
 
 
-def passes(angles, blocksize: int, order: str, seed: int):
+def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterator[list[np.ndarray]]:
     """The `blocks` of one pass after another, without end."""
     rng = np.random.default_rng(seed)
     blocks(
@@ -77,8 +77,10 @@ def passes(angles, blocksize: int, order: str, seed: int):
         yield blocks(angles, blocksize, order, rng)
 
 
-def sweep(system: System, x, lmbda: float, parts, noneg: bool):
-    """One pass over all blocks: the new volume, on the device."""
+def sweep(
+    system: System, x: mi.Float, lmbda: float, parts: Sequence[Sequence[int] | np.ndarray], noneg: bool
+) -> mi.Float:
+    """One pass over all blocks of views, from a volume (mi.Float [voxels], density per mm) to the next."""
     A, step, start = system.A, scalar(lmbda), x
     for views in parts:
         ax, path = A.forward(x, views)

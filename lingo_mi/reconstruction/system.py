@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -29,7 +31,7 @@ class System:
     are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
     """
 
-    def __init__(self, scan: Scan, weights=None, blur=None):
+    def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
         self.geometry = scan.geometry
         self.A = Joseph(scan.geometry) if is_circular(scan) else ExactPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
@@ -51,7 +53,7 @@ class System:
             self.weights = self._device(weights, 'weights of the voxels')
             self.weighed = evaluated(self.A.forward(self.weights, self.views)[0])
 
-    def start(self, volume: ArrayLike | None):
+    def start(self, volume: ArrayLike | None) -> mi.Float:
         """The start volume on the device: zero, or `volume` [x, y, z], density per mm.
 
         Raises InputError where it does not fit the geometry or is not finite.
@@ -66,19 +68,19 @@ class System:
         volume = on_voxels(volume, self.geometry, name)
         return evaluated(mi.Float(volume.ravel()) + scalar(0))  # a copy: the algorithms write into theirs
 
-    def residual(self, x):
+    def residual(self, x: mi.Float) -> tuple[mi.Float, float]:
         """b - A x of all views, and its norm over that of b."""
         r = evaluated(self.b - self.A.forward(x, self.views)[0])
         return r, self.relative(r)
 
-    def relative(self, r) -> float:
+    def relative(self, r: mi.Float) -> float:
         """The norm of a residual over that of b. Raises InputError where it is not finite."""
         value = norm(r) / self.size_b
         if not np.isfinite(value):
             raise InputError(DIVERGED)
         return value
 
-    def correct(self, x):
+    def correct(self, x: mi.Float) -> None:
         """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
 
         Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .45 % (docs/results.md), which an
@@ -89,27 +91,32 @@ class System:
             joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, ExactPair(self.geometry)))
             self.b = evaluated(self.measured + (joseph - exact))
 
-    def volume(self, x) -> np.ndarray:
+    def volume(self, x: mi.Float) -> np.ndarray:
         """A device volume as float32 [x, y, z]. Raises InputError where it is not finite."""
-        return finite(x.numpy().reshape(self.geometry.nVoxel))
+        volume = x.numpy().reshape(self.geometry.nVoxel)
+        if not np.isfinite(volume).all():
+            raise InputError(DIVERGED)
+        return volume
 
 
-def evaluated(x):
+def evaluated(x) -> mi.Float:
+    """An array of the device itself, computed now."""
     dr.eval(x)
     return x
 
 
-def scalar(x: float):
+def scalar(x: float) -> mi.Float:
     """A number that changes between iterations: a literal would be compiled into the kernel."""
     return dr.opaque(mi.Float, float(x))
 
 
-def dot(a, b) -> float:
+def dot(a: mi.Float, b: mi.Float) -> float:
     """Inner product: sums of 4096 terms in float32, these in float64."""
     return float(dr.block_sum(a * b, min(PARTIAL, dr.width(a))).numpy().sum(dtype=np.float64))
 
 
-def norm(a) -> float:
+def norm(a: mi.Float) -> float:
+    """Square root of the sum of squares."""
     return dot(a, a) ** 0.5
 
 
@@ -120,11 +127,4 @@ def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
         raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
     if not np.isfinite(volume).all():
         raise InputError(f'the {name}: NaN or infinity')
-    return volume
-
-
-def finite(volume: np.ndarray) -> np.ndarray:
-    """The volume itself. Raises InputError where it is not finite."""
-    if not np.isfinite(volume).all():
-        raise InputError(DIVERGED)
     return volume

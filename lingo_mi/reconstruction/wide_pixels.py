@@ -6,10 +6,12 @@ two voxels wide or more, some voxels are crossed by no ray of any view.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp, sqrt
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from lingo_mi.geometry.base import Geometry
 
@@ -50,11 +52,11 @@ class Between:
     """
 
     @classmethod
-    def of(cls, geometry: Geometry, A, views) -> Between | None:
+    def of(cls, geometry: Geometry, A, views: np.ndarray) -> Between | None:
         """None where rays are too close for there to be any."""
         return cls(geometry, A, views) if leave_voxels_out(geometry) else None
 
-    def __init__(self, geometry: Geometry, A, views):
+    def __init__(self, geometry: Geometry, A, views: np.ndarray):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
         weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
         self.crossed = weight > LEAST * blurred(weight, self.size, self.deviations)
@@ -64,13 +66,13 @@ class Between:
         )  # of what rays cross around a voxel between them, 0 elsewhere
         dr.eval(self.crossed, self.share)
 
-    def filled(self, change):
+    def filled(self, change: mi.Float) -> mi.Float:
         """A change of the volume (mi.Float [voxels]), the voxels between rays changed as those around them."""
         around = blurred(dr.select(self.crossed, change, 0), self.size, self.deviations)
         return dr.select(self.share > 0, around / self.share, change)
 
 
-def blurred(volume, size, deviations):
+def blurred(volume: mi.Float, size: tuple[int, int, int], deviations: Sequence[float]) -> mi.Float:
     """A volume (mi.Float [voxels]) convolved with a Gaussian of these standard deviations, in voxels along x, y, z.
 
     Cut off at 4 of them; beyond the border the volume is mirrored. Deviations above the volume's own side count as that.

@@ -39,7 +39,7 @@ def write_results(
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
     Raises InputError where a file cannot be written.
     """
-    geometry = dataset.train.geometry
+    geometry, test = dataset.train.geometry, dataset.test
     measured = measure(fitted, dataset)
     cloud = fitted.world_gaussians()
     if measured.volume is None:
@@ -53,12 +53,7 @@ def write_results(
         write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
         write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.model.extent, fitted.effects)
     if measured.views is not None:
-        views = folder / 'views'
-        views.mkdir(exist_ok=True)
-        for stale in views.glob('*.exr'):
-            stale.unlink()
-        for i, image in enumerate(measured.views):
-            write_exr(views / f'{i:04d}.exr', image)
+        _write_views(folder / 'views', measured.views)
     numbers = measured.numbers | dict(
         method=method,
         seed=fitted.seed,
@@ -69,9 +64,7 @@ def write_results(
         command=command,
         **_corrections(fitted),
         angles=np.degrees(geometry.angles).tolist(),
-        test_angles=np.degrees(dataset.test.geometry.angles).tolist()
-        if dataset.test is not None and len(dataset.test)
-        else [],
+        test_angles=[] if measured.views is None or test is None else np.degrees(test.geometry.angles).tolist(),
         versions=versions(),
     )
     write_report(folder, report_data(fitted, dataset, replace(measured, numbers=numbers), title))
