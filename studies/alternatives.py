@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -43,8 +45,8 @@ def per_ray(centre, scale, rotation, density, view, precision: str = 'float32'):
 
     Float [height * width] of that precision.
     """
-    Float = dr.float64_array_t(mi.Float) if precision == 'float64' else mi.Float
-    Vector = mi.Vector3d if precision == 'float64' else mi.Vector3f
+    Float: Any = dr.float64_array_t(mi.Float) if precision == 'float64' else mi.Float
+    Vector: Any = mi.Vector3d if precision == 'float64' else mi.Vector3f
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)
     x, y = Float(i % width) + 0.5, Float(i // width) + 0.5
@@ -52,7 +54,8 @@ def per_ray(centre, scale, rotation, density, view, precision: str = 'float32'):
     source = Vector(view.source)
     start, direction = (point, source) if view.parallel else (source, point - source)
     p, s, rho = Vector(centre), Vector(scale), Float(density)
-    q = rotation if precision != 'float64' else dr.float64_array_t(type(rotation))(rotation)
+    Vector4: Any = dr.float64_array_t(type(rotation)) if precision == 'float64' else type(rotation)
+    q = Vector4(rotation)
     # Columns of diag(1/s) R^T: turning every ray by every quaternion would cost more than all the rest.
     axes = [row / s for row in rows_of(q, Vector)]
     columns = [*p, *(a for axis in axes for a in axis), rho * SQRT_2PI]
@@ -99,7 +102,8 @@ def march(data, size, half, origin, direction, step: float):
 
     Differentiable in `data`.
     """
-    texture = mi.Texture3f(
+    Texture: Any = mi.Texture3f
+    texture = Texture(
         mi.TensorXf(data, shape=(size, size, size, 1)),
         use_accel=False,
         migrate=False,

@@ -20,13 +20,15 @@ NAMES = {'centre': 3, 'scale': 3, 'rotation': 4, 'density': 1}
 REACH = 9.0  # standard deviations: beyond, a Gaussian is below 3e-18 of its peak
 
 
-def image_and_gradients(gaussians, rays: Rays, shape, weights=None, order: int = 0):
+def image_and_gradients(
+    gaussians, rays: Rays, shape, weights=None, order: int = 0
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """One view of a cloud, float64 [v, u]; and derivatives of sum(weights * image) by name, float64 [N, ...].
 
     gaussians   centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N]
     rays        the view is its first one
     shape       of the image, (v, u)
-    weights     [v, u], or None for no derivatives
+    weights     [v, u], or None for no derivatives: none in the dictionary
     order       0 for rays through the pixel centres; n for the mean over the pixels by n x n Gauss-Legendre points
 
     The source must be farther from the Gaussians than their reach.
@@ -43,16 +45,16 @@ def image_and_gradients(gaussians, rays: Rays, shape, weights=None, order: int =
         rows, columns = (np.arange(*ends) for ends in zip(low[i], high[i]))
         box = np.ix_(rows, columns)
         g = weights[box] if weights is not None else None
-        one = [x[i] for x in gaussians]
+        one = tuple(x[i] for x in gaussians)
         for x, y, share in samples:
             start, direction = rays.through(0, *np.broadcast_arrays(columns + x, rows[:, None] + y))
-            value, by_row = _gaussian(*one, start, direction, g)
+            value, by_row = _gaussian(one, start, direction, g)
             image[box] += share * value
             if by_row is not None:
                 for name, row in zip(NAMES, by_row):
                     gradients[name][i] += share * row
     gradients['density'] = gradients['density'][:, 0]
-    return image, gradients if weights is not None else None
+    return image, gradients if weights is not None else {}
 
 
 def rays_and_gradients(gaussians, start, direction, weights):
@@ -60,7 +62,7 @@ def rays_and_gradients(gaussians, start, direction, weights):
     gaussians = [np.asarray(x, float) for x in gaussians]
     total, rows = 0.0, []
     for one in zip(*gaussians):
-        value, row = _gaussian(*one, start, direction, weights)
+        value, row = _gaussian(one, start, direction, weights)
         total = total + value
         rows.append(row)
     return total, {name: np.array(column) for name, column in zip(NAMES, zip(*rows))}
@@ -87,8 +89,9 @@ def _boxes(centre, radius, rays, shape):
     return np.clip(low, 0, shape).astype(int), np.clip(high, 0, shape).astype(int)
 
 
-def _gaussian(centre, scale, rotation, density, start, direction, weights):
+def _gaussian(gaussian, start, direction, weights):
     """Integrals [...] of one Gaussian along rays [..., 3], and rows of derivatives in the order of NAMES."""
+    centre, scale, rotation, density = gaussian
     R = Rotation.from_quat(rotation).as_matrix()
     W = R.T / scale[:, None]
     to = centre - start

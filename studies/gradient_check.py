@@ -109,7 +109,7 @@ def check_gradients(scene, step: float = 1e-4, count: int = 4, seed: int = 0) ->
 
     def loss(values):
         """That of one Gaussian alone, (centre, scale, quaternion, density)."""
-        return slope @ one_integral(values[:3], values[3:6], values[6:10], values[10], *rays)
+        return slope @ one_integral((values[:3], values[3:6], values[6:10], values[10]), *rays)
 
     def image():
         return np.array(line.render(scene), float)[..., 0].ravel()

@@ -25,7 +25,7 @@ def table(columns: list[Column], rows: Iterable[dict], first: str | None = None)
     return '\n'.join(lines + ['| ' + ' | '.join(cell(row) for _, cell in columns) + ' |' for row in rows])
 
 
-def insert(text: str, tables: dict[str, str], where='the document') -> str:
+def insert(text: str, tables: dict[str, str], where: str | Path = 'the document') -> str:
     """The text with what stands in the places of the tables replaced by them.
 
     tables   Markdown by name

@@ -18,25 +18,31 @@ against the other.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Cloud:
-    """centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N], at the centre."""
+    """Gaussians: centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N], at the centre.
+
+    Columns are rounded to what float32 holds of them, so that rounding the input counts as no error of who is measured.
+    """
 
     centre: np.ndarray
     scale: np.ndarray
     rotation: np.ndarray
     density: np.ndarray
 
-    def __post_init__(self):
-        for f in fields(self):  # rounded to what float32 holds, so that rounding the input counts as no error
-            object.__setattr__(self, f.name, np.array(getattr(self, f.name), np.float32).astype(float))
+    def __init__(self, centre: ArrayLike, scale: ArrayLike, rotation: ArrayLike, density: ArrayLike):
+        columns = dict(centre=centre, scale=scale, rotation=rotation, density=density)
+        for name, column in columns.items():
+            object.__setattr__(self, name, np.array(column, np.float32).astype(float))
 
     def __len__(self):
         return len(self.density)
@@ -77,18 +83,14 @@ class Pose:
     @staticmethod
     def of(frames, index, height, width) -> Pose:
         """View `index` of a `lingo_mi.geometry.rays.Rays`, for an image of height x width pixels."""
-        return Pose(
-            *(np.array(a[index], float) for a in (frames.source, frames.corner, frames.u, frames.v)),
-            height,
-            width,
-            frames.parallel,
-        )
+        source, corner, u, v = (np.array(a[index], float) for a in (frames.source, frames.corner, frames.u, frames.v))
+        return Pose(source, corner, u, v, height, width, frames.parallel)
 
     @staticmethod
     def of_view(view) -> Pose:
         """A `lingo_mi.projectors.view.View`."""
-        vectors = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
-        return Pose(*vectors, view.height, view.width, view.parallel)
+        source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
+        return Pose(source, corner, u, v, view.height, view.width, view.parallel)
 
     def ends(self, panel: bool = True) -> tuple[float, float]:
         """Where integrals begin and end, in t: at the source and, if `panel`, at the panel; those of a parallel beam nowhere."""
@@ -103,13 +105,18 @@ class Pose:
         return np.broadcast_to(self.source, on_panel.shape), on_panel - self.source
 
 
-def whiten(scale, rotation, vectors):
+def whiten(scale, rotation, vectors) -> np.ndarray:
     """diag(1/s) R^T v for one Gaussian."""
     return vectors @ Rotation.from_quat(rotation).as_matrix() / scale
 
 
-def one_integral(centre, scale, rotation, density, start, direction, t0=-np.inf, t1=np.inf):
-    """Line integrals [rays] of one Gaussian for t in [t0, t1]."""
+def one_integral(gaussian, start, direction, t0: float = -np.inf, t1: float = np.inf) -> np.ndarray:
+    """Line integrals of one Gaussian along rays, for t in [t0, t1], [M].
+
+    gaussian           its centre, scale, rotation and density, as `rows` gives them
+    start, direction   [M, 3]
+    """
+    centre, scale, rotation, density = gaussian
     w, d = whiten(scale, rotation, centre - start), whiten(scale, rotation, direction)
     dd = (d * d).sum(1)
     m = (w * d).sum(1) / dd
@@ -120,13 +127,13 @@ def one_integral(centre, scale, rotation, density, start, direction, t0=-np.inf,
     return density * np.sqrt(2 * np.pi / dd) * length * np.exp(-0.5 * (nearest**2).sum(1)) * share
 
 
-def line_integrals(cloud, pose, t0=-np.inf, t1=np.inf):
+def line_integrals(cloud: Cloud, pose: Pose, t0: float = -np.inf, t1: float = np.inf) -> np.ndarray:
     """The image of a cloud, [height * width], row by row."""
     rays = pose.rays()
-    return sum(one_integral(*row, *rays, t0, t1) for row in rows(cloud))
+    return sum((one_integral(row, *rays, t0, t1) for row in rows(cloud)), np.zeros(pose.height * pose.width))
 
 
-def rows(cloud):
+def rows(cloud: Cloud) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
     """The Gaussians one by one: centre, scale, rotation, density."""
     return zip(cloud.centre, cloud.scale, cloud.rotation, cloud.density)
 
@@ -137,23 +144,24 @@ def derivative(function, step):
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-def gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
+def gradients(cloud: Cloud, pose: Pose, weights, t0: float = -np.inf, t1: float = np.inf) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by all parameters: a dict of arrays shaped like the cloud's."""
     rays = pose.rays()
-    return _gradients(cloud, lambda *row: (weights * one_integral(*row, *rays, t0, t1)).sum())
+    return _gradients(cloud, lambda row: (weights * one_integral(row, *rays, t0, t1)).sum())
 
 
-def values_at(cloud, points):
+def values_at(cloud: Cloud, points) -> np.ndarray:
     """sigma [M] at points [M, 3]."""
-    return sum(_value(*row, points) for row in rows(cloud))
+    return sum((_value(row, points) for row in rows(cloud)), np.zeros(len(points)))
 
 
-def value_gradients(cloud, points, weights):
+def value_gradients(cloud: Cloud, points, weights) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * sigma(points)), like `gradients`."""
-    return _gradients(cloud, lambda *row: (weights * _value(*row, points)).sum())
+    return _gradients(cloud, lambda row: (weights * _value(row, points)).sum())
 
 
-def _value(centre, scale, rotation, density, points):
+def _value(gaussian, points):
+    centre, scale, rotation, density = gaussian
     return density * np.exp(-0.5 * (whiten(scale, rotation, points - centre) ** 2).sum(-1))
 
 
@@ -175,13 +183,13 @@ def _gradients(cloud, loss, step=1e-3):
                 def moved(by, k=k, index=index):
                     changed = [np.array(x) for x in row]
                     changed[k][index] += by
-                    return loss(*changed)
+                    return loss(changed)
 
-                out[name][(i, *index)] = derivative(moved, h) if h else loss(*row[:3], 1.0)
+                out[name][(i, *index)] = derivative(moved, h) if h else loss((*row[:3], 1.0))
     return out
 
 
-def pose_gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
+def pose_gradients(cloud: Cloud, pose: Pose, weights, t0: float = -np.inf, t1: float = np.inf) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by the view's four vectors."""
     smallest = cloud.scale.min()
     reach = dict(source=1, corner=1, u=pose.width, v=pose.height)
@@ -204,7 +212,7 @@ def pose_gradients(cloud, pose, weights, t0=-np.inf, t1=np.inf):
     return out
 
 
-def relative(found, expected):
+def relative(found, expected) -> float:
     """Root mean square deviation over that of the expected values."""
     found, expected = np.ravel(found), np.ravel(expected)
-    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))

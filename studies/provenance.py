@@ -8,11 +8,13 @@ import platform
 import shlex
 import subprocess
 import sys
+from importlib import resources
 from pathlib import Path
 
-from lingo_mi import errors
 from lingo_mi.paths import replacing
 from lingo_mi.results.save import versions
+
+ROOT = Path(str(resources.files('lingo_mi'))).resolve().parent  # of the checkout, or site-packages
 
 
 def provenance() -> dict:
@@ -43,11 +45,10 @@ def write_provenance(table: Path) -> Path:
 
 def commit() -> str | None:
     """The commit of the checkout that `lingo_mi` runs from, or None where it runs from no checkout of its own."""
-    root = Path(errors.__file__).resolve().parents[1]
-    if not (root / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
+    if not (ROOT / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
         return None
     try:
-        done = subprocess.run(['git', 'rev-parse', 'HEAD'], cwd=root, capture_output=True, text=True)
+        done = subprocess.run(['git', 'rev-parse', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
     except OSError:  # there is no git
         return None
     return done.stdout.strip() if done.returncode == 0 else None

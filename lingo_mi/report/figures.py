@@ -20,7 +20,7 @@ DIFFERENCE = 'RdBu_r'
 COLOURS = {'loss': '#444444', 'psnr_2d': '#1f77b4', 'psnr_3d': '#d6641e', 'gaussians': '#2a7f4f'}
 PADS = {'w_pad': 0.1, 'h_pad': 0.06}  # inches around everything
 MOST_POINTS = 30_000  # more than a scatter plot can show
-STYLE = {
+STYLE: dict = {
     'font.size': 10,
     'axes.titlesize': 10.5,
     'axes.labelsize': 10,

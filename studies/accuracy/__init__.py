@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 
 import drjit as dr
@@ -20,7 +21,7 @@ from lingo_mi.studies.provenance import machine
 __all__ = ['FULL', 'QUICK', 'Sizes', 'measure']
 
 
-def measure(sizes: Sizes, progress=None) -> dict:
+def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> dict:
     """All measurements, as numbers and strings for JSON.
 
     progress   called as progress(what) before each part
@@ -37,7 +38,8 @@ def measure(sizes: Sizes, progress=None) -> dict:
         initialisations=lambda: fits.initialisations(sizes),
         fits=lambda: fits.curves(sizes),
     )
-    out = dict(conditions=dict(variant=mi.variant(), threads=dr.thread_count(), machine=machine(), sizes=asdict(sizes)))
+    conditions = dict(variant=mi.variant(), threads=dr.thread_count(), machine=machine(), sizes=asdict(sizes))
+    out: dict = dict(conditions=conditions)
     for name, part in parts.items():
         if progress:
             progress(name)

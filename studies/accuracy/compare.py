@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gc
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -31,12 +32,12 @@ class Method:
     """
 
     name: str
-    image: object
-    gradients: object = None
-    times: dict = field(default_factory=lambda: dict(forward=[], gradients=[]))
+    image: Callable
+    gradients: Callable | None = None
+    times: dict[str, list[float]] = field(default_factory=lambda: dict(forward=[], gradients=[]))
 
 
-def by_function(name, work: Workload, function, differentiable=True) -> Method:
+def by_function(name: str, work: Workload, function: Callable, differentiable: bool = True) -> Method:
     """A method from function(centre, scale, rotation, density) -> Float [pixels]."""
 
     def image():
@@ -55,7 +56,7 @@ def by_function(name, work: Workload, function, differentiable=True) -> Method:
     return Method(name, image, gradients if differentiable else None)
 
 
-def by_integrator(name, work: Workload, sharing: Sharing = SHARING, **settings) -> Method:
+def by_integrator(name: str, work: Workload, sharing: Sharing = SHARING, **settings) -> Method:
     """A method from `lingo_xray` with these parameters, through `mi.render` and `dr.backward`.
 
     sharing   how its work is shared out
@@ -91,12 +92,12 @@ def split(data, density):
     return data[:, :3].T, data[:, 3:6].T, data[:, 6:].T, density
 
 
-def compare(work: Workload, list_of_methods, sizes: Sizes) -> list[dict]:
+def compare(work: Workload, list_of_methods: list[Method], sizes: Sizes) -> list[dict]:
     """Errors, times and memory of methods, one dictionary each."""
     rows = []
     image, gradients = work.truth
     for m in list_of_methods:  # the first calls, which compile
-        row = dict(name=m.name)
+        row: dict = dict(name=m.name)
         found, row['memory_mb'] = peak_memory(m.image)
         row['image'], row['image_max'] = deviation(np.array(found), image)
         if m.gradients:
@@ -117,7 +118,7 @@ def deviation(found, expected) -> tuple[float, float]:
     return (float(np.linalg.norm(error) / np.linalg.norm(expected)), float(abs(error).max() / abs(expected).max()))
 
 
-def take_turns(list_of_methods, sizes: Sizes):
+def take_turns(list_of_methods: list[Method], sizes: Sizes) -> None:
     """Time all methods in turn, round by round."""
     for _ in range(sizes.rounds):
         for m in list_of_methods:
@@ -126,7 +127,8 @@ def take_turns(list_of_methods, sizes: Sizes):
                     m.times[key].append(seconds(function))
 
 
-def seconds(function) -> float:
+def seconds(function: Callable) -> float:
+    """Seconds that a call takes, until the device is done."""
     dr.sync_thread()
     begun = time.perf_counter()
     function()
@@ -134,7 +136,7 @@ def seconds(function) -> float:
     return time.perf_counter() - begun
 
 
-def kernel_ms(function, repeats: int = 3) -> float:
+def kernel_ms(function: Callable, repeats: int = 3) -> float:
     """Milliseconds that the device computes in a call, without Python and tracing: of `repeats` calls the median."""
     totals = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -156,7 +158,7 @@ def statistics(times: dict) -> dict:
     return out
 
 
-def peak_memory(function):
+def peak_memory(function: Callable):
     """What a call gives, and the MB that Dr.Jit holds at most during it, above what it held before."""
     gc.collect()
     dr.sync_thread()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from lingo_mi import phantoms
@@ -76,7 +78,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
 def curves(sizes: Sizes) -> list[dict]:
     """Quality against seconds: recipes, iterations, cut-off, Gaussians, size of the phantom and of the panel."""
     small, middle = sizes.phantoms[0], sizes.iterations[-2]
-    plans = [dict(name=name, iterations=n) for name in VOLUMETRIC for n in sizes.iterations]
+    plans: list[dict[str, Any]] = [dict(name=name, iterations=n) for name in VOLUMETRIC for n in sizes.iterations]
     plans += [dict(extent=e) for e in (2.0, 4.0, EXTENT)]
     plans += [dict(points=p) for p in sizes.points if p != sizes.points[1]]
     plans += [dict(values_per_gaussian=v) for v in (3.5, 56.0)]
@@ -84,7 +86,7 @@ def curves(sizes: Sizes) -> list[dict]:
     for side in sizes.phantoms[1:]:
         plans += [dict(side=side, pixels=p, iterations=sizes.iterations[-1]) for p in (small, side)]
     scans, rows = {}, []
-    usual = dict(
+    usual: dict[str, Any] = dict(
         name='fast',
         side=small,
         pixels=small,

@@ -49,11 +49,11 @@ def methods(work: Workload, sizes: Sizes) -> list[dict]:
     found = [by_integrator(f'splat, {e:g} σ', work, extent=e) for e in (2.0, 3.0, 4.0, EXTENT, 7.0)]
     found.append(by_integrator('splat, affine, 7 σ', work, extent=7.0, footprint='affine'))
     for p in ('float32', 'compensated', 'float64'):
-        found.append(
-            by_function(
-                f'every ray, {p}', work, lambda *x, p=p: alternatives.per_ray(*x, work.view, p), p != 'compensated'
-            )
-        )
+
+        def per_ray(centre, scale, rotation, density, p=p):
+            return alternatives.per_ray(centre, scale, rotation, density, work.view, p)
+
+        found.append(by_function(f'every ray, {p}', work, per_ray, p != 'compensated'))
     for n in sizes.grids:
         found.append(by_function(f'grid {n}³, exact walk', work, lambda *x, n=n: _through_grid(work, x, n)))
         found += [
@@ -68,7 +68,9 @@ def methods(work: Workload, sizes: Sizes) -> list[dict]:
 def _through_grid(work: Workload, gaussians, n: int, step: float | None = None):
     """The image of a cloud sampled on n^3 voxels: walked exactly, or marched with steps of `step` voxels."""
     side = 2 / n
-    data = voxelize(*gaussians, Grid(vector64((-1, -1, -1)), vector64((side,) * 3), (n,) * 3), EXTENT)
+    centre, scale, rotation, density = gaussians
+    voxels = Grid(vector64((-1, -1, -1)), vector64((side,) * 3), (n, n, n))
+    data = voxelize(centre, scale, rotation, density, voxels, EXTENT)
     origin, direction = alternatives.rays(work.view, 2.0)
     if step:
         return alternatives.march(data, n, 1.0, origin, direction, step * side)

@@ -109,7 +109,8 @@ def _fits(fig, found):
     runs = [r for r in found['fits'] if all(r[key] == first[key] for key in alike)]
     most = max(r['iterations'] for r in runs)
     colours = dict(fast=GREEN, lingo=BLUE, r2=RED)
-    for axis, key, title in zip(fig.subplots(1, 2), ('psnr_2d', 'psnr_3d'), ('Held-out views', 'Volume')):
+    axes = fig.subplots(1, 2)
+    for axis, key, title in zip(axes, ('psnr_2d', 'psnr_3d'), ('Held-out views', 'Volume')):
         for r in runs:
             points = [(r['seconds_init'] + h['seconds'], h[key]) for h in r['history']]
             axis.semilogx(*zip(*points), '-', color=colours[r['name']], alpha=1 if r['iterations'] == most else 0.4)
@@ -131,4 +132,4 @@ def _fits(fig, found):
             )
         axis.set(title=title, xlabel='time, initial cloud included [s]', ylabel='PSNR [dB]')
         axis.grid(alpha=0.3, which='both')
-    axis.legend()
+    axes[1].legend()

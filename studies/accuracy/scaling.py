@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from lingo_mi.studies.accuracy.compare import by_integrator, kernel_ms, peak_memory, statistics, take_turns
 from lingo_mi.studies.accuracy.sizes import Sizes
@@ -38,7 +39,7 @@ def _count(pairs, box):
 
 def _row(work: Workload, sizes: Sizes) -> dict:
     method = by_integrator('', work, extent=3.0)
-    calls = dict(forward=method.image, gradients=method.gradients)
+    calls: dict[str, Any] = dict(forward=method.image, gradients=method.gradients)
     pairs = work.pairs(3.0)
     row = dict(gaussians=len(work.columns[0]), side=work.pixels, pairs=pairs)
     row |= {

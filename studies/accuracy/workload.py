@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
 from lingo_mi.studies.closed_form import image_and_gradients
+from lingo_mi.studies.pairs import count_pairs
 
 DSO, DSD, PANEL = 7.8125, 11.71875, 4.0  # X3D's scanner, in units of half the volume's side
 BALL = 0.625  # radius of the ball of centres
@@ -70,10 +68,10 @@ class Workload:
                 ),
             )
         )
-        self._truth = None
+        self._truth: tuple[np.ndarray, dict[str, np.ndarray]] | None = None
 
     @property
-    def truth(self):
+    def truth(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """The image [v, u] and the derivatives by name."""
         if self._truth is None:
             self._truth = image_and_gradients(
@@ -83,10 +81,9 @@ class Workload:
 
     def gaussians(self):
         """Centre, scale, rotation and density as new Dr.Jit arrays."""
-        kinds = mi.Point3f, mi.Vector3f, mi.Vector4f
-        return [*(kind(*(mi.Float(c) for c in x.T)) for kind, x in zip(kinds, self.columns)), mi.Float(self.columns[3])]
+        centre, scale, rotation = ([mi.Float(c) for c in x.T] for x in self.columns[:3])
+        return mi.Point3f(*centre), mi.Vector3f(*scale), mi.Vector4f(*rotation), mi.Float(self.columns[3])
 
     def pairs(self, extent: float) -> float:
-        """Pixels in the bounding boxes of all footprints."""
-        f = project(*self.gaussians(), self.view, extent)
-        return float(dr.sum(dr.float64_array_t(mi.Float)(mi.Float(f.row_end - f.row_begin) * f.width))[0])
+        """`count_pairs` of the cloud."""
+        return count_pairs(self.gaussians(), self.view, extent)

@@ -18,17 +18,18 @@ import time
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.studies.alternatives import Tree, rays
 from lingo_mi.studies.closed_form import NAMES, rays_and_gradients
 from lingo_mi.studies.oracle import Pose
+from lingo_mi.studies.pairs import count_pairs
 
 EPSILON = 0.0128  # mm, 1e-4 of half the volume's side: where the tree errs least
 VIEWS, WARM_UP = 8, 3
@@ -102,11 +103,10 @@ class Bench:
         self.sensors = [self.scene.sensors()[0].view(i) for i in range(VIEWS)]
 
     def pairs(self) -> float:
-        """Pixels in the boxes of all footprints in the first view."""
+        """`count_pairs` of the cloud in the first view."""
         thing = find_objects(self.scene)[0]
         columns = thing.centre, thing.scale, thing.rotation, thing.density
-        f = project(*columns, view_of(self.sensors[0]), self.work.extent)
-        return float(dr.sum(mi.Float(f.row_end - f.row_begin) * f.width)[0])
+        return count_pairs(columns, view_of(self.sensors[0]), self.work.extent)
 
     def times(self) -> dict:
         """Milliseconds of both passes, ns a pair, and ns a pair of the hand-written kernel.
@@ -121,7 +121,7 @@ class Bench:
         for sensor in self.sensors[:WARM_UP]:
             self._seconds(sensor, upstream)
         with tempfile.TemporaryDirectory() as folder:
-            program = build_limit(folder) if 'llvm' in mi.variant() else None
+            program = build_limit(folder) if 'llvm' in str(mi.variant()) else None
             half = np.sqrt(pairs / work.gaussians) / 2
             for i in range(work.repeats):
                 sensors = [self.sensors[(i + j) % VIEWS] for j in range(TRIES)]
@@ -170,9 +170,10 @@ class Bench:
             worst = max(np.linalg.norm(a - gradients[k]) / np.linalg.norm(gradients[k]) for k, a in zip(NAMES, by))
             return float(np.linalg.norm(found[chosen] - image) / np.linalg.norm(image)), float(worst)
 
-        ours = mi.render(self.scene, self.params, sensor=self.sensors[0])
+        ours: Any = mi.render(self.scene, self.params, sensor=self.sensors[0])
         dr.backward(ours * mi.TensorXf(weights.reshape(ours.shape)))
-        found = errors(ours.numpy().ravel(), *(dr.grad(self.params[name]).numpy() for name in KEYS))
+        by: list[Any] = [dr.grad(self.params[name]) for name in KEYS]
+        found = errors(ours.numpy().ravel(), *(x.numpy() for x in by))
         out = dict(zip(('image_error', 'gradient_error'), found))
 
         tree = Tree(mi.TensorXf(self.data), mi.TensorXf(self.density), self.work.extent, EPSILON)

@@ -98,7 +98,7 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
 def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
     """RTK's operations, or None where it is not installed."""
     try:
-        import itk
+        import itk  # pyright: ignore[reportMissingImports] - optional
 
         itk.RTK  # noqa: B018 - loads it
     except (ImportError, AttributeError):
@@ -119,8 +119,8 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
     """diffct's operations (PyTorch backend), or None where it is not installed."""
     try:
         import torch
-        from diffct import Projector
-        from diffct import fdk as their_fdk
+        from diffct import Projector  # pyright: ignore[reportMissingImports] - optional
+        from diffct import fdk as their_fdk  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     torch.set_num_threads(cores)
@@ -151,7 +151,7 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
 def compare(packages: dict[str, Operations], repeats: int) -> dict:
     """By operation and package, medians over the repeats: seconds and, of packages other than 'ours', ratio (their time over
     ours: above 1 they are slower) and deviation (relative RMS difference from our result)."""
-    seconds, deviation = {}, {}
+    seconds, deviation, reference = {}, {}, np.empty(0)
     for turn in range(repeats + 1):
         for operation in packages['ours']:
             for name, functions in packages.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -125,14 +126,10 @@ def scans(name: str, parameters: dict, seed: int) -> dict:
     if experiment.turn or experiment.shift:
         moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
         scan = Scan(scan.geometry, render_objects(objects, moved))
-    if scan.effects and scan.effects.scatter:  # a fit must not know the random numbers of its data, and may be quicker
-        scatter = scan.effects.scatter
-        scan = replace(
-            scan,
-            effects=replace(
-                scan.effects, scatter=replace(scatter, paths=-(-scatter.paths // 4), seed=scatter.seed + 1)
-            ),
-        )
+    effects: Any = scan.effects
+    if effects and effects.scatter:  # a fit must not know the random numbers of its data, and may be quicker
+        scatter = replace(effects.scatter, paths=-(-effects.scatter.paths // 4), seed=effects.scatter.seed + 1)
+        scan = replace(scan, effects=replace(effects, scatter=scatter))
     return dict(clean=clean, scan=scan, truth=dataset.volume)
 
 

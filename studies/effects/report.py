@@ -70,6 +70,7 @@ def draw(result: dict, path: Path) -> None:
     the errors of all three fits below on one scale of their own."""
     import matplotlib  # half a second that the fits need not wait for
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     truth, spacing = result['truth'], np.array(result['spacing'])
     index, extent = richest(truth, 2), plane_extent(truth.shape, spacing, np.zeros(3), 2)
@@ -77,21 +78,22 @@ def draw(result: dict, path: Path) -> None:
     slices = {kind: plane(result[kind]['volume'], 2, index) for kind in FITS}
     limit = max(np.percentile(np.abs(slices[kind] - wanted), 99) for kind in FITS)
     with matplotlib.rc_context(STYLE):
-        fig = Figure(figsize=(10, 6.6), layout='constrained')
-        fig.get_layout_engine().set(**PADS)
+        fig = Figure(figsize=(10, 6.6), layout=ConstrainedLayoutEngine(w_pad=PADS['w_pad'], h_pad=PADS['h_pad']))
         fig.suptitle(f'{result["title"]}: slice at z = {(index + 0.5 - truth.shape[2] / 2) * spacing[2]:.3g} mm')
         grid = fig.subplots(2, 3, sharex=True, sharey=True)
         above = [('truth', wanted), *((FITS[kind], slices[kind]) for kind in ('ignore', 'model'))]
+        grey, differences = (
+            dict(cmap='gray', vmin=0, vmax=1.1 * wanted.max()),
+            dict(cmap='RdBu_r', vmin=-limit, vmax=limit),
+        )
         for ax, (title, image) in zip(grid[0], above):
-            grey = ax.imshow(image, origin='lower', extent=extent, cmap='gray', vmin=0, vmax=1.1 * wanted.max())
+            ax.imshow(image, origin='lower', extent=extent, **grey)
             ax.set_title(title)
         for ax, (kind, title) in zip(grid[1], FITS.items()):
-            error = ax.imshow(
-                slices[kind] - wanted, origin='lower', extent=extent, cmap='RdBu_r', vmin=-limit, vmax=limit
-            )
+            ax.imshow(slices[kind] - wanted, origin='lower', extent=extent, **differences)
             ax.set(title=f'error, {title}: {result[kind]["psnr_3d"]:.2f} dB', xlabel='x [mm]')
         for ax in grid[:, 0]:
             ax.set_ylabel('y [mm]')
-        fig.colorbar(grey, ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
-        fig.colorbar(error, ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
+        fig.colorbar(grid[0, 0].images[0], ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
+        fig.colorbar(grid[1, 0].images[0], ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
         fig.savefig(path, dpi=90)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,7 +39,7 @@ def turned(rng, n: int) -> np.ndarray:
     special = Rotation.from_euler(
         'zyx', [(0, 0, 0), (90, 0, 0), (0, 90, 0), (45, 0, 0), (0, 45, 0), (45, 45, 0)], degrees=True
     )
-    return np.concatenate([special.as_quat(), Rotation.random(n, random_state=rng).as_quat()])
+    return np.concatenate([special.as_quat(), Rotation.random(n, rng).as_quat()])
 
 
 def through_view(rng, scale, frames: Rays, shape, rotation, reach: float = 1.5, depth: float = 0.3) -> Cloud:
@@ -169,8 +170,10 @@ def _places():
     for panel in (True, False):
         for name, (centre, size) in places.items():
             cloud = Cloud([centre], size * np.array(one['scale']), one['rotation'], one['density'])
-            tail = dict(image=2e-6, note='a far tail only') if name.startswith('centre outside the fan, r') else {}
-            yield ViewCase(name if panel else f'{name}, no panel', cloud, frames, shape, panel=panel, **tail)
+            case = ViewCase(name if panel else f'{name}, no panel', cloud, frames, shape, panel=panel)
+            if name == 'centre outside the fan, reaching in':
+                case = replace(case, image=2e-6, note='a far tail only')
+            yield case
     frames, shape = scanner('parallel')
     for name in ('centre outside the fan, reaching in', 'behind the source', 'centre on the panel', 'behind the panel'):
         centre, size = places[name]

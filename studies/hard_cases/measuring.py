@@ -57,12 +57,12 @@ class Result:
     failed: str = ''
 
 
-def on_device(cloud: Cloud):
+def on_device(cloud: Cloud) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector4f, mi.Float]:
     """Centre, scale, rotation and density as opaque Dr.Jit arrays."""
 
     # From lists, because Dr.Jit compiles the alignment of a NumPy buffer into its kernels; that takes seconds a case.
     def column(values):
-        return mi.Float(values.tolist() if len(values) < 1000 else np.float32(values))
+        return mi.Float(values.tolist() if len(values) < 1000 else values.astype(np.float32))
 
     arrays = (
         mi.Point3f(*map(column, cloud.centre.T)),
@@ -89,7 +89,7 @@ def image_and_gradients(cloud: Cloud, frames: Rays, shape, weights, panel: bool 
     panel     whether integrals end at the panel
     extent    cut-off in standard deviations
     """
-    view, gaussians = View.of(frames, 0, *shape, panel), on_device(cloud)
+    view, gaussians = View.of(frames, 0, shape[0], shape[1], panel), on_device(cloud)
     dr.enable_grad(gaussians)
     image = line_integrals(*gaussians, view, RenderOptions(extent))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))

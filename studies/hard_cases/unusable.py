@@ -41,8 +41,8 @@ def _render(cloud):
             integrator=dict(type='lingo_xray'),
             cloud=dict(
                 type='ellipsoids',
-                data=mi.TensorXf(np.float32(data)),
-                density=mi.TensorXf(np.float32(cloud.density)[:, None]),
+                data=mi.TensorXf(data.astype(np.float32)),
+                density=mi.TensorXf(cloud.density.astype(np.float32)[:, None]),
             ),
             scanner=dict(
                 type='ct_scanner', DSO=5.0, DSD=7.5, nDetector='8', dDetector='.4', nVoxel='8', dVoxel='.25', views=1

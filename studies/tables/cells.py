@@ -163,8 +163,10 @@ class Cells:
         """
         path = self.path(cell)
         path.parent.mkdir(parents=True, exist_ok=True)
-        found = (self._fit if isinstance(cell, Fit) else self._volume)(cell, path, label)
-        fit = cell if isinstance(cell, Fit) else cell.fit
+        if isinstance(cell, Fit):
+            fit, found = cell, self._fit(cell, path, label)
+        else:
+            fit, found = cell.fit, self._volume(cell, path, label)
         found |= dict(
             object=fit.object,
             views=fit.views,
@@ -182,11 +184,11 @@ class Cells:
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
             found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
         truth = averaged(scanned, self.scale.size)
-        views = (
-            replace(s, geometry=replace(s.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
-            for s in (found.train, found.test)
-        )
-        return Dataset(*views, truth.data)
+
+        def of_truth(views):
+            return replace(views, geometry=replace(views.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
+
+        return Dataset(of_truth(found.train), of_truth(found.test), truth.data)
 
     def _measured(self, fit: Fit) -> Dataset:
         return choose_views(self.dataset(fit.object), fit.views)

@@ -284,8 +284,7 @@ def test_tangent_of_line_integrals(name):
     rays = pose.rays()
     expected = sum(
         oracle.derivative(
-            lambda t: oracle.one_integral(*(getattr(cloud, k)[i] + t * by[k][i] for k in PARAMETERS), *rays, *ends),
-            1e-2,
+            lambda t: oracle.one_integral([getattr(cloud, k)[i] + t * by[k][i] for k in PARAMETERS], *rays, *ends), 1e-2
         )
         for i in range(n)
     )

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 
-import lingo_mi
 from lingo_mi.studies import provenance
 
 
@@ -33,8 +32,7 @@ def test_commit_of_the_package_and_of_no_other_project(tmp_path, monkeypatch):
         done = subprocess.run(['git', *identity, *words], cwd=tmp_path, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
-    (tmp_path / 'lingo_mi').mkdir()
-    monkeypatch.setattr(lingo_mi, '__file__', str(tmp_path / 'lingo_mi' / '__init__.py'))
+    monkeypatch.setattr(provenance, 'ROOT', tmp_path)
     assert provenance.commit() is None
     git('init', '-q')
     git('commit', '-q', '--allow-empty', '-m', 'first')

@@ -1,0 +1,23 @@
+"""How much work an image of a cloud is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.view import View
+
+
+def count_pairs(gaussians, view: View, extent: float) -> float:
+    """Pairs of a pixel and a Gaussian: pixels in the bounding boxes of all footprints, summed.
+
+    gaussians   centre, scale, rotation and density as Dr.Jit arrays
+    extent      cut-off in standard deviations
+    """
+    centre, scale, rotation, density = gaussians
+    f: Any = project(centre, scale, rotation, density, view, extent)
+    Float64: Any = dr.float64_array_t(mi.Float)
+    return float(dr.sum(Float64(mi.Float(f.row_end - f.row_begin) * f.width))[0])
