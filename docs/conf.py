@@ -19,6 +19,15 @@ try:
 except importlib.metadata.PackageNotFoundError:
     release = lingo_mi.__version__
 
+
+def offers_api() -> bool:
+    """Whether all public names of the package can be loaded."""
+    try:
+        return bool(getattr(lingo_mi, '__all__', ())) and all(hasattr(lingo_mi, name) for name in lingo_mi.__all__)
+    except ImportError:
+        return False
+
+
 extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
@@ -31,7 +40,7 @@ extensions = [
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
 # The page of the public API needs it; a list of modules stands in for it where `lingo_mi` does not offer it.
-exclude_patterns.append('api_modules.rst' if hasattr(lingo_mi, 'simulate') else 'api.rst')
+exclude_patterns.append('api_modules.rst' if offers_api() else 'api.rst')
 
 myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence', 'attrs_inline', 'attrs_block']
 myst_heading_anchors = 3
@@ -42,7 +51,6 @@ autodoc_preserve_defaults = True
 add_module_names = False
 python_maximum_signature_line_length = 100
 
-examples = sorted((DOCS.parent / 'examples').glob('[0-9][0-9]_*.py'))
 sphinx_gallery_conf = {
     'examples_dirs': '../examples',
     'gallery_dirs': 'gallery',
