@@ -31,7 +31,7 @@ def offers_api() -> bool:
 extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
-    'sphinx.ext.mathjax',
+    'mathml',
     'sphinx_gallery.gen_gallery',
     'plain_docstrings',
     'plugin_pages',
@@ -66,6 +66,7 @@ sphinx_gallery_conf = {
     'abort_on_example_error': True,
 }
 
+html_math_renderer = 'mathml'
 html_theme = 'furo'
 html_title = 'lingo_mi'
 html_static_path = ['_static']

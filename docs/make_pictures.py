@@ -154,7 +154,7 @@ def sagittal(volume):
 
 def save(figure, name: str):
     figure.tight_layout(h_pad=1.5)
-    figure.savefig(FIGURES / f'{name}.png', dpi=110)
+    figure.savefig(FIGURES / f'{name}.png', dpi=110, bbox_inches='tight', pad_inches=0.05)
     plt.close(figure)
 
 
