@@ -20,14 +20,6 @@ except importlib.metadata.PackageNotFoundError:
     release = lingo_mi.__version__
 
 
-def offers_api() -> bool:
-    """Whether all public names of the package can be loaded."""
-    try:
-        return bool(getattr(lingo_mi, '__all__', ())) and all(hasattr(lingo_mi, name) for name in lingo_mi.__all__)
-    except ImportError:
-        return False
-
-
 extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
@@ -39,8 +31,6 @@ extensions = [
     'recipes',
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
-# The page of the public API needs it; a list of modules stands in for it where `lingo_mi` does not offer it.
-exclude_patterns.append('api_modules.rst' if offers_api() else 'api.rst')
 
 myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence', 'attrs_inline', 'attrs_block']
 myst_heading_anchors = 3

@@ -1,11 +1,9 @@
 """`.. recipes::` is a table of all settings of a fit and their values in every recipe."""
 
-from dataclasses import fields
-
 from docutils import nodes
 from docutils.parsers.rst import Directive
 
-from lingo_mi.fit.settings import METHODS
+from lingo_mi.fit.recipes import METHODS
 
 
 class Recipes(Directive):
@@ -19,10 +17,11 @@ class Recipes(Directive):
         head = nodes.thead()
         head += _row([nodes.Text('setting'), *(nodes.literal('', name) for name in names)])
         body = nodes.tbody()
-        for field in fields(METHODS['r2']):
-            values = [_shown(getattr(METHODS[name], field.name)) for name in names]
+        settings = {name: METHODS[name].flat() for name in names}
+        for name in settings['r2']:
+            values = [_shown(of[name]) for of in settings.values()]
             cells = [nodes.Text(v) if v == values[0] else nodes.strong('', v) for v in values]
-            body += _row([nodes.literal('', field.name), *cells])
+            body += _row([nodes.literal('', name), *cells])
         group += [head, body]
         table += group
         return [table]
