@@ -19,10 +19,11 @@ try:
 except importlib.metadata.PackageNotFoundError:
     release = lingo_mi.__version__
 
+
 extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
-    'sphinx.ext.mathjax',
+    'mathml',
     'sphinx_gallery.gen_gallery',
     'plain_docstrings',
     'plugin_pages',
@@ -30,8 +31,6 @@ extensions = [
     'recipes',
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
-# The page of the public API needs it; a list of modules stands in for it where `lingo_mi` does not offer it.
-exclude_patterns.append('api_modules.rst' if hasattr(lingo_mi, 'simulate') else 'api.rst')
 
 myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence', 'attrs_inline', 'attrs_block']
 myst_heading_anchors = 3
@@ -42,7 +41,6 @@ autodoc_preserve_defaults = True
 add_module_names = False
 python_maximum_signature_line_length = 100
 
-examples = sorted((DOCS.parent / 'examples').glob('[0-9][0-9]_*.py'))
 sphinx_gallery_conf = {
     'examples_dirs': '../examples',
     'gallery_dirs': 'gallery',
@@ -58,6 +56,7 @@ sphinx_gallery_conf = {
     'abort_on_example_error': True,
 }
 
+html_math_renderer = 'mathml'
 html_theme = 'furo'
 html_title = 'lingo_mi'
 html_static_path = ['_static']

@@ -135,7 +135,7 @@ def closed_form():
 
 def save(figure, name: str):
     figure.tight_layout()
-    figure.savefig(FIGURES / f'{name}.svg', metadata=dict(Date=None))
+    figure.savefig(FIGURES / f'{name}.svg', metadata=dict(Date=None), bbox_inches='tight', pad_inches=0.1)
     plt.close(figure)
 
 

@@ -4,7 +4,7 @@ What is plain in them, and what it becomes:
 
     name   what it is             a list of names and meanings, where two or more spaces or a line's end follow a name;
            and goes on            further lines are indented
-        code = example()          a block of Python, where a paragraph is indented and is no list of names
+        code = example()          a block of code, where a paragraph is indented and is no list of names, or is Python
     |A x - b|, rate_*             characters of reStructuredText, which lose their meaning outside of `backticks`
 
 A docstring that holds directives or roles is reStructuredText already and stays as it is.
@@ -16,7 +16,7 @@ import re
 
 _NAME = r'`?[A-Za-z_|][\w.|/=\'-]*`?'
 ENTRY = re.compile(rf'^({_NAME}(?:, {_NAME})*)(?:(?:\s{{2,}}|\s+:\s+)(\S.*))?$')
-RST = re.compile(r'^\s*\.\. |:\w+:`|^:param|^:return|^>>>', re.MULTILINE)
+RST = re.compile(r'^\s*\.\. |:\w+:`|^:param|^:return', re.MULTILINE)
 QUOTED = re.compile(r'(``.+?``|`[^`\n]+`)')
 
 
@@ -32,20 +32,34 @@ def to_rst(text: str) -> str:
 def _block(lines: list[str]) -> str:
     """A paragraph, a list of names, or code."""
     indent = min(len(line) - len(line.lstrip()) for line in lines)
-    bare = [line[indent:] for line in lines]
+    bare = _widened([line[indent:] for line in lines])
     starts = [i for i, line in enumerate(bare) if _starts_entry(line, bare[i + 1 : i + 2])]
     if starts and all(i in starts or bare[i].startswith('  ') for i in range(starts[0], len(bare))):
         before = [escaped(' '.join(line.strip() for line in bare[: starts[0]])), ''] if starts[0] else []
         entries = [bare[i:j] for i, j in zip(starts, [*starts[1:], len(bare)])]
         return '\n'.join(before + [_entry(entry) for entry in entries])
-    if indent:
-        language = 'python' if _is_python('\n'.join(bare)) else 'text'
+    language = _language(bare)
+    if indent or language != 'text':
         return f'.. code-block:: {language}\n\n' + '\n'.join(f'    {line}' for line in bare)
     if all(line.startswith('- ') or line.startswith('  ') for line in bare):
         return '\n'.join(escaped(line) for line in bare)
     head = next((i for i, line in enumerate(bare) if i and line.startswith('    ')), len(bare))
     text = escaped('\n'.join(line.strip() for line in bare[:head]))
     return text if head == len(bare) else f'{text}\n\n{_block(bare[head:])}'
+
+
+def _widened(lines: list[str]) -> list[str]:
+    """Two spaces behind a name that fills its column, too."""
+    columns = {match.start(2) for line in lines if (match := ENTRY.match(line)) and match[2]}
+    if len(columns) != 1:
+        return lines
+    column = columns.pop()
+    return [
+        f'{line[:column]} {line[column:]}'
+        if re.fullmatch(f'{_NAME} ', line[:column]) and line[column:].strip()
+        else line
+        for line in lines
+    ]
 
 
 def _starts_entry(line: str, following: list[str]) -> bool:
@@ -62,12 +76,19 @@ def _entry(lines: list[str]) -> str:
     return f'{title}\n    {meaning}\n'
 
 
-def _is_python(text: str) -> bool:
+def _language(lines: list[str]) -> str:
+    """What lines of code are in: 'pycon', 'python', or 'text', which may be words."""
+    if lines[0].startswith('>>> '):
+        return 'pycon'
     try:
-        ast.parse(text)
+        body = ast.parse('\n'.join(lines)).body
     except SyntaxError:
-        return False
-    return True
+        return 'text'
+    code = (ast.Assign, ast.Import, ast.ImportFrom, ast.For, ast.With)
+    calls = (ast.Call, ast.Subscript)
+    return (
+        'python' if any(isinstance(x, code) or isinstance(getattr(x, 'value', None), calls) for x in body) else 'text'
+    )
 
 
 def escaped(text: str) -> str:

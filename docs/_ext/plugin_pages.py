@@ -70,7 +70,7 @@ def monospace(name, rawtext, text, lineno, inliner, options=None, content=()):
 
 def substitutions(app, document_name, source):
     """`|float|` and the like in reStructuredText pages."""
-    if app.env.doc2path(document_name).endswith('.rst'):
+    if Path(app.env.doc2path(document_name)).suffix == '.rst':
         source[0] += '\n\n' + '\n'.join(f'.. |{name}| replace:: :monosp:`{name}`' for name in TYPES) + '\n'
 
 

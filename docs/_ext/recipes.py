@@ -38,7 +38,7 @@ def _shown(value) -> str:
     """A value as it is given on the command line."""
     if isinstance(value, tuple):
         return ', '.join(map(_shown, value))
-    if isinstance(value, bool) or isinstance(value, str):
+    if isinstance(value, (bool, str)):
         return str(value).lower()
     return f'{value:,}' if isinstance(value, int) else f'{value:g}'
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.view import View
 from lingo_mi.studies.closed_form import image_and_gradients
 from lingo_mi.studies.pairs import count_pairs
