@@ -13,7 +13,8 @@ from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases import on_device, scanner
+from lingo_mi.studies.hard_cases.clouds import scanner
+from lingo_mi.studies.hard_cases.measuring import on_device
 from lingo_mi.studies.oracle import Pose, random_cloud, relative
 
 # 2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors. A lane whose team is done
