@@ -1,1 +1,1 @@
-"""Fitting a cloud of Gaussians: settings, loss, Adam, densification, checkpoints, the loop."""
+"""Fitting a cloud of Gaussians: settings and recipes, forward models, loss, Adam, densification, checkpoints, the loop."""

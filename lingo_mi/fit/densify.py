@@ -97,8 +97,8 @@ def prune(state: State, settings: Settings, half, largest: float = np.inf) -> St
     """Remove Gaussians whose density or opacity is below the bound, and those that the forward model does not let stay: whose
     centre left the volume, or a standard deviation of which is above `largest`. Clear the statistic."""
     centre, scale, _, amount = activate(state, settings)
-    inside = forward_model(settings).inside(centre, scale, half, largest)
-    keep = (amount >= settings.densification.prune_density) & inside
+    stays = forward_model(settings).may_stay(centre, scale, half, largest)
+    keep = (amount >= settings.densification.prune_density) & stays
     kept = _take(state, keep)
     kept.gradient[:], kept.visits[:] = 0, 0
     return kept

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import drjit as dr
@@ -12,6 +13,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.fit import checkpoint
 from lingo_mi.fit.average import Average
 from lingo_mi.fit.bounded import bounded
+from lingo_mi.fit.cloud_model import CloudModel
 from lingo_mi.fit.densify import densify, reset_opacity
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.fitted import Fitted
@@ -29,8 +31,8 @@ def run(
     settings: Settings,
     initial: InitialCloud | None,
     seed: int = 0,
-    measure=None,
-    progress=None,
+    measure: Callable[[CloudModel, DeviceState], dict] | None = None,
+    progress: Callable[..., None] | None = None,
     path: Path | None = None,
 ) -> Fitted:
     """Fit a cloud to a scan.
@@ -39,14 +41,17 @@ def run(
     initial    where to start; None: go on from `path`, by the same steps as without the interruption. More iterations than
                the checkpoint was made with are right where `decay_steps` sets the rates and `coarse_share` is 0
     seed       of the views' order, the total variation's cubes and splits
-    measure    called as measure(model, state), a `CloudModel` and a `DeviceState`, at a few iterations; returns numbers for
-               the history
+    measure    called as measure(model, state) at a few iterations; returns numbers for the history
     progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where
                everything is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
+
+    Example: `run(scan, FAST, initial_cloud(scan, FAST)).volume()`.
     """
+    if initial is None and path is None:
+        raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)

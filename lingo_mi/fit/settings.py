@@ -114,7 +114,7 @@ class AdamSettings:
     """Adam's step sizes, first and last, which fall log-linearly, and its moments. Lengths are in the normalised frame.
 
     rate_centre, rate_density, rate_scale, rate_rotation
-                       (R2: the defaults); of `alpha` `rate_centre` is in units of the scene's radius (`alpha.scene_radius`)
+                       (R2: the defaults); of `alpha` `rate_centre` is in units of the scene's radius (see `models.alpha`)
     rate_opacity, rate_radiance, rate_harmonics
                        of `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025, and a twentieth of that, none of which fall)
     rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;

@@ -130,26 +130,8 @@ def differentiate_replayed(gaussians, target: Target, settings: Settings, batch:
     return found
 
 
-def _differentiated(
-    centre,
-    scale,
-    rotation,
-    density,
-    source,
-    corner,
-    u,
-    v,
-    pixels,
-    weights,
-    valid,
-    height,
-    width,
-    parallel,
-    panel,
-    settings,
-    batch,
-):
-    gaussians = centre, scale, rotation, density
+def _differentiated(*arrays, height, width, parallel, panel, settings, batch):
+    *gaussians, source, corner, u, v, pixels, weights, valid = arrays
     dr.enable_grad(gaussians)
     target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)
     return *differentiate(gaussians, target, settings, batch), [dr.grad(x) for x in gaussians]

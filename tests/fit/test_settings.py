@@ -72,3 +72,21 @@ def test_settings_of():
     for method in ('R2', 'r2:V=1', 'r2:V_S', ':V_S=1', ''):
         with pytest.raises(InputError):
             settings_of(method)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_flat_names(method):
+    """Every value has one, no two share one, and they are all that a set of settings is."""
+    settings = METHODS[method]
+    flat = settings.flat()
+    parts = [settings.start, settings.model, settings.loss, settings.adam, settings.densification, settings.bounds]
+    assert len(flat) == 5 + sum(len(vars(part)) for part in parts)
+    assert Settings().changed(**flat) == settings
+    assert flat['lambda_tv'] == settings.loss.lambda_tv and flat['scale_min'] == settings.bounds.scale_min
+
+
+def test_changed_keeps_the_rest():
+    before = METHODS['fast']
+    after = before.changed(lambda_tv=0.1, iterations=800)
+    assert after.flat() == before.flat() | dict(lambda_tv=0.1, iterations=800)
+    assert after.adam is before.adam and before.loss.lambda_tv == 0.15

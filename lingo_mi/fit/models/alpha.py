@@ -48,7 +48,7 @@ class AlphaCompositing(ForwardModel):
         """As they are: opacities are not shared."""
         return values
 
-    def inside(self, centre, scale, half, largest):
+    def may_stay(self, centre, scale, half, largest):
         """Those that are not too large, in the volume or not (3DGS)."""
         return scale.max(1) <= largest
 

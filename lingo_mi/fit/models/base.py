@@ -10,6 +10,9 @@ import numpy as np
 
 from lingo_mi.fit.settings import Settings
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.alpha import Discs
+from lingo_mi.projectors.footprint import Footprints
+from lingo_mi.projectors.view import View
 
 SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of every Gaussian's shape, whatever is rendered
 
@@ -53,7 +56,7 @@ class ForwardModel(ABC):
         """
 
     @abstractmethod
-    def inside(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
+    def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
         """Which Gaussians may stay, bool [N].
 
         centre, scale   [N, 3]
@@ -73,11 +76,11 @@ class ForwardModel(ABC):
         `footprints` takes; differentiable."""
 
     @abstractmethod
-    def footprints(self, gaussians: tuple, rays):
-        """A cloud on a view's panel, an object whose last two `values` are x and y in pixels; differentiable."""
+    def footprints(self, gaussians: tuple, rays: View) -> Footprints | Discs:
+        """A cloud on a view's panel, the last two of whose `values` are x and y in pixels; differentiable."""
 
     @abstractmethod
-    def integrals(self, footprints, rays, share=None) -> list:
+    def integrals(self, footprints, rays: View, share=None) -> list:
         """Line integrals along the rays of a view, a list of Float [height * width]; differentiable.
 
         share   of the second of two materials in every Gaussian, Float [N], which makes the list of two; None: one material

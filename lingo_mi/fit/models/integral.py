@@ -36,7 +36,7 @@ class LineIntegrals(ForwardModel):
         raw[chosen] = inverse_softplus(softplus(raw[chosen]) * factor)
         return values | {'density': raw.astype(np.float32)}
 
-    def inside(self, centre, scale, half, largest):
+    def may_stay(self, centre, scale, half, largest):
         """Those whose centre is in the volume."""
         return (np.abs(centre) <= np.asarray(half)).all(1)
 
