@@ -1,10 +1,12 @@
 """The emitter `xray_tube`: the photons of a scan, by energy, the focal spot that they come from, and how they scatter."""
 
+from dataclasses import fields
+
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.effects.focal_spot import FocalSpot
-from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.errors import InputError
 
@@ -80,16 +82,18 @@ class XRayTube(mi.Emitter):
        - |int|
        - Of its random numbers. (Default: 0)
 
-    It is read by `lingo_xray`, which then gives -ln of the detected signal, and by `scanning.take_scan`. To Mitsuba's own
-    integrators it is dark.
+    It is read by `lingo_xray`, which then gives -ln of the detected signal, and by `lingo_mi.scene.simulate`. To Mitsuba's
+    own integrators it is dark.
     """
 
     def __init__(self, props):
         try:
             spot = FocalSpot.of(props.get('focal_spot', '0'), props.get('focal_order', 3))
-            materials = {k.removeprefix('material_'): props[k] for k in props.keys() if k.startswith('material_')}
+            names = props.keys()
+            materials = {k.removeprefix('material_'): props[k] for k in names if k.startswith('material_')}
             scatter = Scatter.of(*(props.get(k, d) for k, d in _SCATTER.items()))
-            tube = Tube.of(*(props.get(k, d) for k, d in _DEFAULTS.items()), materials)
+            given = {f.name: props.get(f.name, f.default) for f in fields(TubeParameters) if f.name != 'materials'}
+            tube = Tube.of(TubeParameters(**given, materials=materials))
         except InputError as error:
             raise InputError(f'xray_tube {props.id()!r}: {error}') from None
         super().__init__(props)
@@ -117,7 +121,6 @@ class XRayTube(mi.Emitter):
 
 create = XRayTube
 
-_DEFAULTS = dict(energy=None, kvp=None, angle=12.0, filtration='Al 2.5', reference=None, material='', split='', bands=4)
 _SCATTER = dict(
     scatter=0,
     scatter_grid='16',

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import convolve
@@ -36,7 +37,7 @@ _MAPS = 2**63  # added to a seed: the maps of gains and dead pixels share no num
 class Detector:
     """See the film `ct_detector`, whose parameters these are."""
 
-    DEFAULTS = dict(
+    DEFAULTS: ClassVar = dict(
         photons=0.0,
         electronic_noise=0.0,
         response='energy',

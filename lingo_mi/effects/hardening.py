@@ -8,7 +8,7 @@ objects; `bands` turns them into what a detector measures.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
@@ -19,6 +19,29 @@ from lingo_mi.errors import InputError
 
 REFERENCE = 60.0  # keV; water attenuates .0206 per mm
 LARGEST = 10.0  # sum of line integrals up to which bands are fitted: behind it, 5e-5 of the photons are left
+
+
+@dataclass(frozen=True)
+class TubeParameters:
+    """The parameters of `xray_tube` that concern its spectrum, as a scene gives them; its documentation says what they are.
+
+    materials   those of single shapes, by name: the parameters material_NAME
+    """
+
+    energy: float | None = None
+    kvp: float | None = None
+    angle: float = 12.0
+    filtration: str = 'Al 2.5'
+    reference: float | None = None
+    material: str = ''
+    split: str = ''
+    bands: int = 4
+    materials: dict[str, str] = field(default_factory=dict)
+
+    def given(self) -> dict:
+        """The parameters by the names that a scene has for them."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'materials'}
+        return own | {f'material_{name}': text for name, text in self.materials.items()}
 
 
 @dataclass(frozen=True)
@@ -42,33 +65,30 @@ class Tube:
     given: dict = field(default_factory=dict, compare=False)
 
     @staticmethod
-    def of(energy, kvp, angle, filtration, reference, material, split, bands, materials) -> Tube:
-        """From the parameters of `xray_tube`. Raises InputError."""
-        for name, value in dict(energy=energy, kvp=kvp, angle=angle, reference=reference).items():
+    def of(p: TubeParameters) -> Tube:
+        """Checked parameters. Raises InputError."""
+        energy, kvp, reference, bands = p.energy, p.kvp, p.reference, p.bands
+        for name, value in dict(energy=energy, kvp=kvp, angle=p.angle, reference=reference).items():
             if not (value is None or isinstance(value, (int, float)) and not isinstance(value, bool)):
                 raise InputError(f'{name} must be a number, not {value!r}')
         if (energy is None) == (kvp is None):
             raise InputError('a tube needs either an energy or a kvp')
-        spectrum = monochromatic(energy) if kvp is None else tube_spectrum(kvp, angle, filtration)
+        spectrum = monochromatic(energy) if kvp is None else tube_spectrum(kvp, p.angle, p.filtration)
         if reference is None:
             reference = REFERENCE if energy is None else energy
         if not 1 <= reference <= 1000:
             raise InputError(f'reference must be from 1 to 1000 keV, not {reference:g}')
         if isinstance(bands, bool) or not isinstance(bands, int) or not 1 <= bands <= energy_bands.MOST_BANDS:
             raise InputError(f'bands must be a whole number from 1 to {energy_bands.MOST_BANDS}, not {bands!r}')
-        named = {name: _names(text) for name, text in materials.items()}
-        given = dict(
-            energy=energy,
-            kvp=kvp,
-            angle=angle,
-            filtration=filtration,
-            reference=reference,
-            material=material,
-            split=split,
-            bands=bands,
-        ) | {f'material_{name}': text for name, text in materials.items()}
+        named = {name: _names(text) for name, text in p.materials.items()}
         tube = Tube(
-            spectrum, float(reference), _names(material) if material else (), named, _split(split), bands, given
+            spectrum=spectrum,
+            reference=float(reference),
+            material=_names(p.material) if p.material else (),
+            materials=named,
+            split=_split(p.split),
+            bands=bands,
+            given=p.given(),
         )
         for names in (tube.material, *named.values()):
             for name in names:

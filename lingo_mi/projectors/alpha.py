@@ -40,8 +40,8 @@ NAMES = ('opacity', 'radiance', 'mx', 'my', 'shear', 'x', 'y')
 class Discs:
     """N projected Gaussians in one view.
 
-    values    Float [N] each, named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; x, y place the centre in pixels from
-              the image's corner
+    values    Float [N] each, named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; x, y place the centre, in
+              pixels from the image's corner
     depth     Float [N] along the panel's normal; infinite for what cannot be drawn: behind the source, or reaching it
     first, count   UInt32 [N] each for columns and rows: the box of tiles that a Gaussian touches
     """
@@ -123,13 +123,7 @@ class _Composite(dr.CustomOp):
             return self.image
         image = dr.zeros(mi.Float, height * width)
         dr.make_opaque(image)
-        place = _Place(self.lists, *self.size)
-        dr.eval(
-            _forward(
-                place.begin, place.end, place.x, place.y, self.lists.disc, self.packed, place.inside, place.pixel, image
-            ),
-            image,
-        )
+        dr.eval(_forward(_Place(self.lists, *self.size), self.lists.disc, self.packed, image), image)
         self.image = image
         return image
 
@@ -139,31 +133,14 @@ class _Composite(dr.CustomOp):
             self.set_grad_in('values', tuple(dr.zeros(mi.Float, n) for _ in NAMES))
             return
         lists = self.lists
-        place = _Place(lists, *self.size)
         upstream = self.grad_out() + dr.zeros(mi.Float, dr.width(self.image))
         slots = [dr.zeros(mi.Float, lists.length) for _ in NAMES]
         dr.make_opaque(upstream, slots)
-        dr.eval(
-            _backward(
-                place.begin,
-                place.end,
-                place.x,
-                place.y,
-                lists.disc,
-                lists.entry,
-                self.packed,
-                place.inside,
-                place.pixel,
-                self.image,
-                upstream,
-                slots,
-            ),
-            slots,
-        )
+        dr.eval(_backward(_Place(lists, *self.size), lists, self.packed, self.image, upstream, slots), slots)
         end = dr.gather(mi.UInt32, lists.ends, lists.rank)
         begin = dr.select(lists.rank > 0, dr.gather(mi.UInt32, lists.ends, lists.rank - 1, lists.rank > 0), 0)
         moments = _add_up(begin, end, slots)
-        self.set_grad_in('values', _chain(self.values, *moments))
+        self.set_grad_in('values', _by_values(self.values, moments))
 
     def name(self):
         return 'alpha compositing'
@@ -259,7 +236,8 @@ def _alpha(a, b, x, y):
 
 
 @dr.syntax
-def _forward(begin, end, x, y, disc, packed, inside, pixel, image):
+def _forward(place, disc, packed, image):
+    begin, end, x, y, inside, pixel = place.begin, place.end, place.x, place.y, place.inside, place.pixel
     colour, through, i = mi.Vector4f(0), mi.Vector4f(1), mi.UInt32(begin)
     while (i < end) & (dr.max(through) > 0):
         g = dr.gather(mi.UInt32, disc, i)
@@ -280,7 +258,9 @@ def _blend(colour, through, alpha, radiance):
 
 
 @dr.syntax
-def _backward(begin, end, x, y, disc, entry, packed, inside, pixel, image, upstream, slots):
+def _backward(place, lists, packed, image, upstream, slots):
+    begin, end, x, y, inside, pixel = place.begin, place.end, place.x, place.y, place.inside, place.pixel
+    disc, entry = lists.disc, lists.entry
     colour, through, i = mi.Vector4f(0), mi.Vector4f(1), mi.UInt32(begin)
     total = mi.Vector4f(*(dr.gather(mi.Float, image, pixel[k], inside[k]) for k in range(PACKET)))
     grad = mi.Vector4f(*(dr.gather(mi.Float, upstream, pixel[k], inside[k]) for k in range(PACKET)))
@@ -313,8 +293,9 @@ def _add_up(begin, end, slots):
     return sums
 
 
-def _chain(values, light, u, ut, utt, uy, uty, uyy):
-    """Derivatives by the seven numbers from the moments of alpha dL/dalpha in t and dy."""
+def _by_values(values, moments):
+    """Derivatives by the seven numbers from that by the radiance, and the moments of alpha dL/dalpha in t and dy."""
+    light, u, ut, utt, uy, uty, uyy = moments
     opacity, _, mx, my, shear, _, _ = values
     along = dr.square(mx) * ut
     return (

@@ -37,8 +37,8 @@ class ExactPair(Stack):
             walk, length = self._walk(view)
             length *= self._of(self._valid, view)
             target = dr.arange(mi.UInt, self.pixels) + dr.opaque(mi.UInt, block * self.pixels)
-            path = dr.maximum(walk[-1] - walk[-2], 0)
-            for image, value in zip(out, (gather(volume, self.size, *walk), path)):
+            path = dr.maximum(walk.t_last - walk.t_first, 0)
+            for image, value in zip(out, (gather(volume, self.size, walk), path)):
                 dr.scatter(image, length * value, target, mode=dr.ReduceMode.Permute)
             dr.eval(out)
         return tuple(out)
@@ -54,7 +54,7 @@ class ExactPair(Stack):
             walk, length = self._walk(view)
             length *= self._of(self._valid, view)
             for target, value in zip(sums, (self._of(images, block), 1)):
-                scatter(target, length * value, self.size, *walk)
+                scatter(target, length * value, self.size, walk)
                 dr.eval(target)
         return sums[0] if rule is None else rule(dr.arange(mi.UInt, self.voxels), *sums)
 

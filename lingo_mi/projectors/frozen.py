@@ -40,7 +40,7 @@ class Replay:
             with _uncollected():
                 return recording(*(None if x is None else dr.detach(x) for x in arrays))
         except RuntimeError as error:  # Dr.Jit's, around what was raised in a recording
-            raise error.__cause__ or error
+            raise (error.__cause__ or error) from None
 
 
 @contextmanager

@@ -14,6 +14,8 @@ between the two.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -27,6 +29,36 @@ GAUSS = 0.5 / 3**0.5  # abscissae of the two-point rule on [-1/2, 1/2]
 # ------------------------------------------------------------------------------------------------------------
 #  Rays in grid coordinates: voxel centre i lies at i, the box is [-1/2, n - 1/2]
 # ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Lines:
+    """Lines origin + t direction, t in [t_min, t_max].
+
+    origin, direction   Point3f, Vector3f; the direction need not be a unit vector, but must not be zero
+    t_min, t_max        numbers or Float, in units of the direction
+    """
+
+    origin: object
+    direction: object
+    t_min: object = -dr.inf
+    t_max: object = dr.inf
+
+
+@dataclass
+class Walk:
+    """The walks of rays through a grid, in its coordinates.
+
+    origin          Vector3f
+    d, inv          Vector3f, the direction, none of whose components is zero, and 1 / d
+    t_first, t_last   Float, ends of the walk
+    """
+
+    origin: object
+    d: object
+    inv: object
+    t_first: object
+    t_last: object
 
 
 def _clip(origin, direction, low, high, t_min, t_max):
@@ -56,9 +88,10 @@ def _corners(cell, size):
 
 
 @dr.syntax
-def gather(data, size, origin, d, inv, t_first, t_last):
+def gather(data, size, walk: Walk):
     """Sum over the segments of a ray, in units of t."""
-    t = mi.Float(t_first)
+    origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
+    t = mi.Float(walk.t_first)
     total = mi.Float(0)
     plane, step, below = _first_planes(origin, d, t)
     shift = -origin * inv
@@ -116,17 +149,18 @@ def _leave_cell(target, weight, plane, step, size, on_x, on_y):
 
 
 @dr.syntax
-def scatter(target, value, size, origin, d, inv, t_first, t_last):
+def scatter(target, value, size, walk: Walk):
     """The transpose of `gather`: adds `value` times the weight of every corner to `target`.
 
     The weights of the current cell stay in registers: a step through a face writes the four corners it leaves
     behind and hands the other four to the next cell, which halves the memory traffic.
     """
-    t = mi.Float(t_first)
+    origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
+    t = mi.Float(walk.t_first)
     weight = [mi.Float(0) for _ in range(8)]
     plane, step, below = _first_planes(origin, d, t)
     shift = -origin * inv
-    running = t_first < t_last
+    running = walk.t_first < t_last
     while running:
         running = t < t_last
         nearest = dr.fma(mi.Vector3f(plane), inv, shift)
@@ -149,30 +183,30 @@ def scatter(target, value, size, origin, d, inv, t_first, t_last):
 class _LineIntegrals(dr.CustomOp):
     """Linear in `data`, constant in the rest: both derivatives run the walk again and store nothing."""
 
-    def eval(self, data, size, *walk):
+    def eval(self, data, size, walk):
         self.size, self.walk, self.width = size, walk, dr.width(data)
-        return gather(data, size, *walk)
+        return gather(data, size, walk)
 
     def forward(self):
-        self.set_grad_out(gather(self.grad_in('data'), self.size, *self.walk))
+        self.set_grad_out(gather(self.grad_in('data'), self.size, self.walk))
 
     def backward(self):
         target = dr.zeros(mi.Float, self.width)
-        scatter(target, self.grad_out(), self.size, *self.walk)
+        scatter(target, self.grad_out(), self.size, self.walk)
         self.set_grad_in('data', target)
 
     def name(self):
         return 'line_integrals'
 
 
-def _walk(size, box_min, box_max, origin, direction, t_min, t_max, low, high):
-    """The arguments of a walk through the grid, and the length of a unit of t."""
-    box_min = mi.Point3f(box_min)
+def _walk(size, box_min, box_max, lines: Lines, low, high):
+    """The `Walk` along lines through the part of a grid from `low` to `high`, and the length of a unit of t."""
+    origin, direction, box_min = lines.origin, lines.direction, mi.Point3f(box_min)
     to_grid = mi.Vector3f(*size) / (mi.Point3f(box_max) - box_min)
     origin = mi.Vector3f(mi.Point3f(origin) - box_min) * to_grid - 0.5
     length = dr.norm(mi.Vector3f(direction))
-    d, inv, first, last = _clip(origin, mi.Vector3f(direction) * to_grid, low, high, t_min, t_max)
-    return (origin, d, inv, first, last), length
+    d, inv, first, last = _clip(origin, mi.Vector3f(direction) * to_grid, low, high, lines.t_min, lines.t_max)
+    return Walk(origin, d, inv, first, last), length
 
 
 def whole_box(size):
@@ -180,16 +214,15 @@ def whole_box(size):
     return mi.Vector3f(-0.5), mi.Vector3f(*size) - 0.5
 
 
-def line_integrals(data, size, box_min, box_max, origin, direction, t_min=-dr.inf, t_max=dr.inf):
-    """Line integrals of a voxel volume along rays origin + t direction, t in [t_min, t_max].
+def line_integrals(data, size, box_min, box_max, lines: Lines):
+    """Line integrals of a voxel volume.
 
     data               mi.Float [nx * ny * nz], z fastest: densities at the voxel centres
     size               (nx, ny, nz), Python integers
     box_min, box_max   opposite corners of the volume (sequences or mi.Point3f)
-    origin, direction  mi.Point3f, mi.Vector3f; the direction need not be a unit vector, but must not be zero
-    t_min, t_max       ends of the rays, in units of the direction (numbers or mi.Float)
+    lines              along which, in the volume's unit
 
-    Returns mi.Float [rays], density times length: exact for the trilinear interpolant, zero for a ray that
+    Returns mi.Float [lines], density times length: exact for the trilinear interpolant, zero for a ray that
     misses. Differentiable with respect to `data` in both modes (the derivative is the same operator or its
     transpose), not with respect to the rays. An origin near the box keeps all digits of float32; `view_rays`
     chooses it so.
@@ -199,8 +232,8 @@ def line_integrals(data, size, box_min, box_max, origin, direction, t_min=-dr.in
     size = tuple(int(n) for n in size)
     if dr.width(data) != size[0] * size[1] * size[2]:
         raise InputError(f'the volume holds {dr.width(data)} values, but its shape says {size}')
-    walk, length = _walk(size, box_min, box_max, origin, direction, t_min, t_max, *whole_box(size))
-    return length * dr.custom(_LineIntegrals, data, size, *dr.detach(walk))
+    walk, length = _walk(size, box_min, box_max, lines, *whole_box(size))
+    return length * dr.custom(_LineIntegrals, data, size, dr.detach(walk))
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -258,13 +291,12 @@ def _occupied(volume):
 
 
 def view_walk(geometry, row, low, high):
-    """The arguments of `gather` and `scatter` for the rays of a view between `low` and `high`, and the length of a unit of t.
+    """The `Walk` along the rays of a view between `low` and `high`, and the length of a unit of t.
 
     row is one row of `view_table` as an evaluated mi.Float [19].
     """
     half = mi.Vector3f(*(s / 2 for s in geometry.sVoxel))
-    origin, direction, t_min = view_rays(row, *geometry.nDetector)
-    return _walk(geometry.nVoxel, -half, half, origin, direction, t_min, dr.inf, low, high)
+    return _walk(geometry.nVoxel, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
 
 
 def project(volume, geometry: Geometry, progress=None) -> np.ndarray:
@@ -293,7 +325,7 @@ def project(volume, geometry: Geometry, progress=None) -> np.ndarray:
     data = mi.Float(volume.ravel())
     for i, row in enumerate(view_table(geometry)):
         walk, length = view_walk(geometry, mi.Float(row), low, high)
-        out[i] = (length * gather(data, geometry.nVoxel, *walk)).numpy().reshape(geometry.nDetector[::-1]).T
+        out[i] = (length * gather(data, geometry.nVoxel, walk)).numpy().reshape(geometry.nDetector[::-1]).T
         if progress:
             progress(i + 1, len(geometry))
     return out
@@ -320,7 +352,7 @@ def backproject(projections, geometry: Geometry, progress=None) -> np.ndarray:
         index = dr.arange(mi.UInt, n_v * n_u)
         image = dr.gather(mi.Float, mi.Float(projections[i].ravel()), index % n_v * n_u + index // n_v)
         walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))
-        scatter(target, length * image, geometry.nVoxel, *walk)
+        scatter(target, length * image, geometry.nVoxel, walk)
         dr.eval(target)
         if progress:
             progress(i + 1, len(geometry))

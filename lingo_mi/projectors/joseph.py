@@ -17,6 +17,8 @@ fastest.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -141,25 +143,34 @@ class Joseph(Stack):
                  sums. It is traced into the kernel, so it saves volumes in memory
         """
         chosen, n_views = _numbers(views), dr.opaque(mi.UInt, len(views))
-        weighted = _weighted(images, chosen, self.panel, self._columns, self._rows, self._margin, rule is not None)
+        ones = rule is not None
+        tables = _Tables(self.size, self.panel, self._columns, self._rows, self._matrix, self._margin)
+        weighted = _weighted(images, chosen, tables, ones)
         dr.eval(weighted)
-        voxels, sums = _collect(
-            weighted,
-            chosen,
-            n_views,
-            self.size,
-            self.panel,
-            self._columns,
-            self._rows,
-            self._matrix,
-            self._margin,
-            rule is not None,
-        )
+        voxels, sums = _collect(weighted, chosen, n_views, tables, ones)
         out = dr.empty(mi.Float, self.voxels)
         for voxel, inside, value in zip(*voxels, sums):
             value = value[0] if rule is None else rule(dr.select(inside, voxel, 0), *value)
             dr.scatter(out, value, voxel, inside, mode=dr.ReduceMode.Permute)
         return out
+
+
+@dataclass
+class _Tables:
+    """What kernels know of a scan.
+
+    size, panel      voxels along x, y and z; rows and columns
+    columns, rows    Float, see `column_table`; (source, top, step) of the heights
+    matrices         Float, see `_column_matrix`
+    margin           rows of zeros above and below images, at least as many as have hats that cover a voxel
+    """
+
+    size: tuple
+    panel: tuple
+    columns: object
+    rows: tuple
+    matrices: object
+    margin: int
 
 
 def _numbers(views):
@@ -218,12 +229,12 @@ def _integrate(data, size, columns, rows, column, row):
     return path * total, path * count
 
 
-def _weighted(images, chosen, panel, columns, rows, margin, ones):
+def _weighted(images, chosen, tables: _Tables, ones):
     """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
 
     With `ones`, mi.Vector2f interleaved: an image of ones, treated alike, stands beside each value.
     """
-    n_v, n_u = panel
+    (n_v, n_u), columns, rows, margin = tables.panel, tables.columns, tables.rows, tables.margin
     pitch = n_v + 2 * margin
     index = dr.arange(mi.UInt, dr.width(images) // n_v * pitch)
     column = index // pitch
@@ -239,17 +250,18 @@ def _weighted(images, chosen, panel, columns, rows, margin, ones):
 
 
 @dr.syntax
-def _collect(weighted, chosen, n_views, size, panel, columns, rows, matrices, margin, ones):
+def _collect(weighted, chosen, n_views, tables: _Tables, ones):
     """A^T y of voxels: RUN of a line along z a lane, as far apart as they can be, so that lanes and their fetches stay
     neighbours while all that does not depend on z is shared.
 
-    weighted : see `_weighted`; the margin is at least the number of rows whose hats cover a voxel
+    weighted : see `_weighted`
 
     Returns ((voxels, whether they exist), sums), lists of RUN; a sum is a list, with A^T 1 as its second entry where the
     images have ones.
     """
-    (nx, ny, nz), (n_v, n_u) = size, panel
-    source, top, step = rows
+    (nx, ny, nz), (n_v, n_u), margin = tables.size, tables.panel, tables.margin
+    columns, matrices = tables.columns, tables.matrices
+    source, top, step = tables.rows
     run = min(RUN, nz)
     stride = -(-nz // run)
     index = dr.arange(mi.UInt, nx * ny * stride)

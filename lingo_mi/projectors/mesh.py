@@ -63,7 +63,7 @@ class MeshPaths:
     def lengths(self, view):
         """Path lengths inside the mesh along the rays of all pixel centres, Float [height * width], row by row.
 
-        view   `frame.View`; the lengths have its unit
+        view   `view.View`; the lengths have its unit
 
         A mesh behind the source of a cone beam, or behind the panel where there is one, adds nothing. Not
         differentiable. Raises InputError where the mesh reaches through the plane of a cone beam's source, parallel

@@ -60,7 +60,7 @@ class Ellipsoids:
         if 'density' not in params:
             raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
         data, self.density = params['data'], params['density']
-        self.second = params['second'] if 'second' in params else None  # share of a second material
+        self.second = params.get('second')  # share of a second material
         self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
         key, gaussians = (data.index, self.density.index), (self.centre, self.scale, self.rotation, self.density)
         if key not in _USABLE and require_usable(*gaussians, f'the ellipsoids {self.name!r}'):
@@ -104,7 +104,7 @@ class GridInCube:
                 f'{where} must fill an axis-aligned cube exactly: give the cube, [-1, 1]^3 in its own frame, '
                 'and the gridvolume, [0, 1]^3 in its own, transforms onto the same box'
             )
-        self.scale = params['scale'] if 'scale' in params else 1.0
+        self.scale = params.get('scale', 1.0)
         self.data, self.size = tensor.array, tensor.shape[2::-1]
         self.low, self.high = box.min, box.max
 
@@ -124,8 +124,8 @@ class GridInCube:
         i = dr.arange(mi.UInt32, nx * ny * nz)
         z, rest = i % nz, i // nz
         data = dr.gather(mi.Float, self.data, (z * ny + rest % ny) * nx + rest // ny, mode=dr.ReduceMode.Permute)
-        origin, direction, t_min = _rays(view, (self.low + self.high) / 2)
-        return grid.line_integrals(data, self.size, self.low, self.high, origin, direction, t_min) * self.scale
+        lines = _lines(view, (self.low + self.high) / 2)
+        return grid.line_integrals(data, self.size, self.low, self.high, lines) * self.scale
 
 
 def _no_area(options):
@@ -164,7 +164,7 @@ class HomogeneousMesh:
         self.sigma = next(
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
         )
-        self.scale = params['scale'] if 'scale' in params else 1.0
+        self.scale = params.get('scale', 1.0)
         geometry = mi.traverse(shape)
         # While an array is kept alive no other one has its index, so a moved mesh is not taken for the one that it was.
         arrays = geometry['vertex_positions'], geometry['faces']
@@ -185,8 +185,8 @@ class HomogeneousMesh:
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
 
 
-def _rays(view, near):
-    """Rays of all pixels for `grid.line_integrals`, starting on the plane through `near` parallel to the panel.
+def _lines(view, near) -> grid.Lines:
+    """The rays of all pixels, starting on the plane through `near` parallel to the panel.
 
     Starting near the object keeps the digits that a distant source would cost float32.
     """
@@ -199,9 +199,9 @@ def _rays(view, near):
     if view.parallel:
         t = dr.dot(n, near - view.corner) / dr.dot(n, view.source)
         origin = Vector3f(view.corner + t * view.source) + x * Vector3f(view.u) + y * Vector3f(view.v)
-        return mi.Point3f(origin), Vector3f(view.source), -dr.inf
+        return grid.Lines(mi.Point3f(origin), Vector3f(view.source))
     axis = view.corner - view.source
     k = dr.dot(n, near - view.source) / dr.dot(n, axis)
     direction = Vector3f(axis) + x * Vector3f(view.u) + y * Vector3f(view.v)
     origin = Vector3f(view.source + k * axis) + x * Vector3f(k * view.u) + y * Vector3f(k * view.v)
-    return mi.Point3f(origin), direction, Float(-k)
+    return grid.Lines(mi.Point3f(origin), direction, Float(-k))

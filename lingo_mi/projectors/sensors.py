@@ -1,4 +1,4 @@
-"""The rays of Mitsuba sensors as `frame.View`, in float64, differentiable in their pose."""
+"""The rays of Mitsuba sensors as `view.View`, in float64, differentiable in their pose."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def _through_grid(work: Workload, gaussians, n: int, step: float | None = None):
     i, count = dr.arange(mi.UInt32, n**3), dr.opaque(mi.UInt32, n)
     z, rest = i % count, i // count
     data = dr.gather(mi.Float, data, (z * count + rest % count) * count + rest // count, mode=dr.ReduceMode.Permute)
-    return grid.line_integrals(data, (n,) * 3, (-1, -1, -1), (1, 1, 1), origin, direction)
+    return grid.line_integrals(data, (n,) * 3, (-1, -1, -1), (1, 1, 1), grid.Lines(origin, direction))
 
 
 def marching(work: Workload, sizes: Sizes) -> list[dict]:

@@ -10,7 +10,7 @@ from helpers.effects import XML, scene_file  # noqa: F401 - a fixture
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
 from lingo_mi.effects.compton import CELLS, klein_nishina, scattering
 from lingo_mi.effects.forward import find_effects
-from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter, _energies, smoothed
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
 from lingo_mi.errors import InputError
@@ -135,7 +135,7 @@ def tube_of(energy=60.0, material='water', **changes):
         bands=4,
         materials={},
     )
-    return Tube.of(**settings | changes)
+    return Tube.of(TubeParameters(**settings | changes))
 
 
 def chord(a, b):

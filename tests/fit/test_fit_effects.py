@@ -15,7 +15,7 @@ from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop
 from helpers.script import fit
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
-from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.errors import InputError
 from lingo_mi.files.images import read_exr
 from lingo_mi.fit import losses
@@ -107,7 +107,7 @@ def test_a_second_view_compiles_nothing():
 EFFECTS = {
     'spectrum': lambda: Effects(tube(), FocalSpot(), None),
     'two materials': lambda: Effects(tube('soft tissue + bone', '0.0002, 0.0006'), FocalSpot(), None),
-    'spot': lambda: Effects(Tube.of(60.0, None, 12.0, '', None, '', '', 4, {}), SPOT, None),
+    'spot': lambda: Effects(Tube.of(TubeParameters(energy=60.0, filtration='')), SPOT, None),
     'blur': lambda: Effects(None, None, detector(psf=15.0)),
     'saturation': lambda: Effects(None, None, detector(saturation=0.9, gain=0.05)),
     'all': lambda: Effects(tube(), SPOT, detector(psf=15.0, aperture=1.0, aperture_order=2, saturation=0.99)),
@@ -312,11 +312,15 @@ def test_what_a_fit_leaves_behind(tmp_path):
     [
         (lambda: Effects(tube(''), None, None), 'add <string name="material"'),
         (
-            lambda: Effects(Tube.of(None, 120.0, 12.0, 'Al 2.5', None, 'Al', '', 4, dict(bolts='Fe')), None, None),
+            lambda: Effects(Tube.of(TubeParameters(kvp=120.0, material='Al', materials=dict(bolts='Fe'))), None, None),
             'add a split',
         ),
         (
-            lambda: Effects(Tube.of(None, 120.0, 12.0, '', None, 'Al', '', 4, dict(a='Fe', b='Cu')), None, None),
+            lambda: Effects(
+                Tube.of(TubeParameters(kvp=120.0, filtration='', material='Al', materials=dict(a='Fe', b='Cu'))),
+                None,
+                None,
+            ),
             'leave two',
         ),
     ],

@@ -11,7 +11,7 @@ from helpers.effect_parts import detector, rendered_from_files, stepper_of, tube
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
-from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fit import loop
@@ -32,7 +32,7 @@ FEW = Scatter(64, (4, 4), energies=1, voxels=16)
 
 
 def one_energy(material='water', split=''):
-    return Tube.of(60.0, None, 12.0, '', None, material, split, 4, {})
+    return Tube.of(TubeParameters(energy=60.0, filtration='', material=material, split=split))
 
 
 def effects_of(scatter=FEW, **changes):

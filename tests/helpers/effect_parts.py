@@ -5,7 +5,7 @@ import numpy as np
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from lingo_mi.effects.detector import Detector
-from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.fit.device import DeviceState
 from lingo_mi.fit.state import start
 from lingo_mi.fit.step import Stepper
@@ -14,7 +14,7 @@ from lingo_mi.scene.load import load_scene
 
 
 def tube(material='soft tissue', split=''):
-    return Tube.of(None, 120.0, 12.0, 'Al 2.5', None, material, split, 4, {})
+    return Tube.of(TubeParameters(kvp=120.0, material=material, split=split))
 
 
 def detector(**changes):

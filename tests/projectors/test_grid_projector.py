@@ -7,7 +7,7 @@ import pytest
 
 from helpers.grids import scan
 from lingo_mi.errors import InputError
-from lingo_mi.projectors.grid import backproject, line_integrals, project, view_rays, view_table
+from lingo_mi.projectors.grid import Lines, backproject, line_integrals, project, view_rays, view_table
 
 
 def interpolate(volume, box_min, voxel, points):
@@ -60,9 +60,7 @@ def integrate(volume, box_min, box_max, origin, direction, **ends):
         volume.shape,
         box_min,
         box_max,
-        mi.Point3f(np.asarray(origin, np.float32).T),
-        mi.Vector3f(np.asarray(direction, np.float32).T),
-        **ends,
+        Lines(mi.Point3f(np.asarray(origin, np.float32).T), mi.Vector3f(np.asarray(direction, np.float32).T), **ends),
     ).numpy()
 
 
@@ -163,7 +161,7 @@ def test_derivatives_in_both_modes():
     weight = rng.normal(size=geometry.nDetector)
 
     def run(data):
-        return line_integrals(data, geometry.nVoxel, -half, half, origin, direction, t_min)
+        return line_integrals(data, geometry.nVoxel, -half, half, Lines(origin, direction, t_min))
 
     data = mi.Float(np.float32(x).ravel())
     dr.enable_grad(data)
@@ -240,4 +238,4 @@ def test_errors():
     with pytest.raises(InputError, match='shape'):
         backproject(np.ones((4, 21, 17)), scan())
     with pytest.raises(InputError, match='values'):
-        line_integrals(mi.Float([1, 2, 3]), (1, 1, 2), [0, 0, 0], [1, 1, 1], mi.Point3f(0), mi.Vector3f(1))
+        line_integrals(mi.Float([1, 2, 3]), (1, 1, 2), [0, 0, 0], [1, 1, 1], Lines(mi.Point3f(0), mi.Vector3f(1)))
