@@ -38,6 +38,7 @@ default_role = 'py:obj'  # `name` links to what it names, where that is document
 autodoc_typehints = 'signature'
 autodoc_member_order = 'bysource'
 autodoc_preserve_defaults = True
+autodoc_type_aliases = {'ArrayLike': 'ArrayLike'}  # whose definition is many lines long
 add_module_names = False
 python_maximum_signature_line_length = 100
 

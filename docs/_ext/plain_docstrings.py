@@ -92,9 +92,12 @@ def _language(lines: list[str]) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text in which only `backticks` mark anything up."""
+    """Text in which only `backticks` mark anything up; letters may follow them, as in `Scan`s."""
     parts = QUOTED.split(text)
-    return ''.join(part if i % 2 else re.sub(r'([*|\\])|_(?=\W|$)', _escape, part) for i, part in enumerate(parts))
+    plain = [re.sub(r'([*|\\])|_(?=\W|$)', _escape, part) for part in parts[::2]]
+    plain[1:] = [f'\\ {part}' if re.match(r'\w', part) else part for part in plain[1:]]
+    parts[::2] = plain
+    return ''.join(parts)
 
 
 def _escape(match) -> str:
