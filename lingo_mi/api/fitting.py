@@ -73,4 +73,4 @@ def fit(
                 check()
 
             fitted = run(dataset.train, chosen, cloud, seed, quick_measure(dataset), report, file)
-        return Result(fitted, name, dataset, checkpoint=file.read_bytes())
+        return Result(fitted, name, file.read_bytes(), dataset)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -19,8 +20,8 @@ from lingo_mi.geometry import Geometry
 from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
-from lingo_mi.results.measure import measure
-from lingo_mi.results.save import report_data, write_results
+from lingo_mi.results.measure import Measured, measure
+from lingo_mi.results.save import report_data, save
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
 
@@ -51,17 +52,11 @@ class Result:
     """
 
     def __init__(
-        self,
-        fitted: Fitted,
-        recipe: str,
-        data: Dataset | None = None,
-        *,
-        stored: dict | None = None,
-        checkpoint: bytes | None = None,
+        self, fitted: Fitted, recipe: str, checkpoint: bytes, data: Dataset | None = None, stored: dict | None = None
     ):
-        """data: the scan and what is held out; stored: metrics as they were saved; checkpoint: of the finished fit."""
+        """checkpoint: of the finished fit; data: the scan and what is held out; stored: metrics as they were saved."""
         self.fitted, self.recipe, self.data = fitted, recipe, data
-        self._stored, self._checkpoint = stored, checkpoint
+        self._checkpoint, self._stored = checkpoint, stored
 
     @property
     def settings(self) -> Settings:
@@ -110,17 +105,18 @@ class Result:
         """
         return self.fitted.render(self.geometry if geometry is None else geometry)
 
+    @cached_property
+    def _measured(self) -> Measured:
+        return measure(self.fitted) if self.data is None else measure(self.fitted, self.data.test, self.data.volume)
+
     def metrics(self, data: Dataset | None = None) -> dict:
         """PSNR and SSIM of held-out views and volume, IPSD, times; None where there is no truth to compare with.
 
-        data   what to compare with (default: what was given to `lm.fit`, else the numbers as saved)
+        data   what to compare with (default: what was given to `lm.fit`; of a loaded result, the numbers as saved)
         """
-        data = self.data if data is None else data
         if data is not None:
-            return measure(self.fitted, data).numbers
-        if self._stored is None:
-            raise InputError('this result was loaded without numbers: give the data to compare with')
-        return self._stored
+            return measure(self.fitted, data.test, data.volume).numbers
+        return self._measured.numbers if self._stored is None else self._stored
 
     def save(self, folder: str | PathLike, *, title: str = '', force: bool = False) -> Path:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz; returns the folder.
@@ -130,15 +126,13 @@ class Result:
 
         Raises InputError where the folder holds files already, or cannot be written.
         """
-        if self.data is None or self._checkpoint is None:
-            raise InputError('this result was loaded from files: copy its folder')
         folder = Path(folder)
         if folder.is_dir() and any(folder.iterdir()) and not force:
             raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / CHECKPOINT) as temporary:
             temporary.write_bytes(self._checkpoint)
-        write_results(folder, self.fitted, self.data, title=title or folder.name, method=self.recipe)
+        save(folder, self.fitted, self._measured, title=title or folder.name, method=self.recipe)
         return folder
 
     def __repr__(self) -> str:
@@ -148,11 +142,9 @@ class Result:
         )
 
     def _repr_html_(self) -> str:
-        if self.data is None:
-            return f'<pre>{html.escape(repr(self))}\n{html.escape(headline(self._stored or {}))}</pre>'
-        data = report_data(self.fitted, self.data, measure(self.fitted, self.data), self.recipe)
-        picture = base64.b64encode(overview(data, headline(data.metrics))).decode('ascii')
-        return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{picture}">'
+        picture = overview(report_data(self.fitted, self._measured, self.recipe), headline(self.metrics()))
+        embedded = base64.b64encode(picture).decode('ascii')
+        return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{embedded}">'
 
 
 def load_result(path: str | PathLike) -> Result:
@@ -172,4 +164,4 @@ def load_result(path: str | PathLike) -> Result:
             stored = json.loads(numbers.read_text(encoding='utf-8'))
         except ValueError:
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
-    return Result(fitted, (stored or {}).get('method', 'checkpoint'), stored=stored)
+    return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)

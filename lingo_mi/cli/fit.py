@@ -71,8 +71,8 @@ def main():
     from lingo_mi.fit.initial import initial_cloud
     from lingo_mi.fit.loop import run
     from lingo_mi.progress import Progress
-    from lingo_mi.results.measure import quick_measure, summary
-    from lingo_mi.results.save import write_results
+    from lingo_mi.results.measure import measure, quick_measure, summary
+    from lingo_mi.results.save import save
     from lingo_mi.scene.load import defaults, load_scene
 
     check_input(args)
@@ -112,10 +112,10 @@ def main():
         except KeyboardInterrupt:
             again = command_line('--resume', without=('--resume', '--force'))
             raise KeyboardInterrupt(f'go on with  {again}') from None
-    result = write_results(
+    result = save(
         folder,
         fit,
-        scan,
+        measure(fit, scan.test, scan.volume),
         title=Path(args.volume or args.projections or scene.name).name,
         method=args.method,
         command=command_line(),

@@ -36,31 +36,38 @@ class Measured:
 
     numbers   by name; None where there is no truth to compare with
     volume    float32 [x, y, z], density per mm; None where the fit makes none
-    views     the held-out views as the fit renders them, float32 [view, v, u]; None where there are none
+    truth     what it should be; None where that is not known
+    test      views that were held out; None where there are none
+    views     the same as the fit renders them, float32 [view, v, u]
     """
 
     numbers: dict
-    volume: np.ndarray | None
-    views: np.ndarray | None
+    volume: np.ndarray | None = None
+    truth: np.ndarray | None = None
+    test: Scan | None = None
+    views: np.ndarray | None = None
 
 
-def measure(fitted: Fitted, dataset: Dataset) -> Measured:
-    """The volume and the held-out views of a finished fit, and its numbers."""
+def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None = None) -> Measured:
+    """The volume and the held-out views of a finished fit, and its numbers.
+
+    test    views that were held out
+    truth   the true density in 1/mm, [x, y, z], on the grid of the fit's geometry
+    """
     born = fitted.state.values['centre'][fitted.state.born]
-    test, volume, views = dataset.test, fitted.volume(), None
-    if test is not None and len(test):
-        views = fitted.render(test.geometry)
-    truth = None if test is None or views is None else test.projections
-    rendered = None if views is None else comparable(views, test)
+    test = test if test is not None and len(test) else None
+    volume, views = fitted.volume(), None if test is None else fitted.render(test.geometry)
+    expected = None if test is None else test.projections
+    rendered = None if test is None or views is None else comparable(views, test)
 
     def of(function, result, reference):
         return None if result is None or reference is None else _number(function(result, reference))
 
     numbers = dict(
-        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, truth),
-        psnr_2d=of(metrics.psnr_2d, rendered, truth),
-        ssim_2d=of(metrics.ssim_2d, rendered, truth),
-        **compared(volume, dataset.volume),
+        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
+        psnr_2d=of(metrics.psnr_2d, rendered, expected),
+        ssim_2d=of(metrics.ssim_2d, rendered, expected),
+        **compared(volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
@@ -71,7 +78,7 @@ def measure(fitted: Fitted, dataset: Dataset) -> Measured:
         ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
         history=fitted.history,
     )
-    return Measured(numbers, volume, views)
+    return Measured(numbers, volume, truth, test, views)
 
 
 def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:

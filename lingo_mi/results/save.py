@@ -20,28 +20,25 @@ from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.models.alpha import harmonics
 from lingo_mi.paths import replacing
 from lingo_mi.report.page import ReportData, write_report
-from lingo_mi.results.measure import Measured, measure
+from lingo_mi.results.measure import Measured
 from lingo_mi.results.scene_file import write_scene
-from lingo_mi.scan import Dataset
 
 
-def write_results(
-    folder: Path, fitted: Fitted, dataset: Dataset, *, title: str, method: str, command: str = ''
+def save(
+    folder: Path, fitted: Fitted, measured: Measured, *, title: str = 'fit', method: str = '', command: str = ''
 ) -> dict:
     """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
 
-    dataset   that was fitted, with what is held out
-    title     of the report
-    method    the recipe's name
-    command   that makes the result again, for the report
+    folder     which is there already
+    measured   of the fit
+    title      of the report
+    method     the recipe's name, and command: what makes the result again; both for metrics.json and the report
 
     A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
     Raises InputError where a file cannot be written.
     """
-    geometry, test = dataset.train.geometry, dataset.test
-    measured = measure(fitted, dataset)
-    cloud = fitted.world_gaussians()
+    geometry, cloud = fitted.geometry, fitted.world_gaussians()
     if measured.volume is None:
         for stale in 'volume.nii.gz', 'result.xml':
             (folder / stale).unlink(missing_ok=True)
@@ -57,27 +54,27 @@ def write_results(
     numbers = measured.numbers | dict(
         method=method,
         seed=fitted.seed,
-        views=len(dataset.train),
+        views=len(geometry),
         variant=mi.variant(),
         settings=fitted.settings.flat(),
         initial=fitted.info,
         command=command,
         **_corrections(fitted),
         angles=np.degrees(geometry.angles).tolist(),
-        test_angles=[] if measured.views is None or test is None else np.degrees(test.geometry.angles).tolist(),
+        test_angles=[] if measured.test is None else np.degrees(measured.test.geometry.angles).tolist(),
         versions=versions(),
     )
-    write_report(folder, report_data(fitted, dataset, replace(measured, numbers=numbers), title))
+    write_report(folder, report_data(fitted, replace(measured, numbers=numbers), title))
     with replacing(folder / METRICS) as temporary:
         temporary.write_text(json.dumps(numbers, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
     return numbers
 
 
-def report_data(fitted: Fitted, dataset: Dataset, measured: Measured, title: str) -> ReportData:
+def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
     """What the report of a measured fit shows."""
-    geometry, test = dataset.train.geometry, dataset.test
+    geometry, test = fitted.geometry, measured.test
     held_out = {}
-    if measured.views is not None and test is not None:
+    if test is not None:
         angles = np.degrees(test.geometry.angles)
         held_out = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
     centres, _, _, density = fitted.world_gaussians()
@@ -85,7 +82,7 @@ def report_data(fitted: Fitted, dataset: Dataset, measured: Measured, title: str
         title=title,
         metrics=measured.numbers,
         volume=measured.volume,
-        truth=None if measured.volume is None else dataset.volume,
+        truth=None if measured.volume is None else measured.truth,
         shape=geometry.nVoxel,
         spacing=geometry.dVoxel,
         centre=geometry.offOrigin,

@@ -206,7 +206,7 @@ class Cells:
                 check()
 
             fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
-        found = measure(fitted, dataset).numbers
+        found = measure(fitted, dataset.test, dataset.volume).numbers
         return found | dict(method=cell.method, settings=settings.flat(), initial=fitted.info)
 
     def _begin(self, settings, saved: Path):

@@ -9,7 +9,7 @@ import pytest
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from lingo_mi.fit.fitted import Fitted
 from lingo_mi.fit.loop import run
-from lingo_mi.results.measure import summary
+from lingo_mi.results.measure import measure, summary
 from lingo_mi.results.save import save
 
 
@@ -22,7 +22,7 @@ def checkpoint(tmp_path_factory):
 
 def test_a_result_without_a_scan(checkpoint, tmp_path):
     fitted = Fitted.from_checkpoint(checkpoint)
-    found = save(tmp_path, fitted)
+    found = save(tmp_path, fitted, measure(fitted))
     assert json.loads(json.dumps(found)) == json.loads((tmp_path / 'metrics.json').read_text())
     assert found['psnr_2d'] is None and found['psnr_3d'] is None and found['test_angles'] == []
     assert (found['seed'], found['views'], found['settings']['lambda_tv']) == (3, 3, SHORT.loss.lambda_tv)
@@ -32,7 +32,7 @@ def test_a_result_without_a_scan(checkpoint, tmp_path):
 
 def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path):
     fitted, test = Fitted.from_checkpoint(checkpoint), tiny_scan(geometry(2))
-    found = save(tmp_path, fitted, test, fitted.volume(), title='itself', method='r2', command='fit')
+    found = save(tmp_path, fitted, measure(fitted, test, fitted.volume()), title='itself', method='r2', command='fit')
     assert found['ssim_3d'] == pytest.approx(1) and found['psnr_2d'] > 0 and len(found['test_angles']) == 2
     assert (found['method'], found['command']) == ('r2', 'fit')
     assert sorted(p.name for p in (tmp_path / 'views').iterdir()) == ['0000.exr', '0001.exr']
