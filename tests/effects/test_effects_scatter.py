@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba import chi2
 
-from helpers.effects import XML, scene_file  # noqa: F401 - a fixture
+from helpers.effects import XML
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
 from lingo_mi.effects.compton import CELLS, klein_nishina, scattering
 from lingo_mi.effects.forward import find_effects
@@ -362,7 +362,7 @@ def test_numbers_follow_seed_and_view():
     assert np.abs(means(1) - first).min() > 0 and np.abs(means(0, 1) - first).min() > 0
 
 
-def test_scan(scene_file):  # noqa: F811
+def test_scan(scene_file):
     """Every view of a scan is what `mi.render` gives."""
     loaded = load_scene(
         scene_file(
@@ -401,7 +401,7 @@ def test_scan(scene_file):  # noqa: F811
         ('<integer name="scatter" value="9"/><string name="scatter_voxels" value="many"/>', 'scatter_voxels must be'),
     ],
 )
-def test_one_line_that_names_element_and_place(scene_file, given, match):  # noqa: F811
+def test_one_line_that_names_element_and_place(scene_file, given, match):
     with pytest.raises(InputError, match=match) as caught:
         load_scene(scene_file(XML.replace('<string name="material"', given + '<string name="material"')))
     assert '\n' not in str(caught.value)

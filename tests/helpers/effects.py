@@ -54,12 +54,3 @@ XML = """<scene version="3.0.0">
         <float name="kvp" value="120"/> <string name="material" value="soft tissue"/>
     </emitter>
 </scene>"""
-
-
-@pytest.fixture
-def scene_file(tmp_path):
-    def written(text=XML):
-        (tmp_path / 'scene.xml').write_text(text)
-        return tmp_path / 'scene.xml'
-
-    return written
