@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from lingo_mi.api.result import Gaussians, Result, load_result
     from lingo_mi.api.volumes import reconstruct
     from lingo_mi.errors import InputError
-    from lingo_mi.fit.settings import Settings
+    from lingo_mi.fitting.settings import Settings
     from lingo_mi.functional import project, voxelize
     from lingo_mi.geometry import Geometry
     from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Reconstruction, Refined
@@ -78,7 +78,7 @@ _PUBLIC = {
     'Scan': 'lingo_mi.scan',
     'Dataset': 'lingo_mi.scan',
     'fit': 'lingo_mi.api.fitting',
-    'Settings': 'lingo_mi.fit.settings',
+    'Settings': 'lingo_mi.fitting.settings',
     'Result': 'lingo_mi.api.result',
     'Gaussians': 'lingo_mi.api.result',
     'load_result': 'lingo_mi.api.result',

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.recipes import settings_of
+from lingo_mi.fitting.recipes import settings_of
 
 Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
 

@@ -11,10 +11,10 @@ import yaml
 from helpers.fits import SHORT, error_of, geometry, some_points, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
-from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import run
-from lingo_mi.fit.recipes import METHODS
-from lingo_mi.fit.view import Target
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.view import Target
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import LingoSettings, initialise
 from lingo_mi.lingo.masks import masks, truncated

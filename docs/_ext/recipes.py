@@ -3,7 +3,7 @@
 from docutils import nodes
 from docutils.parsers.rst import Directive
 
-from lingo_mi.fit.recipes import METHODS
+from lingo_mi.fitting.recipes import METHODS
 
 
 class Recipes(Directive):

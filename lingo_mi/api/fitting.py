@@ -8,11 +8,11 @@ from pathlib import Path
 
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError
-from lingo_mi.fit.checkpoint import CHECKPOINT
-from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import run
-from lingo_mi.fit.recipes import settings_of
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fitting.checkpoint import CHECKPOINT
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.fitting.settings import Settings
 from lingo_mi.interrupts import between_steps
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure

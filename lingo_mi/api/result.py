@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.checkpoint import CHECKPOINT, METRICS
-from lingo_mi.fit.fitted import Fitted
-from lingo_mi.fit.settings import Settings
+from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry import Geometry
 from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview

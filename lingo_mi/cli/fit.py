@@ -24,7 +24,7 @@ from lingo_mi.cli.common import (
     writable_folder,
 )
 from lingo_mi.errors import InputError
-from lingo_mi.fit.recipes import METHODS
+from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.interrupts import between_steps
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
@@ -59,7 +59,7 @@ def arguments():
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='any setting of the fit (see lingo_mi.fit.settings), or a parameter of the scene file',
+        help='any setting of the fit (see lingo_mi.fitting.settings), or a parameter of the scene file',
     )
     return p.parse_args()
 
@@ -67,9 +67,9 @@ def arguments():
 def main():
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.fit.checkpoint import CHECKPOINT, METRICS
-    from lingo_mi.fit.initial import initial_cloud
-    from lingo_mi.fit.loop import run
+    from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
+    from lingo_mi.fitting.initial import initial_cloud
+    from lingo_mi.fitting.loop import run
     from lingo_mi.progress import Progress
     from lingo_mi.results.measure import measure, quick_measure, summary
     from lingo_mi.results.save import save
@@ -91,7 +91,7 @@ def main():
         names = ', '.join(sorted(own)) or 'it has none'
         raise InputError(
             f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit '
-            '(see lingo_mi/fit/settings.py)'
+            '(see lingo_mi/fitting/settings.py)'
         )
     settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)

@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.fit.recipes import METHODS, VOLUMETRIC
+from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
 
 
 def arguments():

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser, writable_folder
 from lingo_mi.errors import InputError
-from lingo_mi.fit.recipes import METHODS, settings_of
+from lingo_mi.fitting.recipes import METHODS, settings_of
 from lingo_mi.runtime import use_variant
 
 ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer'

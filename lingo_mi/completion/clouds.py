@@ -10,9 +10,9 @@ import numpy as np
 
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
-from lingo_mi.fit.checkpoint import METRICS
-from lingo_mi.fit.fitted import Fitted
-from lingo_mi.fit.poses import Poses
+from lingo_mi.fitting.checkpoint import METRICS
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.poses import Poses
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import Ellipsoids, find_objects
 from lingo_mi.scene.load import load_scene

@@ -10,7 +10,7 @@ import numpy as np
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
 from lingo_mi.errors import InputError
-from lingo_mi.fit.fitted import Fitted
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.reconstruction import FDK, Algorithm, Refined, check_scan
 from lingo_mi.scan import Dataset, Scan

@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.errors import InputError
-from lingo_mi.fit.fitted import Fitted
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.reconstruction.arcs import gaps

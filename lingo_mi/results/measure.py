@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lingo_mi import metrics
-from lingo_mi.fit.fitted import Fitted
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.lingo.ipsd import ipsd, reverse_distance
 from lingo_mi.scan import Dataset, Scan
 

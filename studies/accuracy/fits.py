@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from lingo_mi import phantoms
-from lingo_mi.fit.cloud_model import CloudModel
-from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import run
-from lingo_mi.fit.measured import density_unit
-from lingo_mi.fit.recipes import METHODS, VOLUMETRIC
-from lingo_mi.fit.state import start
+from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.measured import density_unit
+from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
+from lingo_mi.fitting.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.ipsd import ipsd

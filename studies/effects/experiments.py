@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.initial import initial_cloud
-from lingo_mi.fit.loop import run
-from lingo_mi.fit.recipes import FAST
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import psnr_3d_absolute
 from lingo_mi.projectors.objects import find_objects

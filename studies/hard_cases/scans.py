@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lingo_mi.fit.loop import run as fit
-from lingo_mi.fit.recipes import FAST
-from lingo_mi.fit.state import activate
+from lingo_mi.fitting.loop import run as fit
+from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.state import activate
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud

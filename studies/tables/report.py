@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.fit.recipes import settings_of
+from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.paths import replacing
 from lingo_mi.studies.provenance import write_provenance
 from lingo_mi.studies.tables import paper

@@ -6,9 +6,9 @@ import numpy as np
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.hardening import Tube, TubeParameters
-from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.state import start
-from lingo_mi.fit.step import Stepper
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.state import start
+from lingo_mi.fitting.step import Stepper
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 
@@ -34,7 +34,7 @@ def stepper_of(effects, views=3, **changes):
 def rendered_from_files(stepper, state, effects, folder):
     """The stepper's views by Mitsuba's integrator, from the scene and the cloud that a fit writes."""
     from lingo_mi.files.ply import write_ply
-    from lingo_mi.fit.state import activate
+    from lingo_mi.fitting.state import activate
     from lingo_mi.results.scene_file import write_scene
 
     g, share = stepper.geometry, stepper.model.shares(state)

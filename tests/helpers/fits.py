@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lingo_mi.fit.recipes import R2
+from lingo_mi.fitting.recipes import R2
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.fit.r2_start import r2_initialise
+from lingo_mi.fitting.r2_start import r2_initialise
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo import initialise as initialisation

@@ -12,10 +12,10 @@ import pytest
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, transform, values_of
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
-from lingo_mi.fit.cloud_model import CloudModel
-from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.recipes import R2
-from lingo_mi.fit.state import start
+from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.recipes import R2
+from lingo_mi.fitting.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.studies import oracle

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
-from lingo_mi.fit.fitted import Fitted
-from lingo_mi.fit.loop import run
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.loop import run
 from lingo_mi.results.measure import measure, summary
 from lingo_mi.results.save import save
 

@@ -10,13 +10,13 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from lingo_mi.errors import AccuracyWarning
-from lingo_mi.fit.activations import inverse_scale, inverse_softplus, softplus
-from lingo_mi.fit.densify import clone, densify, halve, split
-from lingo_mi.fit.device import DeviceState
-from lingo_mi.fit.loss_scale import loss_scale, otsu
-from lingo_mi.fit.losses import combined, ssim
-from lingo_mi.fit.recipes import R2
-from lingo_mi.fit.state import activate, start
+from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
+from lingo_mi.fitting.densify import clone, densify, halve, split
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.loss_scale import loss_scale, otsu
+from lingo_mi.fitting.losses import combined, ssim
+from lingo_mi.fitting.recipes import R2
+from lingo_mi.fitting.state import activate, start
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.masks import Masks, masks

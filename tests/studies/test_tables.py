@@ -15,7 +15,7 @@ import pytest
 from helpers.script import FIT, run
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import write_volume
-from lingo_mi.fit.recipes import METHODS
+from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.phantoms import make
 from lingo_mi.studies.tables import cells as tables
 from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, recipe

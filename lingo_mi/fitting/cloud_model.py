@@ -1,0 +1,97 @@
+"""The forward model of a fit: what a state's cloud looks like in views and in a volume. It needs no scan."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.effects.forward import Effects
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.expected_signal import ExpectedSignal
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.scattered_light import light_at_pixels
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.objects import Ellipsoids
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.view import View, vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+
+
+class CloudModel:
+    """Renders and voxelizes the states of a fit.
+
+    settings   of the fit
+    geometry   of its scan, as given: says the normalised frame, and the default grid of `volume`
+    unit       the density, in 1/mm, that counts as 1 (`measured.density_unit`)
+    effects    of the scan, where the fit models them (`measured.modelled_effects`); None: line integrals
+    signal     `ExpectedSignal` of these effects; None without
+    """
+
+    def __init__(self, settings: Settings, geometry: Geometry, unit: float, effects: Effects | None = None):
+        """Raises InputError for effects that a fit cannot reproduce."""
+        self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
+        self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
+
+    def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
+        """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
+        the expected signal where the fit models effects. Grey images of alpha compositing are taken for line integrals.
+
+        progress   called as progress(views done, views in all)
+        """
+        every, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        forward = forward_model(self.settings)
+        gaussians, share = forward.gaussians(state.values), self.shares(state)
+
+        scattered = [None] * len(geometry)
+        if self.signal is not None and self.signal.scattered:
+            found = self.signal.scattered.estimate(self.cloud(state), geometry)
+            scattered = [uploaded(image.ravel()) for image in light_at_pixels(found, geometry)]
+
+        def along(rays):
+            return forward.integrals(forward.footprints(gaussians, rays), rays, share)
+
+        out = np.empty((len(geometry), height, width), np.float32)
+        for i in range(len(geometry)):
+            view = View.of(every, i, height, width, panel=False)
+            image = along(view)[0] if self.signal is None else self.signal.image(along, view, scattered[i])
+            out[i] = image.numpy().reshape(height, width)
+            if progress:
+                progress(i + 1, len(geometry))
+        return out * np.float32(self.unit / geometry.scale)
+
+    def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
+        """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
+
+        The grid must be of the scan's size, whatever its voxels.
+        None for alpha compositing: opacities and radiances are no attenuation.
+        """
+        if not self.settings.volumetric:
+            return None
+        g = geometry or self.geometry
+        grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
+        values = voxelize(*state.gaussians(self.settings), grid, self.settings.model.extent, deep=True)
+        return grid.volume(values) * np.float32(self.unit)
+
+    def shares(self, state: DeviceState):
+        """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""
+        if self.signal is None or self.signal.split is None:
+            return None
+        centres = np.stack([c.numpy() for c in state.values['centre']], 1)
+        return self.signal.shares(self.volume(state), centres, self.geometry.half)
+
+    def cloud(self, state: DeviceState) -> Ellipsoids | None:
+        """The Gaussians in the world frame, mm, densities in 1/mm; None for alpha compositing, which knows no densities."""
+        if not self.settings.volumetric:
+            return None
+        centre, scale, rotation, density = (dr.detach(x) for x in state.gaussians(self.settings))
+        size, middle = dr.opaque(mi.Float, self.geometry.scale), dr.opaque(mi.Point3f, self.geometry.offOrigin)
+        return Ellipsoids.of(
+            centre / size + middle,
+            scale / size,
+            rotation,
+            density * dr.opaque(mi.Float, self.unit),
+            self.shares(state),
+            'cloud',
+        )

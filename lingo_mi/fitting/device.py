@@ -1,0 +1,83 @@
+"""A fit's state on the device: activation, Adam and the way to the host and back."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.state import State
+from lingo_mi.projectors.upload import uploaded
+
+
+def _types():
+    return dict(
+        centre=mi.Point3f,
+        scale=mi.Vector3f,
+        rotation=mi.Vector4f,
+        density=mi.Float,
+        opacity=mi.Float,
+        radiance=mi.Float,
+        harmonics=mi.ArrayXf,
+    )
+
+
+class DeviceState:
+    """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `visits` Float [N]."""
+
+    def __init__(self, state: State):
+        self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
+        self.gradient, self.visits = uploaded(state.gradient), uploaded(state.visits)
+        self.born = state.born
+
+    def __len__(self) -> int:
+        return len(self.born)
+
+    def host(self) -> State:
+        """The state as NumPy arrays."""
+        return State(
+            download(self.values),
+            download(self.first),
+            download(self.second),
+            self.gradient.numpy(),
+            self.visits.numpy(),
+            self.born,
+        )
+
+    def gaussians(self, settings: Settings) -> tuple:
+        """Centres, standard deviations, quaternions (not normalised) and densities, or what else the forward model takes (see
+        `models.base.ForwardModel.gaussians`); differentiable."""
+        return forward_model(settings).gaussians(self.values)
+
+    def finite(self) -> bool:
+        """Whether all parameters are finite; waits for the device."""
+        return bool(dr.all(dr.isfinite(sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values()))))
+
+    def adam(self, gradients: dict, settings: Settings, iteration: int):
+        """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
+        b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
+        # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
+        c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
+        for name, g in gradients.items():
+            m = b1 * self.first[name] + (1 - b1) * g
+            v = b2 * self.second[name] + (1 - b2) * g * g
+            rate = dr.opaque(mi.Float, settings.rate(name, iteration))
+            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (
+                dr.sqrt(v * c2) + settings.adam.epsilon
+            )
+            self.first[name], self.second[name] = m, v
+        dr.eval(self.values, self.first, self.second, self.gradient, self.visits)
+
+
+def upload(columns: dict) -> dict:
+    """Parameters by name, float32 [N, components], as Dr.Jit's types."""
+    types = _types()
+    return {k: types[k](*(uploaded(c) for c in v.T)) for k, v in columns.items()}
+
+
+def download(columns: dict) -> dict:
+    """What `upload` was given."""
+    # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
+    return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1) for k, x in columns.items()}

@@ -1,0 +1,135 @@
+"""What a fit gives: a cloud that renders and voxelizes itself, from a fit that has just ended or from its checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.effects.forward import Effects
+from lingo_mi.errors import InputError
+from lingo_mi.fitting import average, checkpoint
+from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.poses import Poses
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.state import State, activate
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.objects import Ellipsoids
+
+
+@dataclass
+class Fitted:
+    """A fitted cloud.
+
+    model       forward model of the fit: settings as used, geometry of the scan as given, unit of density, modelled effects
+    state       the final state (host)
+    initial     centres the fit started from, float32 [N, 3], normalised frame
+    poses       corrections of the views; None where the fit left them alone
+    seed        of the fit
+    history     measurements over time: iteration, seconds, loss, gaussians, and whatever the fit's `measure` gave
+    seconds     spent in steps, over all sessions
+    info        how the initial cloud came about
+
+    Example:
+
+        fitted = run(scan, settings, initial_cloud(scan, settings))
+        fitted.volume()                                   # on the scan's own grid
+        fitted.render(scan.geometry.subset([0]))          # as the scan's detector would see it
+        Fitted.from_checkpoint('out/foot/checkpoint.npz').volume()
+    """
+
+    model: CloudModel
+    state: State
+    initial: np.ndarray
+    poses: Poses | None = None
+    seed: int = 0
+    history: list[dict] = field(default_factory=list)
+    seconds: float = 0.0
+    info: dict = field(default_factory=dict)
+
+    @property
+    def settings(self) -> Settings:
+        """Settings as used, with the bounds that the scan sets."""
+        return self.model.settings
+
+    @property
+    def geometry(self) -> Geometry:
+        """Geometry of the scan, as given."""
+        return self.model.geometry
+
+    @property
+    def unit(self) -> float:
+        """The density, in 1/mm, that the fit counts as 1."""
+        return self.model.unit
+
+    @property
+    def effects(self) -> Effects | None:
+        """Effects of the scan that the fit has modelled; None where it took the projections for line integrals."""
+        return self.model.effects
+
+    @property
+    def corrected(self) -> Geometry:
+        """The geometry with its views where the fit has put them: `geometry` itself, where it left them alone."""
+        return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
+
+    def render(self, geometry: Geometry, progress=None) -> np.ndarray:
+        """What the scan's detector would see in a geometry, float32 [view, v, u]: see `CloudModel.render`."""
+        return self.model.render(DeviceState(self.state), geometry, progress)
+
+    def volume(self, geometry: Geometry | None = None) -> np.ndarray | None:
+        """Density in 1/mm on a geometry's grid (default: the scan's), float32 [x, y, z]; None for alpha compositing."""
+        return self.model.volume(DeviceState(self.state), geometry)
+
+    def cloud(self) -> Ellipsoids | None:
+        """The Gaussians in mm, densities in 1/mm; None for alpha compositing."""
+        return self.model.cloud(DeviceState(self.state))
+
+    def shares(self) -> np.ndarray | None:
+        """The second material's share in every Gaussian's density, float32 [N]; None where the fit knows one material."""
+        share = self.model.shares(DeviceState(self.state))
+        return None if share is None else share.numpy()
+
+    def world_gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres and standard deviations in mm, quaternions (x, y, z, w), and densities in 1/mm, or opacities where there are
+        none: float64 [N, 3], [N, 3], [N, 4], [N]."""
+        centre, scale, rotation, amount = activate(self.state, self.settings)
+        size, unit = self.geometry.scale, self.unit if self.settings.volumetric else 1
+        return centre / size + self.geometry.offOrigin, scale / size, rotation, amount * unit
+
+    @classmethod
+    def from_checkpoint(cls, path: Path | str, effects: Effects | None = None) -> Fitted:
+        """The fit that a checkpoint.npz keeps, as far as it had come; needs no scan.
+
+        effects   of the scan, where the fit has modelled them: a checkpoint does not keep them
+
+        Raises InputError where the file is missing or no checkpoint, and where the fit has modelled effects that are not given.
+        """
+        state, extra, arrays = checkpoint.load(path)
+        try:
+            settings = _settings(extra['settings'])
+            scanner, unit, seed = (extra[name] for name in ('scanner', 'unit', 'seed'))
+            history, seconds, info = (extra[name] for name in ('history', 'seconds', 'info'))
+            initial = arrays['initial']
+        except (AttributeError, KeyError, TypeError, InputError):
+            raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; fit again') from None
+        if effects is None and extra.get('effects', bool(arrays.keys() & {'share', 'scattered'})):
+            raise InputError(
+                f'{path}: the fit has modelled effects of its scan, which a checkpoint does not keep: give them too, '
+                'or use its result.xml, which has them'
+            )
+        geometry = mi.load_dict(scanner).geometry
+        poses = None
+        if max(settings.adam.rate_pose) > 0:
+            poses = Poses(len(geometry))
+            poses.restore(arrays)
+        state.values |= average.values_of(arrays)
+        model = CloudModel(settings, geometry, unit, effects)
+        return cls(model, state, initial, poses, seed, history, seconds, info)
+
+
+def _settings(stored: dict) -> Settings:
+    """Settings from JSON, which has lists for tuples."""
+    return Settings().changed(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})

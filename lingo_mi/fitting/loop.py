@@ -1,0 +1,157 @@
+"""The loop of a fit: views in turn, densification, measurements on the way, checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting.average import Average
+from lingo_mi.fitting.bounded import bounded
+from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.densify import densify, reset_opacity
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.resume import require_same_fit
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.state import start
+from lingo_mi.fitting.step import Stepper
+from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.scan import Scan
+from lingo_mi.scene.description import describe
+
+
+def run(
+    scan: Scan,
+    settings: Settings,
+    initial: InitialCloud | None,
+    seed: int = 0,
+    measure: Callable[[CloudModel, DeviceState], dict] | None = None,
+    progress: Callable[..., None] | None = None,
+    path: Path | None = None,
+) -> Fitted:
+    """Fit a cloud to a scan.
+
+    scan       the views to fit
+    initial    where to start; None: go on from `path`, by the same steps as without the interruption. More iterations than
+               the checkpoint was made with are right where `decay_steps` sets the rates and `coarse_share` is 0
+    seed       of the views' order, the total variation's cubes and splits
+    measure    called as measure(model, state) at a few iterations; returns numbers for the history
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where
+               everything is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
+    path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
+
+    Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
+
+    Example: `run(scan, FAST, initial_cloud(scan, FAST)).volume()`.
+    """
+    if initial is None and path is None:
+        raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
+    settings = bounded(settings, scan)
+    stepper = Stepper(scan, settings)
+    rng = np.random.default_rng(seed)
+    average = Average(settings.adam.average)
+    scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
+    if initial is None:
+        host, extra, arrays = checkpoint.load(path)
+        require_same_fit(host, extra, settings, scanned, seed, path)
+        rng.bit_generator.state = extra['rng']
+        points, order = arrays['initial'], [int(i) for i in arrays['order']]
+        iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
+        state = DeviceState(host)
+        stepper.restore(arrays)
+        average.restore(arrays)
+    else:
+        points, order = initial.points.astype(np.float32), []
+        iteration, seconds, history, info = 0, 0.0, [], dict(initial.info)
+        density = None if initial.density is None else initial.density / stepper.model.unit
+        state = DeviceState(start(points, initial.spacing, density, settings))
+    marks = set(measure_at(settings.iterations))
+    clock = saved = time.perf_counter()
+
+    def store():
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            checkpoint.save(
+                path,
+                state.host(),
+                dict(
+                    seed=seed,
+                    rng=rng.bit_generator.state,
+                    iteration=iteration,
+                    seconds=seconds + time.perf_counter() - clock,
+                    history=history,
+                    info=info,
+                    settings=settings.flat(),
+                    unit=stepper.model.unit,
+                    effects=stepper.model.effects is not None,
+                    **scanned,
+                ),
+                dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays(),
+            )
+
+    while iteration < settings.iterations:
+        # Not after the last step, which nothing would mend; a longer fit that goes on from there does it first.
+        if iteration < settings.densification.densify_until and (
+            renewed := _renewed(state, stepper, settings, iteration, rng)
+        ):
+            state = renewed
+            average.restart()
+        while len(order) < settings.batch:  # every view once before any a second time
+            order += rng.permutation(len(scan)).tolist()
+        views, rest = order[: settings.batch], order[settings.batch :]
+        loss = stepper.step(state, views, iteration, rng)
+        order, iteration = rest, iteration + 1
+        average.add(state)
+        if iteration in marks:
+            dr.sync_thread()
+            value = float(loss[0])
+            if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not would silently leave the image
+                raise InputError(
+                    f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the projections'
+                )
+            seconds += time.perf_counter() - clock
+            entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
+            history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
+            clock = time.perf_counter()  # measuring is not fitting
+        if progress is not None:
+            last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
+            try:
+                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
+            except KeyboardInterrupt:
+                store()
+                raise
+        if time.perf_counter() - saved > settings.checkpoint_seconds:
+            store()
+            saved = time.perf_counter()
+    state = average.of(state)
+    dr.sync_thread()
+    store()
+    seconds += time.perf_counter() - clock
+    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info)
+
+
+def _renewed(state, stepper, settings, iteration, rng):
+    """The state densified and its opacities reset, as far as they are due after so many iterations; None if neither is."""
+    s = settings.densification
+    densifying = iteration > s.densify_from and iteration % s.densify_every == 0
+    resetting = s.reset_every and iteration > 0 and iteration % s.reset_every == 0
+    if not (densifying or resetting):
+        return None
+    host = state.host()
+    if densifying:
+        largest = s.prune_size if 0 < s.reset_every < iteration else np.inf
+        host = densify(host, settings, stepper.half, rng, stepper.flat, largest)
+        if len(host) == 0:
+            raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+    return DeviceState(reset_opacity(host) if resetting else host)
+
+
+def measure_at(iterations: int) -> list[int]:
+    """Iterations to measure at: twelve, denser at the beginning, the last one among them."""
+    return sorted({max(1, round(iterations * share**1.5)) for share in np.linspace(0, 1, 13)[1:]})

@@ -1,0 +1,107 @@
+"""Grey images composited front to back from opacities and radiances: the forward model of 3DGS and of X-Gaussian.
+
+It knows no densities and makes no volume. The projections over their maximum are taken for grey images.
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting.activations import inverse_sigmoid, sigmoid
+from lingo_mi.fitting.models.base import SHAPE, ForwardModel
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.alpha import composite, flatten
+from lingo_mi.projectors.radiance import radiance_towards
+
+OPACITY = 0.1  # of all Gaussians at the start of a fit (3DGS)
+
+
+class AlphaCompositing(ForwardModel):
+    """Opacities by a sigmoid (3DGS), radiances as of `projectors.radiance`; clones and halves keep both.
+
+    Its raw parameters besides the shape: 'opacity', 'radiance', and 'harmonics', coefficients of the radiance's spherical
+    harmonics from degree 1 on, degree by degree.
+    """
+
+    replayable = False
+
+    @property
+    def parameters(self) -> dict[str, int]:
+        degree = self.settings.model.sh_degree
+        harmonics = {'harmonics': (degree + 1) ** 2 - 1} if degree else {}
+        return SHAPE | {'opacity': 1, 'radiance': 1} | harmonics
+
+    def initial(self, n, density):
+        """Opacities of 0.1 and half grey (3DGS), whatever the density."""
+        own = {k: np.zeros((n, size)) for k, size in self.parameters.items() if k not in SHAPE}
+        return own | {'opacity': np.full((n, 1), inverse_sigmoid(OPACITY))}
+
+    def amount(self, values):
+        return sigmoid(values['opacity'][:, 0].astype(float))
+
+    def shared(self, values, chosen, factor):
+        """As they are: opacities are not shared."""
+        return values
+
+    def may_stay(self, centre, scale, half, largest):
+        """Those that are not too large, in the volume or not (3DGS)."""
+        return scale.max(1) <= largest
+
+    def with_lengths(self, geometry: Geometry) -> Settings:
+        """`rate_centre`, `split_size` and `prune_size` are in units of the scene's radius."""
+        radius, s = scene_radius(geometry), self.settings
+        return s.changed(
+            rate_centre=tuple(radius * r for r in s.adam.rate_centre),
+            split_size=radius * s.densification.split_size,
+            prune_size=radius * s.densification.prune_size,
+        )
+
+    def gaussians(self, values):
+        """Followed by what `projectors.radiance.radiance_towards` takes."""
+        radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
+        return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
+
+    def footprints(self, gaussians, rays):
+        centre, scale, rotation, opacity, *radiance = gaussians
+        return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
+
+    def integrals(self, footprints, rays, share=None):
+        """The grey image, taken for line integrals."""
+        return [composite(footprints, rays.height, rays.width)]
+
+    def hold_back(self, gradients, iteration):
+        """Harmonics of a degree that has not joined in stay at zero (3DGS)."""
+        if 'harmonics' not in gradients:
+            return
+        model = self.settings.model
+        degrees = range(1, model.sh_degree + 1)
+        joined = [dr.opaque(mi.Float, float((iteration + 1) // model.sh_every >= k)) for k in degrees]
+        for i in range(len(gradients['harmonics'])):
+            gradients['harmonics'][i] *= joined[math.isqrt(i + 1) - 1]
+
+
+def harmonics(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of the radiance's spherical harmonics: of degree 0 [N], to whose harmonic 1/2 is added, and higher [N, M].
+
+    Radiance that is the same in all directions is a sigmoid of its raw value (see `projectors.radiance`).
+    """
+    raw = values['radiance'][:, 0].astype(float)
+    if 'harmonics' in values:
+        return raw, values['harmonics']
+    return np.sqrt(4 * np.pi) * (sigmoid(raw) - 0.5), np.zeros((len(raw), 0))
+
+
+def scene_radius(geometry: Geometry) -> float:
+    """3DGS's unit of length: 1.1 times the largest distance of a source from the mean of all, in the normalised frame.
+
+    1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
+    """
+    frames = geometry.normalised_rays()
+    if frames.parallel:
+        return 1.0
+    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.0

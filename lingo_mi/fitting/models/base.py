@@ -1,0 +1,97 @@
+"""What a forward model must say, for a fit to find its parameters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.alpha import Discs
+from lingo_mi.projectors.footprint import Footprints
+from lingo_mi.projectors.view import View
+
+SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of every Gaussian's shape, whatever is rendered
+
+
+class ForwardModel(ABC):
+    """Gaussians with raw parameters, and their image.
+
+    replayable   whether a view's loss and derivatives can be replayed (`projectors.frozen`)
+
+    Values on the host are NumPy arrays [N, size] by parameter, on the device Dr.Jit arrays of N.
+    """
+
+    replayable: bool
+
+    def __init__(self, settings: Settings):
+        self.settings = settings
+
+    @property
+    @abstractmethod
+    def parameters(self) -> dict[str, int]:
+        """The raw parameters of a Gaussian by name, and how many numbers each is: `SHAPE` and the model's own."""
+
+    # ---- on the host ----
+
+    @abstractmethod
+    def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
+        """The model's own raw parameters of the n Gaussians that a fit starts with, float [n, size].
+
+        density   at the centres, in the fit's unit, [n]; None where the initial cloud knows none
+        """
+
+    @abstractmethod
+    def amount(self, values: dict[str, np.ndarray]) -> np.ndarray:
+        """Densities, in the fit's unit, or opacities, float64 [N]."""
+
+    @abstractmethod
+    def shared(self, values: dict[str, np.ndarray], chosen: np.ndarray, factor: float) -> dict[str, np.ndarray]:
+        """The values with those of the chosen Gaussians [N] as each of the two should have that replace one.
+
+        factor   of the density
+        """
+
+    @abstractmethod
+    def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
+        """Which Gaussians may stay, bool [N].
+
+        centre, scale   [N, 3]
+        half            half the volume's sides, [3]
+        largest         bound of the standard deviations, where the model has one
+        """
+
+    def with_lengths(self, geometry: Geometry) -> Settings:
+        """The settings with what the model has in another unit of length in that of the normalised frame."""
+        return self.settings
+
+    # ---- on the device ----
+
+    @abstractmethod
+    def gaussians(self, values: dict) -> tuple:
+        """Centres, standard deviations, quaternions (not normalised) and densities or opacities, and whatever else
+        `footprints` takes; differentiable."""
+
+    @abstractmethod
+    def footprints(self, gaussians: tuple, rays: View) -> Footprints | Discs:
+        """A cloud on a view's panel, the last two of whose `values` are x and y in pixels; differentiable."""
+
+    @abstractmethod
+    def integrals(self, footprints, rays: View, share=None) -> list:
+        """Line integrals along the rays of a view, a list of Float [height * width]; differentiable.
+
+        share   of the second of two materials in every Gaussian, Float [N], which makes the list of two; None: one material
+        """
+
+    def hold_back(self, gradients: dict, iteration: int):
+        """Set to zero the gradients of what is not fitted yet at an iteration."""
+
+    def _shape(self, values: dict):
+        """Centres, standard deviations by a sigmoid between the bounds (R2-Gaussian), and quaternions, on the device."""
+        bounds = self.settings.bounds
+        low = dr.opaque(mi.Float, bounds.scale_min)
+        high = dr.opaque(mi.Float, bounds.scale_max - bounds.scale_min)
+        return values['centre'], low + high / (1 + dr.exp(-values['scale'])), values['rotation']

@@ -1,0 +1,330 @@
+"""The settings of a fit: every number named, with its source.
+
+The parts are for code. Users, command lines and files know the flat names, which no two parts share:
+`settings.changed(lambda_tv=0.1)`, `settings.flat()['lambda_tv']`, `-D lambda_tv=0.1`, `settings.loss.lambda_tv`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+
+from lingo_mi.errors import InputError
+from lingo_mi.lingo.initialise import LingoSettings
+from lingo_mi.parsing import parse
+from lingo_mi.projectors import cutoff
+
+INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by what is rendered
+
+
+@dataclass(frozen=True)
+class StartSettings(LingoSettings):
+    """Where a fit starts: `LingoSettings`, whose `n_points` is for all, and
+
+    init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume); for alpha compositing 'random' (points in
+                       the volume, as 3DGS where it has no others) or 'cuboid' (X-Gaussian's regular grid)
+    cuboid_step        voxels between the points of `cuboid` (X-Gaussian: 8)
+    fdk_threshold, fdk_rescale
+                       of `r2`: see `lingo_mi.fitting.r2_start` (R2: 0.05 and 0.15)
+
+    The `init_density` 'fdk' becomes 'lsq' where FDK cannot reconstruct (a source off the circle, a panel that moves against
+    it, invalid pixels).
+    """
+
+    init: str = 'r2'
+    cuboid_step: int = 8
+    fdk_threshold: float = 0.05
+    fdk_rescale: float = 0.15
+
+    def __post_init__(self):
+        _require_finite(self)
+        super().__post_init__()
+        _require_at_least(1, self, 'cuboid_step')
+        _require_at_least(0, self, 'fdk_rescale')
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """The forward model.
+
+    render             'integral': pixels are line integrals; or 'alpha': grey images, the projections over their maximum, are
+                       composited front to back from opacities and radiances (3DGS, see `lingo_mi.projectors.alpha`), which
+                       makes no volume
+    normalise          whether densities are fitted in a unit that makes the largest line integral 1 (own): SSIM's
+                       constants and the bounds then mean the same for any object; R2 expects volumes in [0, 1]
+    sh_degree          of `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0 for radiance that is the
+                       same in all directions (X-Gaussian)
+    sh_every           iterations after which another degree joins in (3DGS: 1000)
+    extent             cut-off in standard deviations (R2: 3)
+    effects            'model': where a scan has effects (spectrum, focal spot, blur, dead pixels), the cloud is seen through
+                       them, since a scene that names them says how its data came about; or 'ignore': projections are
+                       taken for line integrals whatever the scene says
+    """
+
+    render: str = 'integral'
+    normalise: bool = False
+    sh_degree: int = 3
+    sh_every: int = 1000
+    extent: float = cutoff.FIT
+    effects: str = 'model'
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require(self.render in INITS, f"render is 'integral' or 'alpha', not {self.render!r}")
+        _require(0 <= self.sh_degree <= 3, f'sh_degree is from 0 to 3, not {self.sh_degree}')
+        _require_at_least(1, self, 'sh_every')
+        _require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
+        _require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """The loss (paper, section III-C).
+
+    lambda_ssim        weight of 1 - SSIM (0.25)
+    lambda_tv          weight of the total variation of a random cube (0.05)
+    tv_size            samples along its sides (32)
+    tv_stride          voxels from sample to sample (own: 2 smooths eight times the volume at the same cost; published: 1)
+    weights            'equal', or 'noise' (own): an image and the measured one are compared after each pixel is divided by
+                       the standard deviation of its noise, as the scan's `ct_detector` says it is
+    loss_scale         'none'; 'dynamic', the paper's T_g + 1 / (4 T_g) on the whole loss; or 'statistic', the same
+                       factor on the densification statistic alone (Adam cancels a constant factor anyway)
+    """
+
+    lambda_ssim: float = 0.25
+    lambda_tv: float = 0.05
+    tv_size: int = 32
+    tv_stride: int = 1
+    weights: str = 'equal'
+    loss_scale: str = 'none'
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require_at_least(0, self, 'lambda_ssim', 'lambda_tv')
+        _require(self.tv_size >= 1 and self.tv_stride >= 1, 'tv_size and tv_stride must be at least 1')
+        _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
+        _require(
+            self.loss_scale in ('none', 'dynamic', 'statistic'),
+            f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}",
+        )
+
+
+@dataclass(frozen=True)
+class AdamSettings:
+    """Adam's step sizes, first and last, which fall log-linearly, and its moments. Lengths are in the normalised frame.
+
+    rate_centre, rate_density, rate_scale, rate_rotation
+                       (R2: the defaults); of `alpha` `rate_centre` is in units of the scene's radius (see `models.alpha`)
+    rate_opacity, rate_radiance, rate_harmonics
+                       of `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025, and a twentieth of that, none of which fall)
+    rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;
+                       0, 0 leaves the poses alone (see `lingo_mi.fitting.poses`)
+    beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
+    epsilon            added to the root of the second moment (R2: 1e-15)
+    average            decay of the running mean of the parameters which is the result (own); 0: those of the last step
+    """
+
+    rate_centre: tuple[float, float] = (2e-4, 2e-5)
+    rate_density: tuple[float, float] = (1e-2, 1e-3)
+    rate_scale: tuple[float, float] = (5e-3, 5e-4)
+    rate_rotation: tuple[float, float] = (1e-3, 1e-4)
+    rate_opacity: tuple[float, float] = (5e-2, 5e-2)
+    rate_radiance: tuple[float, float] = (2.5e-3, 2.5e-3)
+    rate_harmonics: tuple[float, float] = (1.25e-4, 1.25e-4)
+    rate_pose: tuple[float, float] = (0.0, 0.0)
+    beta1: float = 0.9
+    beta2: float = 0.999
+    epsilon: float = 1e-15
+    average: float = 0.0
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require(0 <= self.beta1 < 1 and 0 <= self.beta2 < 1, 'beta1 and beta2 must lie in [0, 1)')
+        _require_at_least(0, self, 'epsilon')
+        _require(0 <= self.average < 1, f'average must be at least 0 and below 1, not {self.average:g}')
+        for name in (f.name for f in fields(self) if f.name.startswith('rate_') and f.name != 'rate_pose'):
+            rate = getattr(self, name)
+            _require(
+                len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}'
+            )
+        _require(
+            len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
+            f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}',
+        )
+
+    def rate(self, name: str, share: float) -> float:
+        """The step size for a parameter (see `lingo_mi.fitting.models`) or 'pose' after a share of the decay, in [0, 1]."""
+        first, last = getattr(self, f'rate_{name}')
+        return first ** (1 - share) * last**share
+
+
+@dataclass(frozen=True)
+class DensificationSettings:
+    """Adaptive density control (see `lingo_mi.fitting.densify`). Lengths are in the normalised frame; of `alpha` `split_size` and
+    `prune_size` are in units of the scene's radius.
+
+    densify_from, densify_until, densify_every   iterations (500, 15000, 100)
+    densify_threshold  mean gradient of the projected centre, in normalised device units (5e-5)
+    birth              'clone': the small are cloned and the large split (R2); 'halve': all are cut in two along their longest
+                       axis, which keeps mass and covariance (own)
+    split_size         of `clone`: Gaussians with a larger standard deviation split (R2: 0.1 of the longest side)
+    prune_density      Gaussians below vanish, as do those outside the volume (1e-5); of `alpha` an opacity, and Gaussians
+                       outside stay (3DGS: 0.005)
+    reset_every        of `alpha`: iterations after which opacities are lowered to 0.01, while densification lasts (3DGS: 3000);
+                       0: never
+    prune_size         of `alpha`: Gaussians with a larger standard deviation vanish after the first reset (3DGS: 0.1)
+    max_gaussians      no densification beyond (500k)
+    values_per_gaussian
+                       measured values that there must be for each Gaussian (own; 0: any number): bounds the Gaussians at
+                       the start and later, since a small scan cannot determine many
+    """
+
+    densify_from: int = 500
+    densify_until: int = 15_000
+    densify_every: int = 100
+    densify_threshold: float = 5e-5
+    birth: str = 'clone'
+    split_size: float = 0.2
+    prune_density: float = 1e-5
+    reset_every: int = 0
+    prune_size: float = 0.1
+    max_gaussians: int = 500_000
+    values_per_gaussian: float = 0.0
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require(self.birth in ('clone', 'halve'), f"birth is 'clone' or 'halve', not {self.birth!r}")
+        _require_at_least(1, self, 'densify_every', 'max_gaussians')
+        _require_at_least(
+            0,
+            self,
+            'densify_from',
+            'densify_until',
+            'densify_threshold',
+            'split_size',
+            'prune_density',
+            'reset_every',
+            'prune_size',
+            'values_per_gaussian',
+        )
+
+
+@dataclass(frozen=True)
+class ScaleBounds:
+    """What standard deviations lie between, in the normalised frame (R2: 5e-4 and 0.5 of the longest side)."""
+
+    scale_min: float = 1e-3
+    scale_max: float = 1.0
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a fit does. In the normalised frame the volume's longest side is 2. Defaults are R2-Gaussian's published values.
+
+    iterations         Adam steps
+    decay_steps        iterations over which the rates fall from first to last; 0 stands for `iterations`
+    batch              views a step
+    coarse_share       share of the iterations, the first ones, that see views binned 2 x 2 (own): a quarter of the pixels
+    checkpoint_seconds how often a checkpoint is written
+    start, model, loss, adam, densification, bounds
+                       the parts, each with its own documentation
+
+    Raises InputError for a value out of its range, and for values that contradict each other.
+    """
+
+    iterations: int = 30_000
+    decay_steps: int = 30_000
+    batch: int = 1
+    coarse_share: float = 0.0
+    checkpoint_seconds: float = 30.0
+    start: StartSettings = field(default_factory=StartSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+    adam: AdamSettings = field(default_factory=AdamSettings)
+    densification: DensificationSettings = field(default_factory=DensificationSettings)
+    bounds: ScaleBounds = field(default_factory=ScaleBounds)
+
+    def __post_init__(self):
+        _require_finite(self)
+        _require_at_least(1, self, 'iterations', 'batch')
+        _require_at_least(0, self, 'decay_steps', 'checkpoint_seconds')
+        _require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
+        inits, init = INITS[self.model.render], self.start.init
+        _require(init in inits, f'init is {inits[0]!r} or {inits[1]!r} with render={self.model.render}, not {init!r}')
+        _require(
+            self.volumetric or self.model.normalise and self.loss.lambda_tv == 0 and self.model.effects == 'ignore',
+            'render=alpha composites grey images and knows no densities: it needs normalise=true, lambda_tv=0 and '
+            'effects=ignore, as in the method 3dgs',
+        )
+        _require(
+            not (self.volumetric and self.densification.reset_every),
+            'reset_every lowers opacities, which only render=alpha has: leave it out',
+        )
+
+    @property
+    def volumetric(self) -> bool:
+        """Whether a fit finds densities, and so a volume: all but alpha compositing do."""
+        return self.model.render == 'integral'
+
+    def rate(self, name: str, iteration: int) -> float:
+        """Adam's step size for a parameter (see `lingo_mi.fitting.models`) or 'pose' at an iteration, counted from 0."""
+        return self.adam.rate(name, min(iteration / max(self.decay_steps or self.iterations, 1), 1.0))
+
+    def flat(self) -> dict:
+        """All values by their flat names, as files and command lines know them."""
+        return {name: value for _, values in self._parts() for name, value in values.items()}
+
+    def changed(self, **values) -> Settings:
+        """These settings with some of them, by their flat names, replaced; values may be strings, as from a command line.
+
+        Raises InputError for an unknown name or a value of the wrong kind.
+
+        Example: `R2.changed(iterations=800, lambda_tv=0.1)`.
+        """
+        known = self.flat()
+        for name, value in values.items():
+            if name not in known:
+                raise InputError(f'unknown setting {name!r}: one of {", ".join(known)}')
+            if isinstance(value, str):
+                values[name] = parse(f'setting {name}', value, known[name])
+        changes = {}
+        for part, own in self._parts():
+            new = {name: values[name] for name in own if name in values}
+            if part and new:
+                changes[part] = replace(getattr(self, part), **new)
+            else:
+                changes |= new
+        return replace(self, **changes)
+
+    def _parts(self):
+        """The flat values of every part, by its name; the first ones, by the name '', are in no part."""
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        yield '', {name: value for name, value in own.items() if not is_dataclass(value)}
+        for name, part in own.items():
+            if is_dataclass(part):
+                yield name, {f.name: getattr(part, f.name) for f in fields(part)}
+
+
+def _require(good: bool, message: str):
+    if not good:
+        raise InputError(message)
+
+
+def _require_finite(part):
+    """Raise InputError where a number of a part is not finite."""
+    for f in fields(part):
+        value = getattr(part, f.name)
+        numbers = [x for x in (value if isinstance(value, tuple) else [value]) if isinstance(x, int | float)]
+        _require(all(map(math.isfinite, numbers)), f'{f.name} must be finite, not {value}')
+
+
+def _require_at_least(least: int, part, *names: str):
+    """Raise InputError where one of the numbers is below 0 or 1."""
+    for name in names:
+        value = getattr(part, name)
+        say = 'not be negative' if least == 0 else f'be at least {least}'
+        _require(value >= least, f'{name} must {say}, not {value:g}')

@@ -1,0 +1,71 @@
+"""The state of a fit: everything that a step changes, and how raw parameters become Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lingo_mi.fitting.activations import inverse_scale, sigmoid
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.settings import Settings
+
+
+@dataclass
+class State:
+    """N Gaussians under optimisation, on the host: NumPy arrays, float32 but for `born`.
+
+    values             raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`
+    first, second      Adam's moments, like `values`
+    gradient, visits   densification statistic: summed norms of the projected centre's gradient, and in how many views it was
+                       seen [N]
+    born               whether a Gaussian came from a clone or a split [N]
+    """
+
+    values: dict[str, np.ndarray]
+    first: dict[str, np.ndarray]
+    second: dict[str, np.ndarray]
+    gradient: np.ndarray
+    visits: np.ndarray
+    born: np.ndarray = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.born)
+
+
+def start(points, spacing, density, settings: Settings) -> State:
+    """The state that begins a fit: isotropic Gaussians, unrotated, without moments.
+
+    points [N, 3], spacing [N] standard deviations, density [N] at the centres, in the fit's unit; normalised frame. Alpha
+    compositing takes None for the density.
+    """
+    low, high = settings.bounds.scale_min, settings.bounds.scale_max
+    n = len(points)
+    scale = np.clip(spacing, low + 1e-5, high - 1e-5)[:, None].repeat(3, 1)
+    values = dict(
+        centre=np.asarray(points),
+        scale=inverse_scale(scale, low, high),
+        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        **forward_model(settings).initial(n, density),
+    )
+    values = {k: np.ascontiguousarray(v, np.float32) for k, v in values.items()}
+    zeros = {k: np.zeros_like(v) for k, v in values.items()}
+    return State(
+        values,
+        zeros,
+        {k: v.copy() for k, v in zeros.items()},
+        np.zeros(n, np.float32),
+        np.zeros(n, np.float32),
+        np.zeros(n, bool),
+    )
+
+
+def activate(state: State, settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, standard deviations, unit quaternions (x, y, z, w) and densities or opacities, float64 [N, ...].
+
+    Scales by a sigmoid between the bounds (R2-Gaussian), the last by the forward model.
+    """
+    low, high = settings.bounds.scale_min, settings.bounds.scale_max
+    centre, scale, rotation = (state.values[k].astype(float) for k in ('centre', 'scale', 'rotation'))
+    rotation = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
+    return centre, low + (high - low) * sigmoid(scale), rotation, forward_model(settings).amount(state.values)

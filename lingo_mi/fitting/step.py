@@ -1,0 +1,133 @@
+"""One step of the fit: compare the views of a scan with the cloud's, differentiate, and move the Gaussians."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.measured import density_unit, modelled_effects, trusted, weights_of
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.poses import Poses, gathered, place
+from lingo_mi.fitting.scattered_light import RENEWED as LIGHT_RENEWED
+from lingo_mi.fitting.scattered_light import light_at_pixels
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.total_variation import random_cube_variation
+from lingo_mi.fitting.view import Target, differentiate, differentiate_replayed
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.scan import Scan
+
+SHARES_RENEWED = 50  # steps after which the shares of two materials are looked at again
+
+
+class Stepper:
+    """The optimisation of a cloud on one scan with one set of settings, step by step.
+
+    model       what a cloud looks like (`CloudModel`)
+    targets     the measured views, on the device; `coarse`: the same binned 2 x 2, for the first iterations
+    poses       corrections of the views; None where they stay as given
+    share       the second of two materials in every Gaussian, as the steps know it
+    scattered   what `ScatteredLight.estimate` gave, as the steps know it
+    """
+
+    def __init__(self, scan: Scan, settings: Settings):
+        """Raises InputError for an empty scan, and for effects that a fit cannot reproduce."""
+        self.settings, self.geometry = settings, scan.geometry
+        scan = trusted(scan, settings)
+        unit = density_unit(scan, settings)
+        self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
+        self.forward = forward_model(settings)
+        self.share = self.scattered = None
+        self.targets = _targets(scan, unit, settings)
+        self.coarse_until = round(settings.coarse_share * settings.iterations)
+        self.coarse = _targets(scan.binned(2), unit, settings) if self.coarse_until else []
+        self.half = scan.geometry.half
+        # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
+        self.flat = scan.geometry.nVoxel[2] == 1
+        self.poses = Poses(len(scan), self.flat) if max(settings.adam.rate_pose) > 0 else None
+
+    def step(self, state: DeviceState, views, iteration: int, rng):
+        """Advance the state by one Adam step on the given views; returns the loss, Float [1], not yet evaluated.
+
+        iteration counts from 0. rng places the total variation's cube.
+        """
+        s = self.settings
+        if self.share is None or iteration % SHARES_RENEWED == 0 or dr.width(self.share) != len(state):
+            self.share = self.model.shares(state)
+        lit = self.model.signal is not None and self.model.signal.scattered
+        if lit and iteration in {round(x * s.iterations) for x in LIGHT_RENEWED}:
+            self.renew_light(state)
+        for value in state.values.values():
+            dr.enable_grad(value)
+        gaussians = self.forward.gaussians(state.values)
+        # Each view and the cube add their derivatives to these; then one pass takes them to the raw parameters.
+        leaf = leaves(gaussians)
+        total = mi.Float(0)
+        targets = self.coarse if iteration < self.coarse_until else self.targets
+        for view in views:
+            target = targets[view]
+            if self.poses is not None:
+                rays = self.poses.correct(target.rays, view)
+                place(target.view, rays)
+            loss, norm, visible = self._view(leaf, target, len(views))
+            total += loss
+            state.gradient += norm
+            state.visits += visible
+            if self.poses is not None:
+                self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s.adam)
+        if s.loss.lambda_tv > 0:
+            total += random_cube_variation(leaf, self.geometry, s, rng)
+        pass_on(gaussians, map(dr.grad, leaf))
+        gradients = {name: dr.grad(value) for name, value in state.values.items()}
+        if self.flat:
+            gradients['centre'].z, gradients['scale'].z = 0, 0
+            gradients['rotation'].x, gradients['rotation'].y = 0, 0
+        self.forward.hold_back(gradients, iteration)
+        state.adam(gradients, s, iteration)
+        return total
+
+    def corrected(self) -> Geometry:
+        """The scan's geometry with its views where the fit has put them: as given, where it left them alone."""
+        return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
+
+    def arrays(self) -> dict:
+        """What steps keep beside the state, by name, for a checkpoint."""
+        share = {} if self.share is None else dict(share=self.share.numpy())
+        scattered = {} if self.scattered is None else dict(scattered=self.scattered)
+        return ({} if self.poses is None else self.poses.arrays()) | share | scattered
+
+    def restore(self, arrays: dict):
+        """Take over what `arrays` gave."""
+        if self.poses is not None:
+            self.poses.restore(arrays)
+        if 'share' in arrays:
+            self.share = uploaded(arrays['share'])
+        if 'scattered' in arrays:
+            self.scattered = arrays['scattered']
+            self._light_targets()
+
+    def renew_light(self, state: DeviceState):
+        """Estimate anew what the cloud scatters into the views."""
+        self.scattered = self.model.signal.scattered.estimate(self.model.cloud(state), self.corrected())
+        self._light_targets()
+
+    def _light_targets(self):
+        """Give all views the scattered light that is expected in them."""
+        views = Scan(self.geometry, light_at_pixels(self.scattered, self.geometry))
+        for targets, scan in ((self.targets, views), (self.coarse, views.binned(2))):
+            for target, image in zip(targets, scan.projections):
+                target.scattered = uploaded(image.ravel())
+
+    def _view(self, leaf, target, batch):
+        """`differentiate` a view: replayed, where nothing but line integrals from known poses is fitted."""
+        if self.model.signal is None and self.poses is None and self.forward.replayable:
+            return differentiate_replayed(leaf, target, self.settings, batch)
+        return differentiate(leaf, target, self.settings, batch, self.model.signal, self.share)
+
+
+def _targets(scan, unit, settings):
+    weights = weights_of(scan, settings)
+    return [Target.of(scan, i, unit, weights) for i in range(len(scan))]

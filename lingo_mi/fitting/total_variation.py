@@ -1,0 +1,44 @@
+"""The total variation of a fit's cloud, sampled in a random cube a step (R2-Gaussian, section 4.2)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting import losses
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.view import evaluate
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.view import vector64
+from lingo_mi.projectors.voxelize import Grid, voxelize
+
+
+def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng: np.random.Generator):
+    """Add the gradient of the total variation of a cube at a random place to that of the Gaussians; returns lambda_tv times
+    it, Float [1].
+
+    gaussians   centres, standard deviations, quaternions and densities, whose gradients are enabled; normalised frame
+    geometry    says the voxels, `tv_stride` of which lie between two samples: all between the centres of the first and the
+                last ones
+    """
+    s, half, extent = settings.loss, geometry.half, settings.model.extent
+    voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1
+    shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
+    room = between - (np.array(shape) - 1) * s.tv_stride
+    corner = -half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
+    voxel = voxel * s.tv_stride
+    low, high = vector64(corner), vector64(corner + shape * voxel)
+    with dr.suspend_grad():
+        centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
+        reach = dr.max(scale) * extent
+        near = dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))
+        index = dr.compress(near)
+    if dr.width(index) == 0:
+        return mi.Float(0)
+    chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
+    cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), extent)
+    loss = s.lambda_tv * losses.tv(cube, shape[::-1])
+    dr.backward(loss)
+    evaluate(gaussians)
+    return dr.detach(loss)

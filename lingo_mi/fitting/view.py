@@ -1,0 +1,145 @@
+"""One measured view in a step of the fit: the cloud's image, the loss and its derivatives."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting import losses
+from lingo_mi.fitting.loss_scale import loss_scale
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.frozen import Replay
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.view import View
+from lingo_mi.scan import Scan
+
+
+@dataclass
+class Target:
+    """A measured view on the device.
+
+    view       its rays
+    pixels     Float [height * width], normalised line integrals over the fit's unit of density
+    weights    Float, what they were multiplied by and images are before they are compared; None: nothing
+    valid      Bool, which of them are valid; None: all
+    rays       the geometry's `Rays` of the view alone
+    scattered  Float, the scattered light that is expected in them; None: none
+    """
+
+    view: View
+    pixels: object
+    weights: object = None
+    valid: object = None
+    rays: object = None
+    scattered: object = None
+
+    @staticmethod
+    def of(scan: Scan, index: int, unit: float, weights=None) -> Target:
+        """View `index` of a scan; weights float32 [view, v, u] or None."""
+        height, width = scan.geometry.nDetector
+        rays = scan.geometry.normalised_rays()[[index]]
+        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
+        valid = None
+        if weights is not None:
+            weights = weights[index].ravel()
+            pixels, weights = pixels * weights, uploaded(weights)
+        if scan.valid is not None and not scan.valid[index].all():
+            valid = mi.Bool(scan.valid[index].ravel())
+            dr.make_opaque(valid)
+        # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
+        # panel would otherwise leave the fast path.
+        return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), weights, valid, rays)
+
+    def masked(self, image):
+        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
+
+        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
+        """
+        if self.weights is not None:
+            image = image * self.weights
+        return image if self.valid is None else dr.select(self.valid, image, 0)
+
+
+def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
+    """Add the gradient of one view's loss to that of the Gaussians, whose gradients are enabled.
+
+    batch   views of a step, over which the loss is a mean
+    signal  `ExpectedSignal` of the detector; None: line integrals
+    share   of the second of two materials in every Gaussian, Float [N]; None: there is one
+
+    Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
+    footprint's place, and 1 where a Gaussian is seen.
+    """
+    s, view, forward = settings.loss, target.view, forward_model(settings)
+    bundles = []  # of rays: one, or all those that the signal is a mean over
+
+    def image_along(rays):
+        footprints = forward.footprints(gaussians, rays)
+        leaf = leaves(footprints.values)  # the statistic is made of their derivatives
+        bundles.append((footprints, leaf))
+        return forward.integrals(replace(footprints, values=leaf), rays, share)
+
+    image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
+    loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
+    weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
+    # Bundles share what leads to a view's pose, so its edges must outlast all but the last.
+    flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
+    dr.backward(loss * weight * (1 / batch), flags=flags)
+    # Not while derivatives are suspended: they would read as zero.
+    gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
+    footprints = bundles[len(bundles) // 2][0]
+    with dr.suspend_grad():
+        norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
+        norm = norm * factor if s.loss_scale == 'statistic' else norm
+        visible = dr.select(footprints.visible, mi.Float(1), 0)
+    for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
+        pass_on(footprints.values, map(dr.grad, leaf), flags)
+        evaluate(gaussians)
+    return dr.detach(loss) * (1 / batch), norm, visible
+
+
+def differentiate_replayed(gaussians, target: Target, settings: Settings, batch: int):
+    """`differentiate` line integrals that are fitted as they are, replayed; the view's pose is a constant."""
+    view = target.view
+    *found, gradients = _REPLAY(
+        *gaussians,
+        view.source,
+        view.corner,
+        view.u,
+        view.v,
+        target.pixels,
+        target.weights,
+        target.valid,
+        height=view.height,
+        width=view.width,
+        parallel=view.parallel,
+        panel=view.panel,
+        settings=settings,
+        batch=batch,
+    )
+    for x, gradient in zip(gaussians, gradients):
+        dr.accum_grad(x, gradient)
+    return found
+
+
+def _differentiated(*arrays, height, width, parallel, panel, settings, batch):
+    *gaussians, source, corner, u, v, pixels, weights, valid = arrays
+    dr.enable_grad(gaussians)
+    target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)
+    return *differentiate(gaussians, target, settings, batch), [dr.grad(x) for x in gaussians]
+
+
+_REPLAY = Replay(_differentiated)
+
+
+def evaluate(values):
+    """Evaluate all derivatives in one kernel; one by one, each would repeat the work that they share."""
+    dr.eval([dr.grad(value) for value in values])

@@ -1,0 +1,72 @@
+"""The running mean of the parameters: what it is, where it begins anew, and that resuming keeps it."""
+
+import numpy as np
+import pytest
+
+from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
+from lingo_mi.errors import InputError
+from lingo_mi.fitting import loop
+from lingo_mi.fitting.models.integral import PARAMETERS
+from lingo_mi.fitting.settings import AdamSettings
+
+AVERAGED = SHORT.changed(average=0.8, iterations=16)
+
+
+def centres_of(settings, scan, **more):
+    """The fit, and the centres after every one of its steps."""
+    seen = []
+
+    class Spy(loop.Average):
+        def add(self, state):
+            seen.append(state.host().values)
+            super().add(state)
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(loop, 'Average', Spy)
+    try:
+        return loop.run(scan, settings, some_points(scan.geometry), seed=3, **more), seen
+    finally:
+        patch.undo()
+
+
+def test_the_result_is_the_mean_since_the_last_densification():
+    """Of SHORT's, after iterations 6 and 12: the mean begins with the parameters after the next step."""
+    scan = tiny_scan(geometry())
+    fitted, seen = centres_of(AVERAGED, scan)
+    assert fitted.state.born.any() and len(seen) == 16
+    for k in PARAMETERS:
+        mean = seen[12][k].astype(float)
+        for value in seen[13:]:
+            mean = 0.8 * mean + 0.2 * value[k]
+        np.testing.assert_allclose(fitted.state.values[k], mean, rtol=1e-5, atol=1e-5)
+        assert not np.allclose(mean, seen[-1][k], rtol=1e-4, atol=1e-4)
+
+
+def test_measurements_are_of_the_mean():
+    scan = tiny_scan(geometry())
+    measured = []
+    fitted = loop.run(
+        scan,
+        AVERAGED,
+        some_points(scan.geometry),
+        seed=3,
+        measure=lambda model, state: measured.append(state.host()) or {},
+    )
+    assert_equal_states(measured[-1], fitted.state)
+
+
+@pytest.mark.parametrize('stop', [14, 12, 16])
+def test_a_resumed_fit_has_the_same_mean(tmp_path, stop):
+    """Stopped in between, right after a densification, or after the last step."""
+    scan, path = tiny_scan(geometry()), tmp_path / 'fit.npz'
+    whole = loop.run(scan, AVERAGED, some_points(scan.geometry), seed=3)
+    with pytest.raises(KeyboardInterrupt):
+        loop.run(scan, AVERAGED, some_points(scan.geometry), seed=3, path=path, progress=stop_at(stop))
+    for _ in range(2):  # the second time a fit that is done
+        assert_equal_states(loop.run(scan, AVERAGED, None, seed=3, path=path).state, whole.state)
+
+
+@pytest.mark.parametrize('average', [-0.1, 1.0])
+def test_bad_decay(average):
+    with pytest.raises(InputError, match='average'):
+        AdamSettings(average=average)

@@ -1,0 +1,92 @@
+"""Settings of a fit, from the text of a command line too."""
+
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.fitting.recipes import METHODS, settings_of
+from lingo_mi.fitting.settings import Settings
+
+
+@pytest.mark.parametrize(
+    'name, text, value',
+    [
+        ('iterations', '1e2', 100),
+        ('lambda_tv', '0', 0.0),
+        ('normalise', 'True', True),
+        ('rate_centre', '1e-3', (1e-3, 1e-3)),
+        ('rate_centre', '1e-3,1e-4', (1e-3, 1e-4)),
+        ('init', 'lingo', 'lingo'),
+    ],
+)
+def test_values(name, text, value):
+    found = Settings().changed(**{name: text}).flat()[name]
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    'name, text, message',
+    [
+        ('iterations', 'inf', 'a whole number'),
+        ('iterations', 'nan', 'a whole number'),
+        ('iterations', '2.5', 'a whole number'),
+        ('iterations', '', 'a whole number'),
+        ('iterations', '0', 'at least 1'),
+        ('lambda_tv', 'inf', 'finite'),
+        ('lambda_tv', 'much', 'a number'),
+        ('normalise', '1', 'true or false'),
+        ('rate_centre', '1,2,3', 'two positive numbers'),
+        ('rate_centre', '0', 'two positive numbers'),
+        ('occupancy_voxels', '0', 'at least 1'),
+        ('high_fraction', '2', 'in [0, 1]'),
+        ('init_density', 'xyz', "'xyz' is unknown"),
+        ('outside', 'left', "'invalid', 'ignore' or 'auto'"),
+        ('lambda', '1', 'unknown'),
+        *(
+            (name, '-1', 'must not be negative')
+            for name in (
+                'lambda_ssim',
+                'lambda_tv',
+                'epsilon',
+                'decay_steps',
+                'densify_from',
+                'densify_threshold',
+                'split_size',
+                'prune_density',
+                'misses',
+                'V_S',
+                'low_factor',
+            )
+        ),
+    ],
+)
+@pytest.mark.parametrize('method', ['r2', 'fast'])
+def test_bad_values(method, name, text, message):
+    with pytest.raises(InputError) as caught:
+        METHODS[method].changed(**{name: text})
+    assert message in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_settings_of():
+    found = settings_of('r2:V_S=1,n_points=70', n_points=90, iterations=5)
+    assert (found.start.V_S, found.start.n_points, found.iterations) == (1.0, 70, 5)
+    for method in ('R2', 'r2:V=1', 'r2:V_S', ':V_S=1', ''):
+        with pytest.raises(InputError):
+            settings_of(method)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_flat_names(method):
+    """Every value has one, no two share one, and they are all that a set of settings is."""
+    settings = METHODS[method]
+    flat = settings.flat()
+    parts = [settings.start, settings.model, settings.loss, settings.adam, settings.densification, settings.bounds]
+    assert len(flat) == 5 + sum(len(vars(part)) for part in parts)
+    assert Settings().changed(**flat) == settings
+    assert flat['lambda_tv'] == settings.loss.lambda_tv and flat['scale_min'] == settings.bounds.scale_min
+
+
+def test_changed_keeps_the_rest():
+    before = METHODS['fast']
+    after = before.changed(lambda_tv=0.1, iterations=800)
+    assert after.flat() == before.flat() | dict(lambda_tv=0.1, iterations=800)
+    assert after.adam is before.adam and before.loss.lambda_tv == 0.15
