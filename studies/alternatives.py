@@ -157,8 +157,7 @@ class Tree:
             self.scene,
             mi.Point3f(origin),
             mi.Vector3f(direction),
-            self.data,
-            self.density,
+            (self.data, self.density),
             dr.opaque(mi.Float, self.epsilon),
             mi.Float(0),
             False,
@@ -176,8 +175,7 @@ class Tree:
                 self.scene,
                 mi.Point3f(origin),
                 mi.Vector3f(direction),
-                self.data,
-                self.density,
+                (self.data, self.density),
                 dr.opaque(mi.Float, self.epsilon),
                 upstream,
                 True,
@@ -190,23 +188,24 @@ class Tree:
 
 
 @dr.syntax
-def _walk(scene, o, d, data, density, epsilon, upstream, backward):
+def _walk(scene, o, d, gaussians, epsilon, upstream, backward):
     total, active = mi.Float(0), mi.Bool(True)
     while active:
         si = scene.ray_intersect_preliminary(mi.Ray3f(o, d), coherent=False, active=active)
         active &= si.is_valid()
         if dr.hint(backward, mode='scalar'):
             with dr.resume_grad():
-                value = _closed_form(o, d, data, density, si.prim_index, active)
+                value = _closed_form(o, d, gaussians, si.prim_index, active)
                 dr.backward_from(value * upstream)
         else:
-            total += _closed_form(o, d, data, density, si.prim_index, active)
+            total += _closed_form(o, d, gaussians, si.prim_index, active)
         o = mi.Point3f((o + d * si.t) + epsilon * d)
     return total
 
 
-def _closed_form(o, d, data, density, index, active):
-    """The line integral through Gaussian `index`; 0 where not active. d is of length 1."""
+def _closed_form(o, d, gaussians, index, active):
+    """The line integral through Gaussian `index` of (data, density); 0 where not active. d is of length 1."""
+    data, density = gaussians
     c = [dr.gather(mi.Float, data, index * 10 + j, active) for j in range(10)]
     rows = rows_of(dr.select(active, mi.Vector4f(*c[6:]), mi.Vector4f(0, 0, 0, 1)), mi.Vector3f)
     s = dr.select(active, mi.Vector3f(*c[3:6]), 1)

@@ -1,4 +1,4 @@
-"""What the command-line scripts share: clear failures, Ctrl-C, and the arguments of a scene."""
+"""What the commands share: clear failures, Ctrl-C, and the arguments of a scene and of the documentation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def guard(main) -> None:
-    """Run a script's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
+    """Run a command's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
 
     Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
     """

@@ -103,19 +103,9 @@ def main():
             f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
             'are no densities; add other --algorithms or --methods'
         )
-    missing = [cell for cell in planned if cells.get(cell) is None]
-    failed = {}
-    try:
-        for i, cell in enumerate(missing, 1):
-            try:
-                cells.compute(cell, f'[{i}/{len(missing)}] {cell}')
-            except InputError as error:  # of one cell: the others are worth having
-                failed[cell] = error
-            write(args.table, rows, objects, cells, args.scale)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt('the same command goes on from here') from None
+    failed = cells.compute_missing(planned, lambda: write(args.table, rows, objects, cells, args.scale))
     print(write(args.table, rows, objects, cells, args.scale))
     print(f'{cells.folder}/: {args.table}.md, {args.table}.json, {args.table}.provenance.json')
     if failed:
         cell, error = next(iter(failed.items()))
-        raise InputError(f'{len(failed)} of {len(missing)} cells failed, the first one ({cell}): {error}')
+        raise InputError(f'{len(failed)} of {len(planned)} cells failed, the first one ({cell}): {error}')

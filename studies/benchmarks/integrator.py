@@ -172,16 +172,16 @@ class Bench:
 
         ours: Any = mi.render(self.scene, self.params, sensor=self.sensors[0])
         dr.backward(ours * mi.TensorXf(weights.reshape(ours.shape)))
-        by: list[Any] = [dr.grad(self.params[name]) for name in KEYS]
-        found = errors(ours.numpy().ravel(), *(x.numpy() for x in by))
+        by_ours: list[Any] = [dr.grad(self.params[name]) for name in KEYS]
+        found = errors(ours.numpy().ravel(), *(x.numpy() for x in by_ours))
         out = dict(zip(('image_error', 'gradient_error'), found))
 
         tree = Tree(mi.TensorXf(self.data), mi.TensorXf(self.density), self.work.extent, EPSILON)
         start = rays(view, 2 * 128.0)
         tree.image(*(type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start))  # builds the tree
         image_of_tree, forward = _timed(tree.image, *start)
-        by, backward = _timed(tree.gradients, *start, mi.Float(weights))
-        return out | dict(zip(TREE, (forward, backward, *errors(image_of_tree.numpy(), *(x.numpy() for x in by)))))
+        by_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
+        return out | dict(zip(TREE, (forward, backward, *errors(image_of_tree.numpy(), *(x.numpy() for x in by_tree)))))
 
 
 def _timed(function, *arguments):

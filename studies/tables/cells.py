@@ -179,6 +179,23 @@ class Cells:
             temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
         return found
 
+    def compute_missing(self, planned: list[Fit | Volume], after_each: Callable[[], object]) -> dict:
+        """Compute those of the planned cells that are not stored, one by one; the errors of those that failed, by cell.
+
+        Raises KeyboardInterrupt, which says that the same command goes on.
+        """
+        missing, failed = [cell for cell in planned if self.get(cell) is None], {}
+        try:
+            for i, cell in enumerate(missing, 1):
+                try:
+                    self.compute(cell, f'[{i}/{len(missing)}] {cell}')
+                except InputError as error:  # of one cell: the others are worth having
+                    failed[cell] = error
+                after_each()
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt('the same command goes on from here') from None
+        return failed
+
     def _dataset(self, name: str) -> Dataset:
         scanned = load_object(name, self.scale.size * self.scale.finer)
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:

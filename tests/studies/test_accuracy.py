@@ -1,7 +1,5 @@
 """The integrator's knobs, the float64 truth of `closed_form`, the other methods, and the measurements of `accuracy`."""
 
-import runpy
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -341,8 +339,8 @@ def test_presets_are_described_as_measured(variant):
     assert described == measured and list(measured) == list(PRESETS)
 
 
-def test_whole_measurement(tmp_path):
-    """Every part on a tiny configuration, down to the documentation."""
+def test_whole_measurement(tmp_path, monkeypatch):
+    """Every part on a tiny configuration, down to the documentation, by the function and by the command."""
     parts = []
     found = measure(TINY, parts.append)
     assert len(parts) == len(found) - 1
@@ -356,10 +354,21 @@ def test_whole_measurement(tmp_path):
     text = document.read_text(encoding='utf-8')
     assert all(table in text for table in tables.values())
     assert (tmp_path / 'out' / 'accuracy.provenance.json').exists() and (tmp_path / 'accuracy.provenance.json').exists()
+    monkeypatch.setattr('lingo_mi.studies.accuracy.measure', lambda *_: found)
+    script, docs = ROOT / 'scripts' / 'accuracy.py', tmp_path / 'docs'
+    docs.mkdir()
+    (docs / 'accuracy.md').write_text('\n'.join(f'<!-- table {name} -->\n<!-- end {name} -->\n' for name in TITLES))
+    code, printed, err = run(script, '--out', tmp_path / 'alone')
+    assert code == 0 and 'pareto.png' in printed, err
+    assert (tmp_path / 'alone' / 'fits.png').exists() and not (docs / 'figures').exists()
+    code, _, err = run(script, '--out', tmp_path / 'other', '--docs', docs)
+    assert code == 0, err
+    assert tables['presets'] in (docs / 'accuracy.md').read_text() and (docs / 'figures' / 'fits.png').exists()
+    assert (
+        '--docs' in (docs / 'accuracy.provenance.json').read_text() and not (tmp_path / 'other' / 'fits.png').exists()
+    )
 
 
-def test_script_describes_itself(monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['accuracy.py', '--help'])
-    with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(ROOT / 'scripts' / 'accuracy.py'), run_name='__main__')
-    assert stop.value.code == 0 and '--quick' in capsys.readouterr().out
+def test_script_describes_itself():
+    code, out, _ = run(ROOT / 'scripts' / 'accuracy.py', '--help')
+    assert code == 0 and '--quick' in out

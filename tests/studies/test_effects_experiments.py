@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from helpers.script import FIT, run
 from lingo_mi.errors import InputError
 from lingo_mi.scene.shipped import scenes
 from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, SETTINGS, measure, quality
@@ -26,8 +27,8 @@ def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
     np.testing.assert_allclose(found['psnr_3d'], 10 * np.log10(truth.max() ** 2 / (0.01 * (truth**2).mean())))
 
 
-def test_an_experiment(tmp_path):
-    """Of the blur: three fits that differ, and the table and picture of them."""
+def test_an_experiment(tmp_path, monkeypatch):
+    """Of the blur: three fits that differ, and the table and picture of them, by the function and by the command."""
     result = measure('psf', TINY, SETTINGS.changed(iterations=12))
     volumes = [result[kind]['volume'] for kind in FITS]
     assert all(v.shape == (16, 16, 16) and np.isfinite(v).all() for v in volumes)
@@ -41,3 +42,14 @@ def test_an_experiment(tmp_path):
     assert (out / 'effects.md').read_text().count('|') == document.read_text().count('|')
     assert all((folder / 'effects.provenance.json').exists() for folder in (out, tmp_path))
     assert (tmp_path / 'figures' / 'psf.png').stat().st_size > 10_000
+    monkeypatch.setattr('lingo_mi.studies.effects.experiments.measure', lambda name: result | dict(title=name))
+    script, again = FIT.with_name('effects.py'), tmp_path / 'again'
+    code, text, err = run(script, '--only', 'psf', 'gain', '--out', again)
+    assert code == 0 and '| gain |' in text and '| psf |' in text, err
+    assert sorted(path.stem for path in again.glob('*.png')) == ['gain', 'psf']
+    code, _, err = run(script, '--only', 'bits', '--out', again, '--docs', tmp_path)
+    assert code == 0, err
+    assert all(f'| {name} |' in document.read_text() for name in ('psf', 'gain', 'bits'))
+    assert (tmp_path / 'figures' / 'effects' / 'bits.png').exists() and not (again / 'bits.png').exists()
+    code, _, err = run(script, '--only', 'psf', 'rain', '--out', tmp_path / 'none')
+    assert code == 2 and 'no experiment' in err and not (tmp_path / 'none').exists()

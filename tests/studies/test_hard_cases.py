@@ -9,6 +9,8 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from helpers.script import FIT
+from helpers.script import run as run_script
 from lingo_mi.errors import AccuracyWarning
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
@@ -87,6 +89,20 @@ def test_table():
     lines = [line for line in text.splitlines() if line.startswith('|')]
     assert len(lines) == 5 and len({line.count('|') for line in lines}) == 1
     assert 'refused: Gaussian 0' in lines[3] and 'warned: the scales' in lines[4]
+
+
+def test_command(tmp_path, monkeypatch):
+    """The page and how it was made; the exit code and a line for each case that misses its tolerance."""
+    good = next(case for case in CASES if case.name == 'density 0, cone')
+    cases = [good, replace(good, name='too good', warned=True)]
+    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases[:1])
+    page = tmp_path / 'page.md'
+    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--markdown', page)
+    assert code == 0 and not err and page.read_text() == out and '| density 0, cone |' in out
+    assert 'hard_cases.py' in (tmp_path / 'page.provenance.json').read_text()
+    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases)
+    code, out, err = run_script(FIT.with_name('hard_cases.py'))
+    assert code == 1 and '| too good |' in out and err == 'missed its tolerance: too good: not warned of\n'
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
