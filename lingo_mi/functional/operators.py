@@ -54,7 +54,7 @@ def project(
     views        indices of the views to project, n of them; None for all
 
     The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
-    Differentiable in all four, not in the geometry: in forward and reverse mode, in JAX in reverse mode. A result that is to
+    Differentiable once in all four, not in the geometry: in forward and reverse mode, in JAX in reverse mode. A result that is to
     be differentiated holds about 100 bytes for each Gaussian in each view until it is, so a step of a fit had better
     project some views than all.
 
@@ -63,7 +63,8 @@ def project(
         loss.backward()                              # PyTorch
 
     Raises InputError for arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no
-    extent or no rotation, views that the scan has not, and arrays on another device than the active variant's.
+    extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
+    `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
     height, width = geometry.nDetector
     rays = geometry.rays()

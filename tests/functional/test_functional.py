@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -394,6 +397,35 @@ def test_torch_devices():
     if _device() == 'cuda':
         with pytest.raises(InputError, match="on the device 'cpu', but the variant cuda"):
             project(*arrays, scan())
+
+
+@pytest.mark.parametrize('kind', KINDS[:1] + KINDS[2:])
+def test_a_fresh_process(kind):
+    """The variant is chosen on first use; what the caller has not imported is not."""
+    framework(kind)
+    make = dict(numpy='numpy.asarray', torch='torch.tensor', jax='jax.numpy.asarray')[kind]
+    program = f"""
+import sys, {make.partition('.')[0]}
+from lingo_mi.functional import project, voxelize
+from lingo_mi.geometry.base import Geometry, circular
+cloud = [{make}(x) for x in ([[0.0, 1.0, 2.0]], [[9.0, 8.0, 7.0]], [[0.0, 0.0, 0.0, 1.0]], [0.5])]
+geometry = Geometry(500, 750, (8, 9), (20, 20), (4, 5, 6), (20, 20, 20), circular(2))
+print(project(*cloud, geometry).shape, voxelize(*cloud, geometry).shape, *sorted({{'torch', 'jax'}} & set(sys.modules)))
+"""
+    found = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    shapes = 'torch.Size([2, 8, 9]) torch.Size([4, 5, 6])' if kind == 'torch' else '(2, 8, 9) (4, 5, 6)'
+    assert found.stdout.split('\n')[0] == shapes + ('' if kind == 'numpy' else f' {kind}')
+
+
+def test_twice_through_one_graph_of_torch():
+    torch = framework('torch')
+    arrays = arrays_of('torch', columns(gaussians()))
+    arrays[3].requires_grad_()
+    images = project(*arrays, scan(), views=[0, 1])
+    (first,) = torch.autograd.grad(images.sum(), arrays[3], retain_graph=True)
+    (again,) = torch.autograd.grad(images.sum(), arrays[3])
+    np.testing.assert_array_equal(host(first), host(again))
 
 
 def test_variant(variant):
