@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 
 import lingo_mi as lm
-from lingo_mi.fit.initial import initial_cloud
+from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels

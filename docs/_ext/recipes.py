@@ -3,7 +3,7 @@
 from docutils import nodes
 from docutils.parsers.rst import Directive
 
-from lingo_mi.fit.recipes import METHODS
+from lingo_mi.fitting.recipes import METHODS
 
 
 class Recipes(Directive):
@@ -17,11 +17,11 @@ class Recipes(Directive):
         head = nodes.thead()
         head += _row([nodes.Text('setting'), *(nodes.literal('', name) for name in names)])
         body = nodes.tbody()
-        settings = {name: METHODS[name].flat() for name in names}
-        for name in settings['r2']:
-            values = [_shown(of[name]) for of in settings.values()]
+        recipes = [METHODS[name].flat() for name in names]
+        for setting in recipes[0]:
+            values = [_shown(recipe[setting]) for recipe in recipes]
             cells = [nodes.Text(v) if v == values[0] else nodes.strong('', v) for v in values]
-            body += _row([nodes.literal('', name), *cells])
+            body += _row([nodes.literal('', setting), *cells])
         group += [head, body]
         table += group
         return [table]
