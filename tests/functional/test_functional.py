@@ -409,7 +409,7 @@ import sys, {make.partition('.')[0]}
 from lingo_mi.functional import project, voxelize
 from lingo_mi.geometry.base import Geometry, circular
 cloud = [{make}(x) for x in ([[0.0, 1.0, 2.0]], [[9.0, 8.0, 7.0]], [[0.0, 0.0, 0.0, 1.0]], [0.5])]
-geometry = Geometry(500, 750, (8, 9), (20, 20), (4, 5, 6), (20, 20, 20), circular(2))
+geometry = CircularGeometry(500, 750, (8, 9), (20, 20), (4, 5, 6), (20, 20, 20), circular(2))
 print(project(*cloud, geometry).shape, voxelize(*cloud, geometry).shape, *sorted({{'torch', 'jax'}} & set(sys.modules)))
 """
     found = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from helpers.script import run
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies import alternatives, oracle
