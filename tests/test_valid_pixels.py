@@ -230,7 +230,7 @@ def test_without_a_mask_no_kernel_knows_of_masks(scan, monkeypatch):
     masked = Scan(scan.geometry, scan.projections, patches(scan))
     plain, with_mask = kernels(scan, settings, start), kernels(masked, settings, start)
     with monkeypatch.context() as patch:
-        patch.setattr(Target, 'seen', lambda self, image: image)
+        patch.setattr(Target, 'masked', lambda self, image: image)
         bare = kernels(scan, settings, start)
     assert plain == bare and len(plain) > 6
     assert set(with_mask) - set(plain)
