@@ -1,4 +1,4 @@
-"""A volume on voxels that starts from a cloud's own: the best that a few views and a fitted cloud give (docs/results.md)."""
+"""A volume on voxels that starts from a cloud's own: the best that a few views and a fitted cloud give (docs/benchmarks/volumes.md)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Refined(Algorithm):
     Structure finer than the voxels has no place on them and becomes streaks. The cloud has no voxels, so that it may be sampled
     on smaller ones: with `finer` all of this is done on these, and their means are returned. It pays for clean projections of
     objects finer than the voxels. One that was simulated on these very voxels is blurred by it, and noise finds more room
-    (docs/results.md, "Better volumes from 25 views").
+    (docs/benchmarks/volumes.md, "Better volumes from 25 views").
 
     niter             passes over the measured views, from 1 on
     completed_niter   passes over the completed views before, from 0 on

@@ -1,6 +1,6 @@
 """A uniform ball by every algorithm: its density within .5 % about the centre, its place within .1 voxel.
 
-`--slow -s` prints the table of docs/results.md: 360 views, and as many iterations as they need.
+`--slow -s` prints the table of docs/benchmarks/correctness.md: 360 views, and as many iterations as they need.
 """
 
 import numpy as np
