@@ -15,6 +15,7 @@ All is computed and given in float32, also for float64 input, whose gradients ar
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterable
 
@@ -87,14 +88,14 @@ def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent:
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
-    shape = tuple(geometry.nVoxel)
+    shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
 
     def grid(*gaussians):
         cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
         values = voxels.voxelize(*gaussians, cells, extent, deep=True)
-        i, (nx, ny, nz) = dr.arange(mi.UInt32, np.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
+        i, (nx, ny, nz) = dr.arange(mi.UInt32, math.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
         # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
         x, rest = i // (ny * nz), i % (ny * nz)
         return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
