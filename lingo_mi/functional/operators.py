@@ -56,7 +56,7 @@ def project(
     views        indices of the views to project, n of them; None for all
 
     The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
-    Differentiable once in all four, not in the geometry: in forward and reverse mode, in JAX in reverse mode. A result that is to
+    Differentiable once in all four, not in the geometry: in reverse mode, in Dr.Jit also in forward mode. A result that is to
     be differentiated holds about 100 bytes for each Gaussian in each view until it is, so a step of a fit had better
     project some views than all.
 
