@@ -20,6 +20,7 @@ the order of threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -47,7 +48,7 @@ class Discs:
     """
 
     values: tuple
-    depth: object
+    depth: Any
     first: tuple
     count: tuple
 

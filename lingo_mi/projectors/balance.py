@@ -12,6 +12,7 @@ at the end, unless they were too large. On the GPU there are many teams, one ima
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,10 +58,10 @@ class Share:
     lanes        of a team
     """
 
-    lane: object
+    lane: Any
     begin: tuple
     end: tuple
-    blocks: object
+    blocks: Any
     lanes: int
 
     def row(self, block):
@@ -90,8 +91,8 @@ class Target:
     private   whether it has one, and needs no atomics
     """
 
-    values: object
-    base: object
+    values: Any
+    base: Any
     private: bool
 
     def add(self, value, index):

@@ -29,6 +29,7 @@ kappa-ellipsoid lies between source and detector. Gaussians for which it does no
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,13 +58,13 @@ class Footprints:
     """
 
     values: tuple
-    column: object
-    row: object
-    row_begin: object
-    row_end: object
-    width: object
-    area: object
-    straddles: object
+    column: Any
+    row: Any
+    row_begin: Any
+    row_end: Any
+    width: Any
+    area: Any
+    straddles: Any
 
     @property
     def visible(self):

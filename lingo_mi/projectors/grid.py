@@ -15,6 +15,7 @@ between the two.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,10 +40,10 @@ class Lines:
     t_min, t_max        numbers or Float, in units of the direction
     """
 
-    origin: object
-    direction: object
-    t_min: object = -dr.inf
-    t_max: object = dr.inf
+    origin: Any
+    direction: Any
+    t_min: Any = -dr.inf
+    t_max: Any = dr.inf
 
 
 @dataclass
@@ -54,11 +55,11 @@ class Walk:
     t_first, t_last   Float, ends of the walk
     """
 
-    origin: object
-    d: object
-    inv: object
-    t_first: object
-    t_last: object
+    origin: Any
+    d: Any
+    inv: Any
+    t_first: Any
+    t_last: Any
 
 
 def _clip(origin, direction, low, high, t_min, t_max):

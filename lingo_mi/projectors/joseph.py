@@ -18,6 +18,7 @@ fastest.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -167,9 +168,9 @@ class _Tables:
 
     size: tuple
     panel: tuple
-    columns: object
+    columns: Any
     rows: tuple
-    matrices: object
+    matrices: Any
     margin: int
 
 

@@ -23,6 +23,7 @@ only grows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -135,12 +136,12 @@ class _Packed:
     bend            Float, 1 for a cone beam, 0 for a parallel one
     """
 
-    vertices: object
-    triangles: object
-    height: object
-    width: object
-    packets: object
-    bend: object
+    vertices: Any
+    triangles: Any
+    height: Any
+    width: Any
+    packets: Any
+    bend: Any
 
     def corners(self, i):
         """The vertices (x, y, q, 0) of a triangle."""

@@ -16,6 +16,7 @@ row to row in twice float32's digits. In a row, t is then the whole pixels from 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -99,10 +100,10 @@ class _Packed:
     packets   Int32, of a row of the image
     """
 
-    numbers: object
-    places: object
-    extent2: object
-    packets: object
+    numbers: Any
+    places: Any
+    extent2: Any
+    packets: Any
 
     def load(self, g):
         """The numbers and the places of footprint g."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,10 +29,10 @@ class View:
                            only a chart of directions); those of a parallel beam are never cut
     """
 
-    source: object
-    corner: object
-    u: object
-    v: object
+    source: Any
+    corner: Any
+    u: Any
+    v: Any
     width: int
     height: int
     parallel: bool = False

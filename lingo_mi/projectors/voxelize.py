@@ -14,6 +14,7 @@ Likewise they sum derivatives by what stays small, t and r, and those by dy and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -55,8 +56,8 @@ class Grid:
     sharing   how the work on them is shared out
     """
 
-    corner: object
-    step: object
+    corner: Any
+    step: Any
     shape: tuple[int, int, int]
     sharing: Sharing = SHARING
 
@@ -157,11 +158,11 @@ class _Packed:
     rows      Int32, of a slice
     """
 
-    numbers: object
-    places: object
-    extent2: object
-    packets: object
-    rows: object
+    numbers: Any
+    places: Any
+    extent2: Any
+    packets: Any
+    rows: Any
 
     def load(self, g):
         """The numbers and the places of Gaussian g, these in two parts."""
