@@ -11,7 +11,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Measured or simulated projections.
 
@@ -91,7 +91,7 @@ class Scan:
         return self.projections * np.float32(self.geometry.scale)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataset:
     """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -40,7 +42,9 @@ class CloudModel:
 
         progress   called as progress(views done, views in all)
         """
-        every, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        g, (height, width) = self.geometry, geometry.nDetector
+        # In the frame of the fit's own volume, whatever the voxels of this geometry.
+        every = replace(geometry, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin).normalised_rays()
         forward = forward_model(self.settings)
         gaussians, share = forward.gaussians(state.values), self.shares(state)
 
@@ -59,18 +63,22 @@ class CloudModel:
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
-        return out * np.float32(self.unit / geometry.scale)
+        return out * np.float32(self.unit / g.scale)
 
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
         """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
 
-        The grid must be of the scan's size, whatever its voxels.
         None for alpha compositing: opacities and radiances are no attenuation.
         """
         if not self.settings.volumetric:
             return None
-        g = geometry or self.geometry
-        grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
+        own = self.geometry
+        if geometry is None:
+            grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+        else:
+            low = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 - own.offOrigin
+            step = np.array(geometry.dVoxel)
+            grid = Grid(vector64(low * own.scale), vector64(step * own.scale), geometry.nVoxel)
         values = voxelize(*state.gaussians(self.settings), grid, self.settings.model.extent, deep=True)
         return grid.volume(values) * np.float32(self.unit)
 

@@ -87,5 +87,5 @@ def settings_of(method: str, **values) -> Settings:
     """
     name, _, changes = method.partition(':')
     if name not in METHODS:
-        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
+        raise InputError(f'{method}: there is no such recipe; use one of {", ".join(METHODS)}')
     return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))

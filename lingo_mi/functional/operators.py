@@ -68,6 +68,7 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
     `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
+    _require_geometry(geometry)
     height, width = geometry.nDetector
     rays = geometry.rays()
     index = _indices(views, len(rays))
@@ -89,6 +90,7 @@ def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent:
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
+    _require_geometry(geometry)
     shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
@@ -114,6 +116,11 @@ def _checked(function, name: str):
     return wrapped
 
 
+def _require_geometry(geometry):
+    if not isinstance(geometry, Geometry):
+        raise InputError(f'geometry must be a Geometry, not {type(geometry).__name__}; of a scan give scan.geometry')
+
+
 def _extent(extent) -> float:
     if not 1 <= extent <= 20:
         raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
@@ -129,5 +136,5 @@ def _indices(views, count: int) -> np.ndarray:
     except TypeError:
         raise InputError(f'views must be whole numbers, one a view, not {views!r}') from None
     if len(found) == 0 or found.min() < -count or found.max() >= count:
-        raise InputError(f'views must be at least one number from 0 to {count - 1}, not {views!r}')
+        raise InputError(f'views must be at least one number from {-count} to {count - 1}, not {views!r}')
     return found

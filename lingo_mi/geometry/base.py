@@ -35,7 +35,7 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix, scanner_rays
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry(ABC):
     """A scan with a flat panel and a voxel grid: what every kind of scan has, and the constructors of both kinds.
 
@@ -355,7 +355,7 @@ class Geometry(ABC):
         return {name: getattr(self, name) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CircularGeometry(Geometry):
     """The source on a circle about z before an upright panel, rows down.
 
@@ -424,7 +424,7 @@ class CircularGeometry(Geometry):
         return replace(self, nDetector=shape, dDetector=step, offDetector=offset)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PosedGeometry(Geometry):
     """A scan with a pose for every view.
 

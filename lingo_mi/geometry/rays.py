@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rays:
     """The rays of n flat-panel views.
 

@@ -31,7 +31,7 @@ class Analytic(Protocol):
         """Exact line integrals, float32 [view, v, u], density times mm."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Phantom:
     """A voxelized test object.
 

@@ -67,6 +67,7 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
         psnr_2d=of(metrics.psnr_2d, rendered, expected),
         ssim_2d=of(metrics.ssim_2d, rendered, expected),
+        ssim_2d_absolute=of(metrics.ssim_2d_absolute, rendered, expected),
         **compared(volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),

@@ -53,7 +53,13 @@ def measured(count: int, pixels: int, repeats: int) -> tuple[float, float]:
         rng.uniform(0.01, 0.02, count),
     )
     geometry = CircularGeometry(
-        500, 750, (pixels, pixels), (256 / pixels, 256 / pixels), (64,) * 3, (2.5,) * 3, circular(1)
+        DSO=500,
+        DSD=750,
+        nDetector=(pixels, pixels),
+        dDetector=256 / pixels,
+        nVoxel=(64,) * 3,
+        dVoxel=2.5,
+        angles=circular(1),
     )
     upstream = np.float32(rng.normal(size=(pixels, pixels)))
     both = _native(cloud, geometry, upstream), _through_torch(cloud, geometry, upstream)

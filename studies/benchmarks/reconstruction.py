@@ -43,7 +43,15 @@ def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
     dr.set_thread_count(cores)
     volume = phantoms.make('shepp_logan', size).data
-    geometry = CircularGeometry(1000.0, 1500.0, (size, size), 512 / size, volume.shape, 256 / size, circular(views))
+    geometry = CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(size, size),
+        dDetector=512 / size,
+        nVoxel=volume.shape,
+        dVoxel=256 / size,
+        angles=circular(views),
+    )
     empty = Scan(geometry, np.zeros((views, size, size), np.float32))
     scan = Scan(geometry, ours(empty, volume)['projector']())
     packages = dict(ours=ours(scan, volume))

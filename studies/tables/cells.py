@@ -256,8 +256,7 @@ class Cells:
         dataset = self._measured(cell.fit)
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
         if isinstance(algorithm, Refined):
-            stepper, state = self._cloud(cell.fit)
-            inputs = dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
+            inputs = dict(completed=views, sample=self._cloud(cell.fit).volume)
             views = dataset.train
         with progress_bar(algorithm, views, label) as progress:
             found = algorithm.run(views, progress=progress, **inputs)
