@@ -76,7 +76,7 @@ class CTScanner(mi.Sensor):
 
     The source runs on a circle in the plane z = 0 unless told otherwise; `lingo_mi.geometry.base` states the frame, and
     `lingo_mi.geometry.trajectories.scanner_rays` what moves it. One view of a scanner is a
-    sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scene.load.scan` renders them all.
+    sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scene.simulate.take_scan` renders them all.
     """
 
     def __init__(self, props):

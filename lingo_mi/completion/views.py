@@ -23,7 +23,7 @@ def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
     """The measured views of a data set whose rays are those of `geometry`, in its order, to a hundredth of a pixel.
 
     Angles do not tell views: a helix comes back to them at other heights. Where views repeat each other, they are those that
-    `geometry.base.spread` chooses, else the first of them that are left. Raises InputError where a view is missing.
+    `geometry.trajectories.spread` chooses, else the first of them that are left. Raises InputError where a view is missing.
     """
     scan = dataset.train
     reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()

@@ -40,7 +40,7 @@ class View:
 
     @staticmethod
     def of(rays, index: int, height: int, width: int, panel: bool = True) -> View:
-        """View `index` of `lingo_mi.geometry.base.Rays`."""
+        """View `index` of `lingo_mi.geometry.rays.Rays`."""
         return View(
             *(vector64(a[index]) for a in (rays.source, rays.corner, rays.u, rays.v)),
             width,

@@ -13,7 +13,7 @@ from lingo_mi.scan import Dataset, Scan
 
 
 def quick_measure(dataset: Dataset, most: int = 4):
-    """A function for `fit.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where the truth is known."""
+    """A function for `fitting.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where there is a truth."""
     test = dataset.test
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)

@@ -38,7 +38,7 @@ def points(n: int = 50) -> InitialCloud:
 
 
 def fit_to(scan: Scan, iterations: int, **changes):
-    """A fit that densifies often, as `fit.loop.run` returns it.
+    """A fit that densifies often, as `fitting.loop.run` returns it.
 
     changes   to its settings
 
