@@ -71,7 +71,8 @@ def project(
     rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        found = [line_integrals(*gaussians, View.of(rays, i, height, width), options) for i in range(len(index))]
+        views = (View.of(rays, i, height, width) for i in range(len(index)))
+        found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 
     return call(
@@ -86,14 +87,14 @@ def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent:
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
-    shape = tuple(geometry.nVoxel)
+    shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
 
     def grid(*gaussians):
         cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
-        values = voxels.voxelize(*gaussians, cells, extent, deep=True)
-        i, (nx, ny, nz) = dr.arange(mi.UInt32, np.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
+        values = voxels.voxelize(*gaussians, grid=cells, extent=extent, deep=True)
+        i, (nx, ny, nz) = dr.arange(mi.UInt32, int(np.prod(shape))), (dr.opaque(mi.UInt32, n) for n in shape)
         # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
         x, rest = i // (ny * nz), i % (ny * nz)
         return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
@@ -105,7 +106,7 @@ def _checked(function, name: str):
     """A function of Gaussians that first makes sure that they are usable."""
 
     def wrapped(*gaussians):
-        require_usable(*gaussians, f'the arrays given to {name}')
+        require_usable(*gaussians, where=f'the arrays given to {name}')
         return function(*gaussians)
 
     return wrapped

@@ -6,6 +6,7 @@ import drjit as dr
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from lingo_mi.projectors.upload import uploaded_tensor
 
@@ -42,6 +43,6 @@ def _on_host(function, result, *arrays):
     def of_numpy(*arrays):
         return function(*map(np.asarray, arrays))
 
-    if any(isinstance(a, jax.core.Tracer) for a in arrays):
+    if any(isinstance(a, Tracer) for a in arrays):
         return jax.pure_callback(of_numpy, result, *arrays, vmap_method='sequential')
     return jax.tree.map(jnp.asarray, of_numpy(*arrays))

@@ -16,6 +16,7 @@ row to row in twice float32's digits. In a row, t is then the whole pixels from 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -99,10 +100,10 @@ class _Packed:
     packets   Int32, of a row of the image
     """
 
-    numbers: object
-    places: object
-    extent2: object
-    packets: object
+    numbers: Any
+    places: Any
+    extent2: Any
+    packets: Any
 
     def load(self, g):
         """The numbers and the places of footprint g."""
@@ -114,7 +115,7 @@ class Plan:
 
     def __init__(self, prepared, height: int, width: int, extent: float, sharing: Sharing):
         packed, places, *work = prepared
-        self.height, self.width, self.work = height, width, Work(*work, sharing)
+        self.height, self.width, self.work = height, width, Work(*work, sharing=sharing)
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(width))
         self.packed = _Packed(packed, places, extent2, packets)
 
