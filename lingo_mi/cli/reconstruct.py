@@ -150,15 +150,16 @@ def main():
     scan, inputs = dataset.train, {}
     check_scan(scan.geometry, algorithm, views)
     if algorithm is None:
+        assert cloud is not None  # as `check_arguments` has made sure
         began = time.perf_counter()
         volume = sampled(cloud)(scan.geometry)
         found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
         of = f'a cloud fitted to {views}'
     else:
         require_signal(scan)
-        if args.complete:
+        if cloud and args.complete:
             scan, inputs = prepare_completed(dataset, cloud, args.views, algorithm)
-        elif args.start:
+        elif cloud:
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)

@@ -75,7 +75,8 @@ def project(
     rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        found = [line_integrals(*gaussians, View.of(rays, i, height, width), options) for i in range(len(index))]
+        views = (View.of(rays, i, height, width) for i in range(len(index)))
+        found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 
     return call(
@@ -97,7 +98,7 @@ def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent:
 
     def grid(*gaussians):
         cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
-        values = voxels.voxelize(*gaussians, cells, extent, deep=True)
+        values = voxels.voxelize(*gaussians, grid=cells, extent=extent, deep=True)
         i, (nx, ny, nz) = dr.arange(mi.UInt32, math.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
         # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
         x, rest = i // (ny * nz), i % (ny * nz)
@@ -110,7 +111,7 @@ def _checked(function, name: str):
     """A function of Gaussians that first makes sure that they are usable."""
 
     def wrapped(*gaussians):
-        require_usable(*gaussians, f'the arrays given to {name}')
+        require_usable(*gaussians, where=f'the arrays given to {name}')
         return function(*gaussians)
 
     return wrapped

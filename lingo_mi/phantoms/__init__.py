@@ -29,6 +29,7 @@ class Analytic(Protocol):
 
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

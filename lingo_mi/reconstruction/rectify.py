@@ -61,7 +61,7 @@ def can_rectify(scan: Scan) -> bool:
     return True
 
 
-def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
+def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> CircularGeometry:
     """The same rays before an upright panel that holds the real panel's shadow of all views, with pixels no coarser.
 
     Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side
@@ -99,10 +99,11 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ge
             right = max(right, -left)
             left = -right
     step_u, step_v = _steps(_homographies(plane, rays), shadow)
+    rows, columns = (int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u))
     return CircularGeometry(
         DSO=DSO,
         DSD=DSD,
-        nDetector=tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
+        nDetector=(rows, columns),
         dDetector=(step_v, step_u),
         nVoxel=geometry.nVoxel,
         dVoxel=geometry.dVoxel,

@@ -323,7 +323,7 @@ def test_recipes():
         found.loss.loss_scale,
         recipe(Fit('foot', 5, 'r2'), TINY).start.n_points,
     ) == (1, 70, 'dynamic', 200)
-    with pytest.raises(InputError, match='unknown'):
+    with pytest.raises(InputError, match='no such recipe'):
         recipe(Fit('foot', 5, '3d'), TINY)
 
 
@@ -336,7 +336,7 @@ def test_recipes():
         (['ct', '--iterations', '0'], 'at least 1'),
         (['views', '--seed', '-1'], 'negative'),
         (['figures'], 'invalid choice'),
-        (['views', '--methods', 'nerf'], 'unknown'),
+        (['views', '--methods', 'nerf'], 'no such recipe'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
         (['ct', '--finer', '0'], 'at least 1'),
     ],
