@@ -46,7 +46,7 @@ fig, axes = plt.subplots(1, 3, figsize=(10, 3.8), layout='constrained')
 volumes = {'truth': foot.data, **{name: result.volume() for name, result in fits.items()}}
 for axis, (name, volume) in zip(axes, volumes.items()):
     shown = axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
-    title = name if name == 'truth' else f"{name}\n{fits[name].metrics()['psnr_3d']:.1f} dB"
+    title = name if name == 'truth' else f'{name}\n{fits[name].metrics()["psnr_3d"]:.1f} dB'
     axis.set(title=title, xticks=[], yticks=[])
 fig.colorbar(shown, ax=axes, label='density [1/mm]')
 

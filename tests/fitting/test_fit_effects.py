@@ -18,7 +18,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.errors import InputError
 from lingo_mi.files.images import read_exr
-from lingo_mi.fit import losses
+from lingo_mi.fitting import losses
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
