@@ -23,7 +23,8 @@ print(data.train.projections.shape, 'to fit,', data.test.projections.shape, 'hel
 # %%
 # The fit
 # -------
-# 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 1400 steps are usual, 250 are enough for a small volume.
+# 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 1400 steps are usual,
+# 250 are enough for a small volume.
 
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 print(result)

@@ -300,7 +300,7 @@ class Texture:
     """
 
     def __init__(self, rng, period: float, step: float, scales):
-        n = int(round(period / step))
+        n = round(period / step)
         self.step = step
         noise = rng.standard_normal((n, n, n), dtype=np.float32)
         sigma = np.array(scales) / step

@@ -1,4 +1,4 @@
-"""A volume on voxels that starts from a cloud's own: the best that a few views and a fitted cloud give (docs/benchmarks/volumes.md)."""
+"""A volume on voxels that starts from a cloud's own: the best that few views and a fitted cloud give (docs/benchmarks)."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Refined(Algorithm):
 
         start       the cloud's volume [x, y, z], density per mm; in its place, and where `finer` is above 1:
         sample      the cloud's densities per mm [x, y, z] at the voxel centres of a geometry, a function of that
-        completed   measured views, which come first, and those between (`completion.views.insert_views`); None where completed_niter is 0
+        completed   measured views, then those between (`completion.views.insert_views`); None where completed_niter is 0
         progress    called as progress(passes done, passes, residual), None for the residual of completed views
 
         Raises InputError where one of these is missing or does not fit the geometry, and where the result is not finite.

@@ -83,7 +83,7 @@ class System:
     def correct(self, x: mi.Float) -> None:
         """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
 
-        Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .45 % (docs/benchmarks/volumes.md), which an
+        Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .45 % (docs/benchmarks), which an
         algorithm that meets the projections to less would otherwise turn into streaks. Costs two projections; nothing where
         the projector is the exact one.
         """

@@ -86,7 +86,7 @@ class ForwardModel(ABC):
         share   of the second of two materials in every Gaussian, Float [N], which makes the list of two; None: one material
         """
 
-    def hold_back(self, gradients: dict, iteration: int):
+    def hold_back(self, gradients: dict, iteration: int):  # noqa: B027 - most models hold nothing back
         """Set to zero the gradients of what is not fitted yet at an iteration."""
 
     def _shape(self, values: dict):
