@@ -36,7 +36,7 @@ data = lm.simulate(volume, geometry, held_out=between)
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 fitted = result.volume()
 numbers = result.metrics()
-print(f"held-out views {numbers['psnr_2d']:.1f} dB, volume {numbers['psnr_3d_absolute']:.1f} dB below its maximum")
+print(f'held-out views {numbers["psnr_2d"]:.1f} dB, volume {numbers["psnr_3d_absolute"]:.1f} dB below its maximum')
 
 # %%
 # Coronal slices of both. Ribs and vessels of a voxel's width are more than 20 views tell.

@@ -38,7 +38,7 @@ scan = lm.Scan(geometry, projections, valid)
 
 data = lm.Dataset(scan.subset(np.arange(30) % 5 != 4), scan.subset(np.arange(30) % 5 == 4))
 result = lm.fit(data, 'fast', iterations=300, n_points=4000)
-print(f"held-out views: {result.metrics()['psnr_2d']:.1f} dB")
+print(f'held-out views: {result.metrics()["psnr_2d"]:.1f} dB')
 
 rendered = result.render(data.test.geometry)
 volume = result.volume()

@@ -3,7 +3,7 @@ In a PyTorch training loop
 ==========================
 
 `lm.project` is differentiable for PyTorch tensors: the exact X-ray counterpart of a Gaussian rasteriser, without a CUDA
-toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else.
+toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else. It needs ``pip install 'lingo_mi[torch]'``.
 """
 
 # %%
@@ -18,13 +18,7 @@ import lingo_mi as lm
 foot = lm.phantom('foot', size=48)
 angles = np.linspace(0, np.pi, 12, endpoint=False)
 geometry = lm.Geometry.cone(
-    DSO=1000,
-    DSD=1500,
-    nDetector=(72, 72),
-    dDetector=(8, 8),
-    nVoxel=foot.data.shape,
-    dVoxel=foot.spacing,
-    angles=angles,
+    DSO=1000, DSD=1500, nDetector=(72, 72), dDetector=(8, 8), nVoxel=foot.data.shape, dVoxel=foot.spacing, angles=angles
 )
 target = torch.as_tensor(lm.simulate(foot, geometry).train.projections)
 
