@@ -47,6 +47,6 @@ for axis, (name, volume) in zip(axes.flat, volumes.items()):
     axis.set(title=name + quality, xticks=[], yticks=[])
 
 # %%
-# FDK has streaks and cuts the range of densities; on these clean projections SART, ASD-POCS and the cloud are about as good as
-# each other, and what starts from the cloud is 3 dB better. The projections were simulated from the voxels themselves, without
-# noise, which favours whatever works on voxels. The benchmarks have noise, other objects, and objects finer than the voxels.
+# FDK has streaks. On these clean projections 20 passes of SART or ASD-POCS are about as good as the cloud, and what starts from
+# the cloud is 3 dB better. The projections were simulated from the voxels themselves, without noise, which favours whatever
+# works on voxels. The benchmarks have noise, other objects, and objects finer than the voxels.

@@ -3,7 +3,7 @@ Beam hardening and a real detector
 ==================================
 
 A scene with an `xray_tube` or a `ct_detector` is scanned as a real scanner would see it. The fit models what the scene names:
-here a spectrum of 120 kV, whose soft photons are lost first.
+here a spectrum of 120 kV, whose soft photons are lost first. It needs ``pip install 'lingo_mi[physics]'``.
 """
 
 # %%
@@ -24,17 +24,17 @@ print(f'mean energy of the photons {spectrum.mean:.0f} keV')
 
 fits = {name: lm.fit(data, 'fast', iterations=250, n_points=3000, effects=name) for name in ('ignore', 'model')}
 
-fig, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout='constrained')
+fig, axes = plt.subplots(2, 2, figsize=(8, 7), layout='constrained')
 volumes = {'truth': data.volume, 'ignored': fits['ignore'].volume(), 'modelled': fits['model'].volume()}
-for axis, (title, volume) in zip(axes, volumes.items()):
+for axis, (title, volume) in zip(axes.flat, volumes.items()):
     axis.imshow(volume[:, :, 24].T, origin='lower', cmap='gray', vmin=0, vmax=data.volume.max())
     axis.set(title=title, xticks=[], yticks=[])
-    axes[3].plot(volume[:, 24, 24], label=title)
-axes[3].set(xlabel='x [voxels]', ylabel='density [1/mm]')
-axes[3].legend()
+    axes[1, 1].plot(volume[:, 24, 24], label=title)
+axes[1, 1].set(title='middle row', xlabel='x [voxels]', ylabel='density [1/mm]')
+axes[1, 1].legend()
 
 # %%
-# Ignored, the middle of dense parts comes out too thin ("cupping").
+# Where the spectrum is ignored, metal comes out too thin, in its middle most ("cupping"), and the hole is not empty.
 
 for name, result in fits.items():
     error = result.volume() - data.volume

@@ -17,7 +17,7 @@ import lingo_mi as lm
 
 lm.use_variant()
 
-import mitsuba as mi  # noqa: E402
+import mitsuba as mi
 
 # %%
 # A cloud of 200 Gaussians beside a steel cube, before a scanner of 60 views.
