@@ -139,7 +139,7 @@ def main():
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
     if (args.algorithm in FROM_CLOUD or args.start) and not hasattr(cloud, 'gaussians'):
         raise InputError(
-            f'{args.complete or args.start}: opacities and radiances make no volume; '
+            f'{args.complete or args.start}: this recipe fits opacities, not densities, and has no volume; '
             + ('leave out --start' if args.start else 'take another --algorithm')
         )
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed

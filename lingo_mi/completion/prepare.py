@@ -1,4 +1,4 @@
-"""What an algorithm on voxels is given of a scan and a fitted cloud: views completed from it, or its volume to start from."""
+"""Inputs of a voxel algorithm from a scan and a fitted cloud: views completed with it, or its volume as the start."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from lingo_mi.scene.truth import voxelize_cloud
 
 
 def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
-    """The cloud's densities per mm, float32 [x, y, z], at the voxel centres of a geometry, as a function of that.
+    """A function of a geometry that returns the cloud's densities per mm at its voxel centres, float32 [x, y, z].
 
-    Raises InputError for a cloud of alpha compositing, which has none.
+    Raises InputError for a cloud of alpha compositing, which has no densities.
     """
     if isinstance(cloud, Fitted):
-        raise InputError('opacities and radiances make no volume: take the cloud of another method')
+        raise InputError(
+            'this recipe fits opacities, not densities, and has no volume: use a cloud of fast, lingo or r2'
+        )
 
     def sample(geometry: Geometry) -> np.ndarray:
         return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
@@ -34,16 +36,16 @@ def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
 def prepare_completed(
     dataset: Dataset, cloud: FittedCloud | Fitted, views: int, algorithm: Algorithm
 ) -> tuple[Scan, dict[str, Any]]:
-    """The views that a cloud was fitted to and those between them, rendered from it: `views` in all.
+    """The views that a cloud was fitted to, and views between them, rendered from it: `views` in all.
 
         scan, inputs = prepare_completed(dataset, cloud, 100, algorithm)
         found = reconstruct(scan, algorithm, **inputs)
 
     dataset   holds the views that the cloud was fitted to
 
-    `Refined` is given the measured views, and the completed ones and the cloud's densities beside them; any other algorithm the
-    completed ones. Raises InputError as `fitted_views`, `check_scan` and `complete` do, and for FDK where the fit has corrected
-    the poses.
+    `Refined` gets the measured views and, in addition, the completed ones and the cloud's densities. Any other algorithm gets
+    the completed views. Raises InputError as `fitted_views`, `check_scan` and `complete` do, and for FDK if the fit has
+    corrected the poses.
     """
     measured = fitted_views(dataset, cloud.geometry)
     on_circle = [isinstance(g, CircularGeometry) for g in (measured.geometry, cloud.corrected)]
@@ -60,14 +62,14 @@ def prepare_completed(
 
 
 def prepare_start(dataset: Dataset, cloud: FittedCloud | Fitted, algorithm: Algorithm) -> tuple[Scan, dict[str, Any]]:
-    """The views that a cloud was fitted to, with the cloud's own volume to start from.
+    """The views that a cloud was fitted to, with the cloud's volume as the start.
 
         scan, inputs = prepare_start(dataset, cloud, algorithm)
         found = reconstruct(scan, algorithm, **inputs)
 
     dataset   holds the views that the cloud was fitted to
 
-    `Refined` is given the cloud's densities, to sample them on its voxels; its completed_niter must be 0. Raises InputError as
+    `Refined` gets a function that samples the cloud's densities; its completed_niter must be 0. Raises InputError as
     `fitted_views` and `sampled` do.
     """
     scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)

@@ -1,4 +1,4 @@
-"""Views that were not measured: which they are, and a scan completed by rendering them from a fitted cloud."""
+"""Completion of a scan: the views to add between the measured ones, rendered from a fitted cloud."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from lingo_mi.scene.description import MOST_VIEWS
 
 
 def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
-    """The measured views of a data set whose rays are those of `geometry`, in its order, to a hundredth of a pixel.
+    """The measured views of a data set that match the views of `geometry` to a hundredth of a pixel, in its order.
 
-    Angles do not tell views: a helix comes back to them at other heights. Where views repeat each other, they are those that
-    `geometry.trajectories.spread` chooses, else the first of them that are left. Raises InputError where a view is missing.
+    Views are matched by geometry, not by angle: a helix repeats angles at other heights. Among equal views, those that
+    `geometry.trajectories.spread` chooses are preferred, then the first unused. Raises InputError if a view is missing.
     """
     scan = dataset.train
     reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()
@@ -49,15 +49,15 @@ def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
 
 
 def _corners(geometry: Geometry, reach: float) -> np.ndarray:
-    """What tells views apart, [view, 12] in mm: the source, or how far a beam goes sideways in `reach`, and three corners of
-    the panel."""
+    """Points that identify a view, [view, 12] in mm: the source (parallel beam: its direction times `reach`) and three corners
+    of the panel."""
     f, (rows, columns) = geometry.rays(), geometry.nDetector
     source = f.source * reach if f.parallel else f.source
     return np.concatenate([source, f.corner, f.corner + columns * f.u, f.corner + rows * f.v], 1)
 
 
 def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
-    """The `fitted_views` with their poses as the fit has corrected them; as they are, where it left them alone."""
+    """The `fitted_views` with the poses that the fit has corrected; unchanged if it has corrected none."""
     if cloud.corrected is cloud.geometry:
         return scan
     g = scan.geometry
@@ -65,9 +65,9 @@ def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
 
 
 def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.ndarray:
-    """Angles (radians) of the views - len(angles) views that spread `views` as evenly as the given ones allow.
+    """Angles (radians) of the views to add, so that `views` in all are spread as evenly as the given ones allow.
 
-    The widest step is divided first, until there are enough views; an arc that is open stays as long as it is.
+    The widest gap is divided first, until there are enough views. An open arc is not extended.
     """
     order, gap, is_open = gaps(replace(geometry, angles=angles), 2 * np.pi)
     parts = np.ones(len(gap), int)
@@ -77,19 +77,19 @@ def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.nda
 
 
 def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
-    """The line integrals of measured views, `corrected` by the cloud for the effects that its fit has modelled; where it has
-    modelled none, the projections themselves."""
+    """Line integrals of measured views: `corrected`, with the cloud, for the effects that its fit has modelled. Without such
+    effects, the scan itself."""
     if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing models none
         return scan
     return corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
 
 
 def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
-    """A scan of `views` views: the measured ones, `as_corrected` and `without_effects`, and those between them rendered from
+    """A scan of `views` views: the measured ones (`as_corrected` and `without_effects`), and views between them, rendered from
     the cloud.
 
-    Raises InputError where fewer views are asked for than were measured or more than a scan may have, and for a scan that is
-    no circle about z.
+    Raises InputError for fewer views than were measured, for more than a scan may have, and for a scan that is not a circle
+    about z.
     """
     require_circle(scan, 'the completion of a scan')
     if views > MOST_VIEWS:
@@ -101,11 +101,11 @@ def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
 def insert_views(
     scan: Scan, views: int, render: Callable[[Geometry], np.ndarray], circle: Geometry | None = None
 ) -> Scan:
-    """A scan of `views` views: the given ones and those between them, by `render`, a function of their geometry.
+    """A scan of `views` views: the given ones, and views between them from `render(geometry)`.
 
-    circle   where the views should be, if a fit has found them to be beside it (default: where they are)
+    circle   nominal geometry of the views, if a fit has corrected the poses (default: the scan's own)
 
-    Raises InputError where fewer views are asked for than are given.
+    Raises InputError for fewer views than are given.
     """
     geometry = circle or scan.geometry
     if views < len(scan):

@@ -101,7 +101,7 @@ class Detector:
 
     @property
     def expected(self) -> Detector:
-        """The same, of which only what happens to the light is left, and its saturation."""
+        """The same detector without noise, bits and dead pixels: blur and saturation stay."""
         gain = self.gain if self.saturation and self.corrected else 0.0  # what is divided out moves the saturation
         return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 

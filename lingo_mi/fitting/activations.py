@@ -1,4 +1,4 @@
-"""How raw parameters become the numbers of a Gaussian, and back. NumPy."""
+"""Conversions between raw parameters and the numbers of a Gaussian. NumPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def softplus(x) -> np.ndarray:
 
 
 def inverse_softplus(y) -> np.ndarray:
-    """x with softplus(x) = y; y below 1e-30 counts as that, since 0 has no inverse."""
+    """x with softplus(x) = y. y is raised to at least 1e-30, since 0 has no inverse."""
     y = np.maximum(y, 1e-30)
     return y + np.log(-np.expm1(-y))
 

@@ -1,4 +1,4 @@
-"""A running mean of a fit's parameters: steps on single views jitter about what they converge to, and their mean does not."""
+"""Running mean of a fit's parameters: averages out the jitter of steps on single views."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import mitsuba as mi
 
 from lingo_mi.fitting.device import DeviceState, download, upload
 
-PREFIX = 'average.'  # of the names in a checkpoint
+PREFIX = 'average.'  # of its names in a checkpoint
 
 
 class Average:
-    """The exponential moving average of a state's raw parameters, which begins anew when Gaussians come or go.
+    """Exponential moving average of a state's raw parameters. It restarts when Gaussians are added or removed.
 
-    decay   share of the earlier mean in the next one; 0: the parameters themselves
+    decay   weight of the previous mean in the next one; 0: no averaging
 
-    Polyak and Juditsky, "Acceleration of stochastic approximation by averaging", SIAM J. Control Optim. 30 (1992), who take
-    the mean of all steps.
+    After Polyak and Juditsky, "Acceleration of stochastic approximation by averaging", SIAM J. Control Optim. 30 (1992), who
+    average all steps.
     """
 
     def __init__(self, decay: float):
         self.decay, self.values = decay, None
 
     def add(self, state: DeviceState):
-        """Take a step's parameters into the mean."""
+        """Add a step's parameters to the mean."""
         if self.decay == 0:
             return
         if self.values is None:
@@ -35,11 +35,11 @@ class Average:
         dr.eval(self.values)
 
     def restart(self):
-        """Forget the mean."""
+        """Discard the mean."""
         self.values = None
 
     def of(self, state: DeviceState) -> DeviceState:
-        """The state with the mean in place of its parameters."""
+        """The state with its parameters replaced by their mean."""
         if self.values is None:
             return state
         out = copy.copy(state)
@@ -51,10 +51,10 @@ class Average:
         return {PREFIX + k: v for k, v in download(self.values or {}).items()}
 
     def restore(self, arrays: dict):
-        """Take over what `arrays` gave."""
+        """Restore the output of `arrays`."""
         self.values = upload(values_of(arrays)) or None
 
 
 def values_of(arrays: dict) -> dict:
-    """The mean in the arrays of a checkpoint, by the parameters' names, float32 [N, components]; empty where there is none."""
+    """The mean from a checkpoint's arrays, by parameter name, float32 [N, components]; empty if there is none."""
     return {k.removeprefix(PREFIX): v for k, v in arrays.items() if k.startswith(PREFIX)}

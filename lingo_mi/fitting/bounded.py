@@ -1,4 +1,4 @@
-"""The settings of a fit with the bounds that its scan sets."""
+"""Settings of a fit, limited by its scan."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lingo_mi.scan import Scan
 
 
 def bounded(settings: Settings, scan: Scan) -> Settings:
-    """The settings with the bounds that a scan sets.
+    """The settings, limited by a scan.
 
-    The largest scale becomes so small that no Gaussian in the volume can reach the source: beyond it the integral of a
-    cone beam's Gaussian is no footprint (see `projectors.footprint`). `values_per_gaussian` bounds the number of Gaussians.
-    What is in units of the scene's radius becomes a length. Raises InputError where the source is in the volume.
+    The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
+    no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. Settings in units of the
+    scene's radius are converted to lengths. Raises InputError if the source is inside the volume.
     """
     g = scan.geometry
     settings = forward_model(settings).with_lengths(g)

@@ -1,4 +1,4 @@
-"""Checkpoints: all that a fit needs to go on as if it had never stopped."""
+"""Checkpoints: all that a fit needs to continue exactly as without the interruption."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ METRICS, CHECKPOINT = 'metrics.json', 'checkpoint.npz'  # files of a result
 
 
 def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = None) -> None:
-    """Write a state and plain values (`extra`, as JSON) atomically: a crash leaves the earlier checkpoint whole.
+    """Write a state and plain values (`extra`, as JSON) atomically: after a crash, the previous checkpoint is intact.
 
-    arrays   further NumPy arrays to keep, by name
+    arrays   further NumPy arrays to store, by name
 
     Raises InputError if it cannot be written.
     """
     path = Path(path)
     columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
-    temporary = path.with_name(path.name + '.partial')  # what a kill leaves behind, the next one replaces
+    temporary = path.with_name(path.name + '.partial')  # left behind only by a kill, then replaced by the next
     try:
         with open(temporary, 'wb') as file:
             np.savez(
@@ -51,7 +51,7 @@ def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = 
 def load(path: PathLike | str) -> tuple[State, dict, dict]:
     """The state, the plain values and the further arrays of a checkpoint.
 
-    Raises InputError where the file is missing or is no checkpoint. The file cannot run code.
+    Raises InputError if the file is missing or is not a checkpoint. Loading never runs code from the file.
     """
     try:
         with np.load(path, allow_pickle=False) as file:

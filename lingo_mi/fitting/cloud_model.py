@@ -1,4 +1,4 @@
-"""The forward model of a fit: what a state's cloud looks like in views and in a volume. It needs no scan."""
+"""The forward model of a fit: renders and voxelizes a state's cloud. It needs no scan."""
 
 from __future__ import annotations
 
@@ -27,24 +27,26 @@ class CloudModel:
     """Renders and voxelizes the states of a fit.
 
     settings   of the fit
-    geometry   of its scan, as given: says the normalised frame, and the default grid of `volume`
-    unit       the density, in 1/mm, that counts as 1 (`measured.density_unit`)
-    effects    of the scan, where the fit models them (`measured.modelled_effects`); None: line integrals
-    signal     `ExpectedSignal` of these effects; None without
+    geometry   of its scan, as given; defines the normalised frame and the default grid of `volume`
+    unit       the fit's unit of density, 1/mm (`measured.density_unit`)
+    effects    of the scan, if the fit models them (`measured.modelled_effects`); None: line integrals
+    signal     `ExpectedSignal` of these effects; None without effects
     """
 
     def __init__(self, settings: Settings, geometry: Geometry, unit: float, effects: Effects | None = None):
-        """Raises InputError for effects that a fit cannot reproduce."""
+        """Raises InputError for effects that a fit cannot model."""
         self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
         self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
 
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
     ) -> np.ndarray:
-        """What the scan's detector would see in a geometry, noise apart, float32 [view, v, u]: density times mm, or -ln of
-        the expected signal where the fit models effects. Grey images of alpha compositing are taken for line integrals.
+        """Noise-free projections in the views of a geometry, float32 [view, v, u].
 
-        progress   called as progress(views done, views in all)
+        They are line integrals (density times mm), or -ln of the expected signal if the fit models effects. For alpha
+        compositing they are the grey images.
+
+        progress   called as progress(views done, all views)
         """
         g, (height, width) = self.geometry, geometry.nDetector
         # In the frame of the fit's own volume, whatever the voxels of this geometry.
@@ -72,7 +74,8 @@ class CloudModel:
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
         """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
 
-        None for alpha compositing: opacities and radiances are no attenuation.
+        The grid must have the size of the scan's volume, but may have other voxels.
+        None for alpha compositing, whose opacities are not densities.
         """
         if not self.settings.volumetric:
             return None
@@ -88,7 +91,7 @@ class CloudModel:
         return grid.volume(values) * np.float32(self.unit)
 
     def shares(self, state: DeviceState) -> Any:
-        """The second material's share in every Gaussian's density, Float [N]; None where the fit knows one material."""
+        """The second material's share in every Gaussian's density, Float [N]; None for one material."""
         volume = None if self.signal is None or self.signal.split is None else self.volume(state)
         if self.signal is None or volume is None:
             return None
@@ -103,7 +106,7 @@ class CloudModel:
         return None if light is None or cloud is None else light.estimate(cloud, geometry)
 
     def cloud(self, state: DeviceState) -> Ellipsoids | None:
-        """The Gaussians in the world frame, mm, densities in 1/mm; None for alpha compositing, which knows no densities."""
+        """The Gaussians in the world frame, mm, densities in 1/mm; None for alpha compositing, which has no densities."""
         if not self.settings.volumetric:
             return None
         centre, scale, rotation, density = (dr.detach(x) for x in state.gaussians(self.settings))

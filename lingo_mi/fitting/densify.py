@@ -1,16 +1,16 @@
 """Adaptive density control: pure functions from state to state, in NumPy.
 
-R2-Gaussian's rules: where the projected centre's mean gradient is large, a small Gaussian is cloned and a large one
-split in two. A clone and its original take half the density each, which keeps the mass. The halves of a split are
-smaller by 1.6; R2 gives them half the density too, so that three quarters of the mass vanish. Where there is not room
-for all, the strongest go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are removed. Adam's moments
-travel with their Gaussian; new ones start at zero.
+R2-Gaussian's rules: where the mean gradient of the projected centre is large, a small Gaussian is cloned and a large one
+is split in two. A clone and its original get half the density each, which keeps the mass. The two halves of a split are
+smaller by 1.6. R2 gives them half the density too, so three quarters of the mass vanish. If there is not room for all,
+those with the largest gradients go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are removed. Each
+Gaussian keeps its Adam moments; new ones start at zero.
 
-With birth 'halve', which is this project's own, all that are chosen are cut in two along their longest axis instead. Mass,
-mean and covariance stay, so that images hardly change, and both halves keep the moments.
+With birth='halve' (own), every chosen Gaussian is instead cut in two along its longest axis. Mass, mean and covariance stay,
+so images hardly change. Both halves keep the moments.
 
-For alpha compositing the rules are those of 3DGS: clones and halves keep the opacity, the faint vanish and later the large,
-Gaussians outside the volume stay, and from time to time all opacities are lowered (`reset_opacity`).
+Alpha compositing follows 3DGS: clones and halves keep the opacity. Faint Gaussians are removed, later also large ones;
+Gaussians outside the volume stay. All opacities are lowered from time to time (`reset_opacity`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State, activate
 
-RESET = 0.01  # 3DGS: opacity that `reset_opacity` leaves at most
+RESET = 0.01  # 3DGS: largest opacity after `reset_opacity`
 APART = 0.7  # distance of a half's centre from its parent's, in the parent's standard deviations
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
@@ -32,10 +32,10 @@ SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over th
 def densify(state: State, settings: Settings, half, rng, flat: bool = False, largest: float = np.inf) -> State:
     """Clone and split, or halve, and prune once, then clear the statistic.
 
-    half      half the volume's sides, [3]: Gaussians centred outside are removed
+    half      half the volume's sides, [3]; Gaussians centred outside are removed
     rng       numpy Generator; places the halves of splits
-    flat      whether all Gaussians lie in the plane z = 0 of a fan beam, and their halves must too
-    largest   standard deviation above which the Gaussians of alpha compositing vanish
+    flat      True for a fan beam: all Gaussians, also new ones, lie in the plane z = 0
+    largest   alpha compositing: Gaussians with a larger standard deviation are removed
     """
     control = settings.densification
     mean = np.divide(state.gradient, state.visits, out=np.zeros_like(state.gradient), where=state.visits > 0)
@@ -62,7 +62,7 @@ def clone(state: State, chosen, settings: Settings) -> State:
 
 
 def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> State:
-    """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
+    """Replace each chosen Gaussian [N] by two smaller ones, at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation, _ = activate(state, settings)
@@ -78,7 +78,7 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
 
 
 def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State:
-    """Replace each of the chosen Gaussians [N] by two, side by side along its longest axis, with its mass and covariance."""
+    """Replace each chosen Gaussian [N] by two, side by side along its longest axis. The pair has its mass and covariance."""
     parents = np.flatnonzero(chosen)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
@@ -94,8 +94,8 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
 
 
 def prune(state: State, settings: Settings, half, largest: float = np.inf) -> State:
-    """Remove Gaussians whose density or opacity is below the bound, and those that the forward model does not let stay: whose
-    centre left the volume, or a standard deviation of which is above `largest`. Clear the statistic."""
+    """Remove faint Gaussians (density or opacity below `prune_density`) and stray ones: centre outside the volume or, for alpha
+    compositing, a scale above `largest`. Clear the statistic."""
     centre, scale, _, amount = activate(state, settings)
     stays = forward_model(settings).may_stay(centre, scale, half, largest)
     keep = (amount >= settings.densification.prune_density) & stays
@@ -105,7 +105,7 @@ def prune(state: State, settings: Settings, half, largest: float = np.inf) -> St
 
 
 def reset_opacity(state: State) -> State:
-    """Lower all opacities to 0.01 and forget their moments, so that only those that images need come back (3DGS)."""
+    """Lower all opacities to at most 0.01 and clear their moments (3DGS). Those that the images need rise again."""
 
     def with_opacity(columns, opacity):
         return columns | {'opacity': opacity}
@@ -121,7 +121,7 @@ def reset_opacity(state: State) -> State:
 
 
 def _shared(state, chosen, factor, settings):
-    """The state with the chosen densities multiplied, where the forward model has densities."""
+    """The state with the chosen densities multiplied by `factor`, if the forward model has densities."""
     values = forward_model(settings).shared(state.values, chosen, factor)
     return replace(state, values=values)
 

@@ -1,4 +1,4 @@
-"""A fit's state on the device: activation, Adam and the way to the host and back."""
+"""A fit's state on the device: activation, Adam, and transfer to and from the host."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _types() -> dict[str, Any]:
 
 
 class DeviceState:
-    """Twin of `state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `visits` Float [N]."""
+    """`state.State` in Dr.Jit arrays: `values`, `first`, `second` by name; `gradient`, `visits` Float [N]."""
 
     def __init__(self, state: State):
         self.values, self.first, self.second = upload(state.values), upload(state.first), upload(state.second)
@@ -49,8 +49,7 @@ class DeviceState:
         )
 
     def gaussians(self, settings: Settings) -> tuple:
-        """Centres, standard deviations, quaternions (not normalised) and densities, or what else the forward model takes (see
-        `models.base.ForwardModel.gaussians`); differentiable."""
+        """The Gaussians as the forward model takes them (see `models.base.ForwardModel.gaussians`). Differentiable."""
         return forward_model(settings).gaussians(self.values)
 
     def finite(self) -> bool:
@@ -61,7 +60,7 @@ class DeviceState:
     def adam(self, gradients: dict, settings: Settings, iteration: int) -> None:
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
         b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
-        # Numbers that change from step to step must be opaque: literals would be compiled into a new kernel every time.
+        # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
         c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
         for name, g in gradients.items():
             m = b1 * self.first[name] + (1 - b1) * g
@@ -81,6 +80,6 @@ def upload(columns: dict) -> dict:
 
 
 def download(columns: dict) -> dict:
-    """What `upload` was given."""
-    # Component by component: a whole vector would be interleaved by a kernel that has its length compiled in.
+    """The inverse of `upload`."""
+    # By component: interleaving a whole vector takes a kernel with the vector's length compiled in.
     return {k: np.stack([c.numpy() for c in ([x] if isinstance(x, mi.Float) else x)], 1) for k, x in columns.items()}

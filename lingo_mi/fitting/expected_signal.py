@@ -1,4 +1,4 @@
-"""What a scan's detector is expected to see of a cloud: the effects of a scan inside the fit's forward model."""
+"""The signal that a scan's detector is expected to measure of a cloud: a scan's effects in the fit's forward model."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from lingo_mi.projectors.view import View
 class ExpectedSignal:
     """The expected signal of a scan's detector, in the frame and the unit of a fit.
 
-    A line integral q of the fit is p = factor q at the tube's reference energy, without a unit, and pixels are compared as
-    -ln(I / I0) / factor. Two materials are told apart as in a grid, by the density at a Gaussian's centre (Joseph and
-    Spital, J. Comput. Assist. Tomogr. 2, 1978, who divide a first reconstruction so); the shares are constants to the
-    derivatives and are renewed now and then.
+    A line integral q of the fit is p = factor q at the tube's reference energy, without a unit. Pixels are compared as
+    -ln(I / I0) / factor. The density at a Gaussian's centre separates two materials, as in a grid (Joseph and Spital, J.
+    Comput. Assist. Tomogr. 2, 1978, separate a first reconstruction in this way). The shares are constants for the
+    derivatives and are updated every few steps.
 
     effects     with lengths in the fit's frame
-    bands       of the spectrum; None where no material matters
+    bands       of the spectrum; None if materials do not matter
     split       densities between which the second material's share rises, 1/mm; None for one material
-    scattered   the light that the cloud scatters; None where the scan is without
+    scattered   the light that the cloud scatters; None for a scan without scatter
     """
 
     def __init__(self, effects: Effects, geometry: Geometry, unit: float):
-        """effects: of the scan, in mm. unit: the density that counts as 1, 1/mm. Raises InputError for effects that a fit
-        cannot reproduce."""
+        """effects: of the scan, in mm. unit: the fit's unit of density, 1/mm. Raises InputError for effects that a fit
+        cannot model."""
         self.effects = effects.scaled(geometry.scale)
         self.factor = dr.opaque(mi.Float, unit / geometry.scale)
         self.bands, self.split = None, None
@@ -48,10 +48,10 @@ class ExpectedSignal:
             self.split = effects.tube.split if len(names) == 2 else None
 
     def image(self, integrals: Callable[[View], Sequence], view: View, scattered: Any = None) -> Any:
-        """What the pixels of a view are expected to be, Float [height * width]; differentiable.
+        """The expected pixels of a view, Float [height * width]. Differentiable.
 
-        integrals   gives line integrals along the rays of a View, one Float a material
-        scattered   light over the open beam's, Float [height * width], a constant to the derivatives; None: none
+        integrals   function of a View that returns line integrals along its rays, one Float per material
+        scattered   scattered light relative to the open beam's, Float [height * width], not differentiated; None: none
         """
 
         def seen(rays):

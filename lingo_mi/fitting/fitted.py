@@ -1,4 +1,4 @@
-"""What a fit gives: a cloud that renders and voxelizes itself, from a fit that has just ended or from its checkpoint."""
+"""The result of a fit, from `loop.run` or from a checkpoint: a cloud that can be rendered and voxelized."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Fitted:
     model       forward model of the fit: settings as used, geometry of the scan as given, unit of density, modelled effects
     state       the final state (host)
     initial     centres the fit started from, float32 [N, 3], normalised frame
-    poses       corrections of the views; None where the fit left them alone
+    poses       corrections of the views; None if the fit has not corrected them
     seed        of the fit
-    history     measurements over time: iteration, seconds, loss, gaussians, and whatever the fit's `measure` gave
-    seconds     spent in steps, over all sessions
-    info        how the initial cloud came about
+    history     measurements over time: iteration, seconds, loss, gaussians, and the results of the fit's `measure`
+    seconds     spent in steps, including those before an interruption
+    info        data on the initial cloud (`InitialCloud.info`)
 
     Example:
 
@@ -67,16 +67,16 @@ class Fitted:
 
     @property
     def effects(self) -> Effects | None:
-        """Effects of the scan that the fit has modelled; None where it took the projections for line integrals."""
+        """Effects of the scan that the fit has modelled; None if it treated the projections as line integrals."""
         return self.model.effects
 
     @property
     def corrected(self) -> Geometry:
-        """The geometry with its views where the fit has put them: `geometry` itself, where it left them alone."""
+        """The geometry with corrected poses; `geometry` itself if the fit has not corrected them."""
         return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
     def render(self, geometry: Geometry, progress=None) -> np.ndarray:
-        """What the scan's detector would see in a geometry, float32 [view, v, u]: see `CloudModel.render`."""
+        """Projections in the views of a geometry, float32 [view, v, u]; see `CloudModel.render`."""
         return self.model.render(DeviceState(self.state), geometry, progress)
 
     def volume(self, geometry: Geometry | None = None) -> np.ndarray | None:
@@ -88,24 +88,24 @@ class Fitted:
         return self.model.cloud(DeviceState(self.state))
 
     def shares(self) -> np.ndarray | None:
-        """The second material's share in every Gaussian's density, float32 [N]; None where the fit knows one material."""
+        """The second material's share in every Gaussian's density, float32 [N]; None for one material."""
         share = self.model.shares(DeviceState(self.state))
         return None if share is None else share.numpy()
 
     def world_gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Centres and standard deviations in mm, quaternions (x, y, z, w), and densities in 1/mm, or opacities where there are
-        none: float64 [N, 3], [N, 3], [N, 4], [N]."""
+        """Centres and standard deviations in mm, quaternions (x, y, z, w), and densities in 1/mm (alpha compositing:
+        opacities): float64 [N, 3], [N, 3], [N, 4], [N]."""
         centre, scale, rotation, amount = activate(self.state, self.settings)
         size, unit = self.geometry.scale, self.unit if self.settings.volumetric else 1
         return centre / size + self.geometry.offOrigin, scale / size, rotation, amount * unit
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, effects: Effects | None = None) -> Fitted:
-        """The fit that a checkpoint.npz keeps, as far as it had come; needs no scan.
+        """The fit stored in a checkpoint.npz, finished or not. Needs no scan.
 
-        effects   of the scan, where the fit has modelled them: a checkpoint does not keep them
+        effects   of the scan, if the fit has modelled them; a checkpoint does not store them
 
-        Raises InputError where the file is missing or no checkpoint, and where the fit has modelled effects that are not given.
+        Raises InputError if the file is missing or not a checkpoint, or if the fit has modelled effects that are not given.
         """
         state, extra, arrays = checkpoint.load(path)
         try:
@@ -131,5 +131,5 @@ class Fitted:
 
 
 def _settings(stored: dict) -> Settings:
-    """Settings from JSON, which has lists for tuples."""
+    """Settings from JSON, where tuples are lists."""
     return Settings().changed(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})

@@ -1,4 +1,4 @@
-"""The initial cloud of a fit, by the method that its settings name."""
+"""The initial cloud of a fit, by the method of the setting `init`."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from lingo_mi.scan import Scan
 
 
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
-    """Where a fit of `scan` starts: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume.
+    """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume.
 
-    `info['seconds']` is the whole time, an FDK reconstruction or renderings included. Raises InputError where the scan
+    `info['seconds']` is the whole time, including an FDK reconstruction or renderings. Raises InputError if the scan
     gives no cloud.
     """
     begun = time.perf_counter()

@@ -1,4 +1,4 @@
-"""The loop of a fit: views in turn, densification, measurements on the way, checkpoints."""
+"""The loop of a fit: views in turn, densification, intermediate measurements, checkpoints."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def run(
     """Fit a cloud to a scan.
 
     scan       the views to fit
-    initial    where to start; None: go on from `path`, by the same steps as without the interruption. More iterations than
-               the checkpoint was made with are right where `decay_steps` sets the rates and `coarse_share` is 0
-    seed       of the views' order, the total variation's cubes and splits
+    initial    the initial cloud; None: continue from `path`, with the same steps as without the interruption. The fit may
+               then have more iterations than the checkpoint's, if it is `resume.extensible`
+    seed       for the views' order, the total variation's cubes and splits
     measure    called as measure(model, state) at a few iterations; returns numbers for the history
-    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between two steps, where
-               everything is consistent: a KeyboardInterrupt that it raises leaves a checkpoint
-    path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is made
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps. The state is then
+               consistent: if it raises KeyboardInterrupt, a checkpoint is written
+    path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is created
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
 
@@ -97,13 +97,13 @@ def run(
             )
 
     while iteration < settings.iterations:
-        # Not after the last step, which nothing would mend; a longer fit that goes on from there does it first.
+        # Before a step, so never after the last one. A longer fit that continues from there does it first.
         if iteration < settings.densification.densify_until and (
             renewed := _renewed(state, stepper, settings, iteration, rng)
         ):
             state = renewed
             average.restart()
-        while len(order) < settings.batch:  # every view once before any a second time
+        while len(order) < settings.batch:  # every view once before any view twice
             order += rng.permutation(len(scan)).tolist()
         views, rest = order[: settings.batch], order[settings.batch :]
         loss = stepper.step(state, views, iteration, rng)
@@ -112,14 +112,14 @@ def run(
         if iteration in marks:
             dr.sync_thread()
             value = float(loss[0])
-            if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not would silently leave the image
+            if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not finite would silently vanish
                 raise InputError(
                     f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the projections'
                 )
             seconds += time.perf_counter() - clock
             entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
             history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
-            clock = time.perf_counter()  # measuring is not fitting
+            clock = time.perf_counter()  # excludes the time of `measure`
         if progress is not None:
             last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
             try:
@@ -138,7 +138,7 @@ def run(
 
 
 def _renewed(state, stepper, settings, iteration, rng):
-    """The state densified and its opacities reset, as far as they are due after so many iterations; None if neither is."""
+    """The state after densification and reset of opacities, whichever is due at this iteration; None if neither is."""
     s = settings.densification
     densifying = iteration > s.densify_from and iteration % s.densify_every == 0
     resetting = s.reset_every and iteration > 0 and iteration % s.reset_every == 0
@@ -154,5 +154,5 @@ def _renewed(state, stepper, settings, iteration, rng):
 
 
 def measure_at(iterations: int) -> list[int]:
-    """Iterations to measure at: twelve, denser at the beginning, the last one among them."""
+    """Iterations to measure at: up to twelve, denser at the start, including the last."""
     return sorted({max(1, round(iterations * share**1.5)) for share in np.linspace(0, 1, 13)[1:]})

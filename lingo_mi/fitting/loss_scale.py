@@ -1,4 +1,4 @@
-"""The paper's loss scale T_g + 1 / (4 T_g) from Otsu's threshold of a rendered image, without leaving the device."""
+"""The paper's loss scale T_g + 1 / (4 T_g) from Otsu's threshold of a rendered image, computed on the device."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 BINS = 256
-LANES = 32  # histograms for each thread of the CPU
+LANES = 32  # histograms per CPU thread
 
 
 def loss_scale(image: Any, floor: float = 0.01) -> Any:
@@ -26,9 +26,9 @@ def otsu(image: Any) -> Any:
 
     image : Float [N], any unit
 
-    The histogram has 256 bins between the smallest and the largest value, the threshold is the centre of a bin, the
-    lowest of several equally good ones: `skimage.filters.threshold_otsu`, but for values that rounding puts into the
-    next bin. A flat image has no two classes; its one value is returned.
+    The histogram has 256 bins between the smallest and the largest value. The threshold is the centre of a bin, the
+    lowest of equally good ones, as in `skimage.filters.threshold_otsu` (rounding may put a value into the next bin). For
+    a constant image, its value is returned.
 
     Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979).
     """
@@ -39,12 +39,12 @@ def otsu(image: Any) -> Any:
     dr.eval(histogram)
     threshold = low + (mi.Float(_best_bin(histogram)) + 0.5) * ((high - low) / BINS)
     threshold = dr.select(high > low, threshold, low)
-    dr.eval(threshold)  # now, with one lane: not in each lane of whatever uses it
+    dr.eval(threshold)  # in a kernel of one lane, not in every lane of a later kernel
     return threshold
 
 
 def _histogram(image, low, high):
-    """Numbers of pixels in BINS equal bins from low to high, UInt32 [BINS]; a flat image has none."""
+    """Pixel counts of BINS equal bins from low to high, UInt32 [BINS]; zeros for a constant image."""
     if dr.backend_v(image) == dr.JitBackend.LLVM:
         lanes = LANES * dr.thread_count()
         histograms = dr.zeros(mi.UInt32, BINS * lanes)
@@ -52,19 +52,19 @@ def _histogram(image, low, high):
         dr.eval(_count(image, low, high, dr.arange(mi.UInt32, lanes), lanes, histograms), histograms)
         return dr.block_sum(histograms, lanes)
     histogram = dr.zeros(mi.UInt32, BINS)
-    # Most pixels may fall into one bin: those of a warp are added up first.
+    # Most pixels may fall into one bin, so counts are first added within a warp.
     dr.scatter_add(histogram, mi.UInt32(1), _bin(image, low, high), high > low, mode=dr.ReduceMode.Local)
     return histogram
 
 
 def _bin(value, low, high):
-    # The maximum belongs to the last bin. So does what is no number: it has no index.
+    # The maximum belongs to the last bin. NaN goes there too, since it has no bin.
     return dr.minimum(mi.UInt32((value - low) * (BINS / (high - low))), BINS - 1)
 
 
 @dr.syntax
 def _count(image, low, high, lane, lanes, target):
-    """Every lane counts its share of the pixels in a histogram of its own, without atomics."""
+    """Each lane counts its share of the pixels in its own histogram, without atomics."""
     i = mi.UInt32(lane)
     end = dr.select(high > low, mi.UInt32(dr.width(image)), 0)
     while i < end:
@@ -76,10 +76,10 @@ def _count(image, low, high, lane, lanes, target):
 
 @dr.syntax
 def _best_bin(histogram):
-    """The bin up to which the lower class reaches. One lane does it: 256 steps are less than another kernel's launch.
+    """The last bin of the lower class. Computed in one lane: 256 steps cost less than launching another kernel.
 
-    With n pixels and the sum s of their bins in all, n1 and s1 in the lower class, the variance between the classes is
-    (n s1 - n1 s)^2 / (n1 (n - n1)) but for a constant.
+    Let n be the number of pixels and s the sum of their bin numbers; n1 and s1 are those of the lower class. Then the
+    variance between the classes is (n s1 - n1 s)^2 / (n1 (n - n1)), up to a constant factor.
     """
     Float64: Any = dr.float64_array_t(mi.Float)
     i, n, s = mi.UInt32(0), Float64(0), Float64(0)

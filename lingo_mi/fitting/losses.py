@@ -1,18 +1,18 @@
-"""What the fit minimises: L1 and SSIM of a projection, total variation of a cube of voxels.
+"""The loss of a fit: L1 and SSIM of a projection, total variation of a cube of voxels.
 
-SSIM's window is separable, so all of it is four kernels: filter along columns; filter along rows and compare; and the
-two adjoint filters. In each, a lane makes TILE consecutive pixels of a line from TILE + 2 REACH taps, which it keeps in
-registers, and the four maps that SSIM filters travel as one packet a pixel. The packets between column and row filters
-are stored transposed, so that neighbouring lanes always read neighbouring packets.
+SSIM's window is separable, so four kernels suffice: filter along columns; filter along rows and compare; and the two
+adjoint filters. In each kernel, a lane computes TILE consecutive pixels of a line from TILE + 2 REACH taps in registers.
+The four maps that SSIM filters are one packet per pixel. Packets between column and row filters are stored transposed,
+so that neighbouring lanes always read neighbouring packets.
 
-Line integrals are not small: E[x^2] - mu^2 at 10 would lose to rounding what SSIM compares with C2 = 9e-4. Therefore
-nothing is measured from zero:
+Line integrals can be large. At 10, E[x^2] - mu^2 has a rounding error above C2 = 9e-4, SSIM's constant. Therefore all
+values are taken relative to a nearby origin:
 
     a filter       takes its taps relative to the line's middle pixel, which lies in all of its windows; the variance of
                    a window is the mean variance of its columns plus the variance of the columns' means
-    between them   means are kept relative to their *tile's origin*, the pixel in the middle of TILE x TILE of them
-    the adjoint    filters linear functions of the two images, e + g (y - y0) - h (x - x0), with the same origins; a
-                   function is carried over to the next tile by adding the step between the origins
+    between them   means are stored relative to their *tile's origin*, the middle pixel of TILE x TILE pixels
+    the adjoint    filters linear functions of the two images, e + g (y - y0) - h (x - x0), with the same origins; for the
+                   next tile, the step between the origins is added
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def ssim(image, truth, height: int, width: int):
 
     Wang et al. (IEEE TIP 2004) in the form of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5,
     zeros around the images, C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode;
-    the truth is a constant. InputError where the two do not have that many pixels.
+    the truth is a constant. Raises InputError if an image has another number of pixels.
     """
     return 1 - _photometric(image, truth, height, width, 0.0, 1.0)
 
@@ -61,8 +61,8 @@ def tv(volume, shape: tuple[int, int, int]):
     volume : Float [nz * ny * nx], x fastest
     shape  : (nz, ny, nx); an axis of one voxel has no differences
 
-    Subgradient 0 where neighbours agree; 0 for a single voxel. Differentiable in reverse mode. InputError where the
-    volume does not have that many voxels.
+    Subgradient 0 where neighbours agree; 0 for a single voxel. Differentiable in reverse mode. Raises InputError if the
+    volume has another number of voxels.
     """
     _check_size('volume', volume, *shape)
     return dr.custom(_TotalVariation, volume, tuple(shape))
@@ -115,9 +115,9 @@ class _Tiles:
         self.padded_height, self.padded_width = self.down * TILE, self.across * TILE
 
     def columns(self):
-        """Filter along columns; returns sums of |x - y|, and per pixel (mean of x, of y, variance, covariance).
+        """Filter along columns. Returns sums of |x - y|, and per pixel (mean of x, mean of y, variance, covariance).
 
-        The variance is the sum of both images': SSIM needs no more.
+        The variance is the sum of both images' variances, which is all that SSIM needs.
         """
         lane = dr.arange(mi.Int32, self.down * self.padded_width)
         tile, column = lane // self.padded_width, lane % self.padded_width
@@ -174,7 +174,7 @@ class _Tiles:
         return target
 
     def columns_adjoint(self, slopes, factor_l1, factor_ssim):
-        """Filter the derivatives along columns and apply them; returns the gradient of the image."""
+        """Filter the derivatives along columns. Returns the gradient of the image."""
         lane = dr.arange(mi.Int32, self.down * self.width)
         tile, column = lane // self.width, lane % self.width
         index = tile * (TILE * self.padded_width) + column
@@ -209,7 +209,7 @@ class _Tiles:
         )
 
     def _row(self, packed, stride):
-        """A tile's row, its taps in packets stored column by column, and the origins of it and its neighbours."""
+        """A tile's row: its taps, from packets stored by column, and the origins of the tile and its neighbours."""
         lane = dr.arange(mi.Int32, self.across * self.height)
         tile, row = lane // self.height, lane % self.height
         inside = {s: self._inside(tile, s * TILE, self.padded_width) for s in (-1, 0, 1)}
@@ -218,7 +218,7 @@ class _Tiles:
         return tile, row, taps, [self._origin(row // TILE, tile + s, inside[s]) for s in (-1, 0, 1)]
 
     def _origin(self, down, across, active=True):
-        """Both images in the middle of a tile (or the last pixel before it, if the tile is cut off)."""
+        """Both images' values at the middle pixel of a tile (or at the last pixel before it, if the tile is cut off)."""
         row = dr.minimum(down * TILE + TILE // 2, self.height - 1)
         column = dr.minimum(across * TILE + TILE // 2, self.width - 1)
         index = row * self.width + column
@@ -238,7 +238,7 @@ class _Tiles:
         return there[0] - here[0], there[1] - here[1]
 
     def _carry(self, origins, k, s):
-        """The linear function of tap k with the tile's own origin."""
+        """The linear function of tap k, converted to the tile's own origin."""
         if 0 <= k < TILE:
             return s.x, s.y, s.z
         dx, dy = self._step(origins, k)
@@ -259,11 +259,11 @@ def _central(mx, my, squares, product):
 
 
 def _blur(taps):
-    """The TILE windows' means of TILE + 2 REACH consecutive tuples."""
+    """Window means of TILE + 2 REACH consecutive tuples: TILE tuples."""
     weights = [mi.Float(float(w)) for w in WINDOW[REACH:]]
     fma = dr.fma
     maps = []
-    for values in zip(*taps):  # plain numbers trace in half the time of packets
+    for values in zip(*taps):  # tracing scalars takes half the time of tracing packets
         means = []
         for i in range(REACH, REACH + TILE):
             mean = values[i] * weights[0]
@@ -285,7 +285,7 @@ def _compare(mx, my, ox, oy, variance, covariance):
     structure = dr.fma(2, covariance, C2) * i2
     g = 2 * luminance * i2
     h = g * structure
-    # The luminance's derivative, 2 (y - x luminance) / b1, is written without that cancellation.
+    # The luminance's derivative, 2 (y - x luminance) / b1, rewritten without its cancellation.
     e = 2 * structure * i1 * i1 * dm * dr.fma(y, x + y, C1) - g * my + h * mx
     return dr.fma(-luminance, structure, 1), mi.Vector4f(e, g, h, 0)
 

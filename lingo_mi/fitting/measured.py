@@ -1,4 +1,4 @@
-"""What a fit takes of its scan: the pixels it trusts, their weights, the effects it models, the unit of density."""
+"""What a fit uses of its scan: trusted pixels, their weights, modelled effects, the unit of density."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from lingo_mi.scan import Scan
 
 
 def modelled_effects(scan: Scan, settings: Settings) -> Effects | None:
-    """The scan's effects that the fit models; None where it takes the projections for line integrals, because the scan has
-    none or they are ignored."""
+    """The scan's effects that the fit models. None if the scan has none or the settings ignore them: the fit then treats
+    projections as line integrals."""
     effects = scan.effects if settings.model.effects == 'model' else None
     return None if effects is None or effects.ideal else effects
 
 
 def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
-    """What pixels are multiplied by before they are compared, float32 [view, v, u]; None where they are as they are.
+    """Factors of the pixels before comparison, float32 [view, v, u]; None: no weighting.
 
-    One over the standard deviation of a pixel's noise, so that all have the same (as the weights of penalised weighted least
-    squares, Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993, which are squares of these). It follows the mean signal of
-    3 x 3 valid pixels: by its own noise alone a pixel that came out dark would count for less than a bright one. The largest
-    projection stays as large as it was, for the sake of the loss's constants.
+    A weight is 1 / (standard deviation of the pixel's noise), so that all weighted pixels have the same noise. (Its square is
+    the weight of penalised weighted least squares: Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993.) The noise is
+    computed from the mean signal of 3 x 3 valid pixels: from the pixel alone, a pixel that is dark by chance would weigh less
+    than a bright one. The weights are scaled to keep the largest projection, to which SSIM's constants refer.
 
-    Raises InputError for a scan that says neither how many photons it has counted nor its bit depth.
+    Raises InputError for a scan with neither a photon count nor a bit depth.
     """
     if settings.loss.weights == 'equal':
         return None
@@ -46,18 +46,18 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
 
 
 def trusted(scan: Scan, settings: Settings) -> Scan:
-    """The scan without the pixels that its detector knows to be dead."""
+    """The scan without the detector's known dead pixels."""
     effects = scan.effects if settings.model.effects == 'model' else None
     return scan if effects is None else effects.masked(scan)
 
 
 def linearised(scan: Scan, settings: Settings) -> Scan:
-    """A scan of line integrals at the reference energy for what knows no effects: initial clouds, FDK."""
+    """Line integrals at the reference energy, for methods without a model of effects: initial clouds, FDK."""
     effects = scan.effects if settings.model.effects == 'model' else None
     return scan if effects is None else corrections.linearised(scan, effects)
 
 
 def density_unit(scan: Scan, settings: Settings) -> float:
-    """The density, in 1/mm, that a fit counts as 1: see `normalise` of the settings. Raises InputError for an empty scan."""
+    """A fit's unit of density, 1/mm; see the setting `normalise`. Raises InputError for an empty scan."""
     require_signal(scan, 'fit')
     return float(scan.projections.max()) * scan.geometry.scale if settings.model.normalise else 1.0

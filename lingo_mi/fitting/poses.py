@@ -1,14 +1,14 @@
 """Poses of the views, corrected together with the cloud: a rigid motion of source and panel for every view.
 
 A view's correction turns source and panel about the volume's centre and shifts them. The six numbers are found by Adam
-(Kingma and Ba 2015) in the tangent space: a step d turns the view as it stands by exp([d1 d2 d3]) and then shifts it by
-(d4 d5 d6), so that the derivatives are always those at no rotation,
+(Kingma and Ba 2015) in the tangent space. A step d turns the current view by exp([d1 d2 d3]) and then shifts it by
+(d4 d5 d6). The derivatives are therefore always taken at zero rotation:
 
     d loss / d turn  = sum over source, corner, u, v of  x cross (d loss / d x)
     d loss / d shift = d loss / d source + d loss / d corner
 
-A motion of all views together is one of the object, which no projection tells: after every step the mean turn and the mean
-shift of the views are taken off.
+A common motion of all views equals a motion of the object; the projections do not determine it. So after every step the mean
+turn and the mean shift of all views are subtracted.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Poses:
 
     turn    [n, 3] rotation vectors, radians
     shift   [n, 3], in units of half the volume's longest side
-    first, second, steps   Adam's moments [n, 6] of every view, and how often it was moved [n]
+    first, second, steps   Adam's moments [n, 6] and number of steps [n] of every view
     """
 
     def __init__(self, n: int, flat: bool = False):
-        """flat: views of a fan beam, which turn about z and shift in its plane only."""
+        """flat: True for a fan beam, whose views turn about z and shift in their plane only."""
         self.turn, self.shift = np.zeros((n, 3)), np.zeros((n, 3))
         self.first, self.second, self.steps = np.zeros((n, 6)), np.zeros((n, 6)), np.zeros(n, int)
         self.free = np.array([0, 0, 1, 1, 1, 0] if flat else [1] * 6, float)
@@ -46,18 +46,17 @@ class Poses:
         return {f'poses.{k}': getattr(self, k) for k in ('turn', 'shift', 'first', 'second', 'steps')}
 
     def restore(self, arrays: dict):
-        """Take over what `arrays` gave."""
+        """Restore the output of `arrays`."""
         for name in self.arrays():
             setattr(self, name.removeprefix('poses.'), np.array(arrays[name]))
 
     def correct(self, rays: Rays, view: int | None = None) -> Rays:
-        """The views, in the normalised frame, as corrected; only one of them where `view` is given, rays then being its
-        own [1]."""
+        """The corrected views, normalised frame. With `view`, `rays` holds that one view [1] and only it is corrected."""
         chosen = slice(None) if view is None else [view]
         return rays.moved(Rotation.from_rotvec(self.turn[chosen]).as_matrix(), self.shift[chosen])
 
     def corrected(self, geometry: Geometry) -> Geometry:
-        """A scan's geometry, in mm, with its views as corrected."""
+        """A scan's geometry, in mm, with corrected views."""
         g, centre = geometry, np.array(geometry.offOrigin)
         f = self.correct(g.normalised_rays())
         source = f.source if f.parallel else f.source / g.scale + centre
@@ -65,15 +64,15 @@ class Poses:
         return Geometry.from_poses(rays, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
     def undone(self) -> Poses:
-        """What takes corrected views back to where they were."""
+        """The inverse corrections: they take corrected views back to the given poses."""
         back = Poses(len(self.turn))
         back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
         return back
 
     def step(self, view: int, rays: Rays, gradient: dict, rate: float, adam: AdamSettings):
-        """Move a view by one Adam step, then take off the mean motion of all.
+        """Move a view by one Adam step, then subtract the mean motion of all views.
 
-        rays       the view as corrected so far, [1]
+        rays       the view with the corrections so far, [1]
         gradient   derivatives of the loss by its source, corner, u and v, [3] each
         """
         turn = sum(np.cross(getattr(rays, name)[0], gradient[name]) for name in _NAMES)
@@ -88,7 +87,7 @@ class Poses:
         move = -rate * m / (np.sqrt(v) + adam.epsilon)
         by = Rotation.from_rotvec(move[:3])
         self.turn[view] = (by * Rotation.from_rotvec(self.turn[view])).as_rotvec()
-        self.shift[view] = by.apply(self.shift[view]) + move[3:]  # the origin stays: a turn carries the shift along
+        self.shift[view] = by.apply(self.shift[view]) + move[3:]  # turns are about the origin, so the shift turns too
         back = Rotation.from_rotvec(-self.turn.mean(0))
         self.turn = (back * Rotation.from_rotvec(self.turn)).as_rotvec()
         self.shift = back.apply(self.shift)
@@ -96,7 +95,7 @@ class Poses:
 
 
 def place(view, rays: Rays):
-    """Put a `View` where its `rays` [1] are, ready to gather derivatives."""
+    """Set a `View`'s pose to that of `rays` [1] and enable its gradients."""
     for name in _NAMES:
         vector = vector64(getattr(rays, name)[0])
         dr.enable_grad(vector)
@@ -104,5 +103,5 @@ def place(view, rays: Rays):
 
 
 def gathered(view) -> dict:
-    """The derivatives that a view's vectors have gathered, [3] each by name. Waits for the device."""
+    """The accumulated derivatives by a view's vectors, [3] each, by name. Waits for the device."""
     return {name: np.array([float(c[0]) for c in dr.grad(getattr(view, name))]) for name in _NAMES}

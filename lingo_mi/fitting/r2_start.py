@@ -17,16 +17,16 @@ def r2_initialise(
 ) -> InitialCloud:
     """Random voxels of an FDK volume (R2-Gaussian, section 4.1 and its released settings).
 
-    volume     [x, y, z], densities (the normalised frame keeps their number)
+    volume     [x, y, z], densities (the same numbers in the normalised frame)
     half       half the volume's sides in the normalised frame, [3] (`Geometry.half`)
     rng        numpy Generator (default: seed 0)
-    n_points   voxels drawn without replacement; where fewer pass the threshold, all of those
-    threshold  voxels above it take part
-    rescale    density of a Gaussian over that of its voxel
+    n_points   voxels drawn without replacement; all voxels above the threshold if they are fewer
+    threshold  only voxels above it are drawn
+    rescale    density of a Gaussian divided by that of its voxel
 
-    Points sit at voxel centres.
+    Points lie at voxel centres.
 
-    Raises InputError where no voxel passes the threshold.
+    Raises InputError if no voxel is above the threshold.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(0) if rng is None else rng

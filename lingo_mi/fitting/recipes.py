@@ -1,4 +1,4 @@
-"""The recipes: settings that were published, and this project's own."""
+"""The recipes: published settings and this project's own."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from lingo_mi.fitting.settings import Settings
 # Zha et al., "R2-Gaussian: Rectifying Radiative Gaussian Splatting for Tomographic Reconstruction", NeurIPS 2024.
 R2 = Settings()
 LINGO = R2.changed(init='lingo', loss_scale='dynamic')
-# Found by measurement on the foot and chest phantoms. Against LINGO: densities that start from an FDK volume, rates up to 40
-# times higher that fall over the run, moments that forget faster and a mean of the last steps, more weight on SSIM, which
-# brings fine detail forward, total variation of eight times the volume (with moments that forget, what smooths a Gaussian
-# must come more often than once in 64 steps), and earlier densification, as far as the scan's size allows.
+# Tuned on the foot and chest phantoms. Differences from LINGO: initial densities from an FDK volume; rates up to 40 times
+# higher that fall over the run; shorter memory of the moments, and a mean of the last steps; more weight on SSIM, for fine
+# detail; total variation of eight times the volume (with short moments, each Gaussian must be smoothed more often than once
+# in 64 steps); earlier densification, limited by the scan's size.
 FAST = R2.changed(
     init='lingo',
     init_density='fdk',
@@ -40,8 +40,8 @@ FAST = R2.changed(
 )
 
 # Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM TOG 42 (2023), and its released settings, on
-# grey images. Its loss 0.8 L1 + 0.2 (1 - SSIM) is 0.8 times the one here, so that a gradient of 2e-4 there is 2.5e-4 here. Its
-# scales have no bounds: these keep them where float32 and the footprints are sound.
+# grey images. Its loss 0.8 L1 + 0.2 (1 - SSIM) is 0.8 times the one here, so a gradient of 2e-4 there is 2.5e-4 here. Its
+# scales are unbounded; the bounds here keep them where float32 and the footprints are valid.
 GS3D = R2.changed(
     render='alpha',
     init='random',
@@ -59,8 +59,8 @@ GS3D = R2.changed(
     reset_every=3000,
     scale_min=1e-5,
 )
-# Cai et al., "Radiative Gaussian Splatting for Efficient X-ray Novel View Synthesis", ECCV 2024: radiance that is the same in
-# all directions, the cuboid to start from, and the released settings of its foot scan. Its threshold is 2.7e-5 of that loss.
+# Cai et al., "Radiative Gaussian Splatting for Efficient X-ray Novel View Synthesis", ECCV 2024: the same radiance in all
+# directions, a start from the cuboid, and the released settings of its foot scan (threshold 2.7e-5 for 3DGS's loss).
 XGAUSSIAN = GS3D.changed(
     init='cuboid',
     sh_degree=0,
@@ -77,11 +77,12 @@ XGAUSSIAN = GS3D.changed(
 )
 
 METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2, '3dgs': GS3D, 'xgaussian': XGAUSSIAN}
-VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.volumetric)  # those that make a volume
+VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.volumetric)  # those with a volume
 
 
 def settings_of(method: str, **values: Any) -> Settings:
-    """The settings of `name` or `name:setting=value,...`; `values` replace the recipe's own, but not those.
+    """The settings of the recipe `name` or `name:setting=value,...`. `values` replace the recipe's own settings; those in the
+    name take precedence.
 
     Raises InputError for an unknown method or setting.
 

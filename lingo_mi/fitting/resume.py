@@ -1,4 +1,4 @@
-"""Whether a checkpoint belongs to a fit that is to go on from it."""
+"""Checks whether a fit may continue from a checkpoint."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from lingo_mi.fitting.state import State
 
 
 def extensible(settings: Settings) -> bool:
-    """Whether a longer fit begins with the very steps of a shorter one, and can go on from where that ended."""
+    """Whether a longer fit repeats the steps of a shorter one, so that it can continue from its checkpoint."""
     return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.adam.average == 0
 
 
 def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict, seed: int, path: Path):
-    """Raise InputError where a checkpoint belongs to another fit, or its parts do not fit together."""
+    """Raise InputError if a checkpoint belongs to another fit, or is inconsistent."""
     damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
     if (
         not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views', 'scanner', 'signal'}

@@ -1,4 +1,4 @@
-"""Scattered photons in a fit: estimated from its cloud now and then, and held fixed between."""
+"""Scattered photons in a fit: estimated from the cloud at a few steps, and constant in between."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.view import View
 
-# Shares of a fit's steps after which the estimate is renewed. Scatter depends on the object's coarse form alone, which is
-# found first.
+# The estimate is renewed after these shares of a fit's steps. Scatter depends only on the object's coarse shape, which a fit
+# finds first.
 RENEWED = 0, 1 / 16, 1 / 8, 1 / 4, 1 / 2
 
 
 class ScatteredLight:
-    """What a cloud in the volume of a scan scatters (`effects.scatter`).
+    """Light that a cloud in the volume of a scan scatters (`effects.scatter`).
 
-    A view's random numbers are always the same, so an estimate changes with the cloud alone.
+    A view always has the same random numbers, so estimates differ only if the cloud does.
 
-    scatter   parameters, with the volume as the box outside which nothing scatters: a single Gaussian that grows large must
-              not make the box so
+    scatter   parameters; nothing scatters outside the volume, so that a single large Gaussian does not enlarge the box
     """
 
     def __init__(self, scatter: Scatter, tube: Tube, response: str, geometry: Geometry):
@@ -32,7 +31,7 @@ class ScatteredLight:
         self.response = response
 
     def estimate(self, cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
-        """Means and their standard errors on the coarse grid of every view, float64 [2, n, rows, columns].
+        """Mean scattered light and its standard error on the coarse grid of every view, float64 [2, n, rows, columns].
 
         cloud, geometry   in mm
         """
@@ -47,7 +46,7 @@ class ScatteredLight:
 
 
 def light_at_pixels(found: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """The scattered signal over the open beam's at all pixels, float32 [view, v, u], from what `estimate` gave."""
+    """The scattered signal relative to the open beam's at all pixels, float32 [view, v, u]. found: from `estimate`."""
     rows, columns = geometry.nDetector
     views = [smoothed(means, errors, rows, columns) for means, errors in found.swapaxes(0, 1)]
     return np.stack(views).astype(np.float32)

@@ -1,6 +1,6 @@
-"""The settings of a fit: every number named, with its source.
+"""The settings of a fit: every number with its name and source.
 
-The parts are for code. Users, command lines and files know the flat names, which no two parts share:
+Code uses the parts. Users, command lines and files use flat names, which are unique across the parts:
 `settings.changed(lambda_tv=0.1)`, `settings.flat()['lambda_tv']`, `-D lambda_tv=0.1`, `settings.loss.lambda_tv`.
 """
 
@@ -15,21 +15,21 @@ from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import parse
 from lingo_mi.projectors import cutoff
 
-INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by what is rendered
+INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by the setting `render`
 
 
 @dataclass(frozen=True)
 class StartSettings(LingoSettings):
-    """Where a fit starts: `LingoSettings`, whose `n_points` is for all, and
+    """The start of a fit: `LingoSettings` (all starts use its `n_points`), and
 
     init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume); for alpha compositing 'random' (points in
-                       the volume, as 3DGS where it has no others) or 'cuboid' (X-Gaussian's regular grid)
-    cuboid_step        voxels between the points of `cuboid` (X-Gaussian: 8)
+                       the volume; 3DGS without given points) or 'cuboid' (X-Gaussian's regular grid)
+    cuboid_step        for `cuboid`: voxels between points (X-Gaussian: 8)
     fdk_threshold, fdk_rescale
-                       of `r2`: see `lingo_mi.fitting.r2_start` (R2: 0.05 and 0.15)
+                       for `r2`: see `lingo_mi.fitting.r2_start` (R2: 0.05 and 0.15)
 
-    The `init_density` 'fdk' becomes 'lsq' where FDK cannot reconstruct (a source off the circle, a panel that moves against
-    it, invalid pixels).
+    init_density='fdk' becomes 'lsq' if FDK cannot reconstruct the scan (source off the circle, panel that moves relative to
+    the source, invalid pixels).
     """
 
     init: str = 'r2'
@@ -48,18 +48,17 @@ class StartSettings(LingoSettings):
 class ModelSettings:
     """The forward model.
 
-    render             'integral': pixels are line integrals; or 'alpha': grey images, the projections over their maximum, are
-                       composited front to back from opacities and radiances (3DGS, see `lingo_mi.projectors.alpha`), which
-                       makes no volume
-    normalise          whether densities are fitted in a unit that makes the largest line integral 1 (own): SSIM's
-                       constants and the bounds then mean the same for any object; R2 expects volumes in [0, 1]
-    sh_degree          of `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0 for radiance that is the
-                       same in all directions (X-Gaussian)
-    sh_every           iterations after which another degree joins in (3DGS: 1000)
+    render             'integral': pixels are line integrals; 'alpha': grey images (projections divided by their maximum),
+                       composited front to back from opacities and radiances (3DGS, see `lingo_mi.projectors.alpha`),
+                       without a volume
+    normalise          whether to fit densities in a unit that makes the largest line integral 1 (own). SSIM's constants
+                       and the bounds then mean the same for any object. R2 expects volumes in [0, 1]
+    sh_degree          for `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0: the same radiance in
+                       all directions (X-Gaussian)
+    sh_every           for `alpha`: iterations between the starts of successive degrees (3DGS: 1000)
     extent             cut-off in standard deviations (R2: 3)
-    effects            'model': where a scan has effects (spectrum, focal spot, blur, dead pixels), the cloud is seen through
-                       them, since a scene that names them says how its data came about; or 'ignore': projections are
-                       taken for line integrals whatever the scene says
+    effects            'model': the fit models the effects that the scene declares (spectrum, focal spot, blur, dead pixels);
+                       'ignore': it treats all projections as line integrals
     """
 
     render: str = 'integral'
@@ -85,11 +84,11 @@ class LossSettings:
     lambda_ssim        weight of 1 - SSIM (0.25)
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
-    tv_stride          voxels from sample to sample (own: 2 smooths eight times the volume at the same cost; published: 1)
-    weights            'equal', or 'noise' (own): an image and the measured one are compared after each pixel is divided by
-                       the standard deviation of its noise, as the scan's `ct_detector` says it is
-    loss_scale         'none'; 'dynamic', the paper's T_g + 1 / (4 T_g) on the whole loss; or 'statistic', the same
-                       factor on the densification statistic alone (Adam cancels a constant factor anyway)
+    tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
+    weights            'equal'; or 'noise' (own): rendered and measured pixels are divided by the standard deviation of their
+                       noise (from the scan's `ct_detector`) before comparison
+    loss_scale         'none'; 'dynamic': the paper's factor T_g + 1 / (4 T_g) on the whole loss; 'statistic': the same
+                       factor on the densification statistic only (Adam cancels a constant factor of the loss)
     """
 
     lambda_ssim: float = 0.25
@@ -112,17 +111,17 @@ class LossSettings:
 
 @dataclass(frozen=True)
 class AdamSettings:
-    """Adam's step sizes, first and last, which fall log-linearly, and its moments. Lengths are in the normalised frame.
+    """Adam's step sizes (first, last) and moments. Step sizes fall log-linearly. Lengths are in the normalised frame.
 
     rate_centre, rate_density, rate_scale, rate_rotation
-                       (R2: the defaults); of `alpha` `rate_centre` is in units of the scene's radius (see `models.alpha`)
+                       (R2: the defaults); for `alpha`, `rate_centre` is in units of the scene's radius (see `models.alpha`)
     rate_opacity, rate_radiance, rate_harmonics
-                       of `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025, and a twentieth of that, none of which fall)
-    rate_pose          of the corrections to every view's pose (own): radians, and units of half the volume's longest side;
-                       0, 0 leaves the poses alone (see `lingo_mi.fitting.poses`)
+                       for `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025 and a twentieth of that, all constant)
+    rate_pose          for corrections of the views' poses (own): radians, and units of half the volume's longest side;
+                       0, 0: no corrections (see `lingo_mi.fitting.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
     epsilon            added to the root of the second moment (R2: 1e-15)
-    average            decay of the running mean of the parameters which is the result (own); 0: those of the last step
+    average            decay of the running mean of the parameters, which is the result (own); 0: parameters of the last step
     """
 
     rate_centre: tuple[float, float] = (2e-4, 2e-5)
@@ -154,30 +153,30 @@ class AdamSettings:
         )
 
     def rate(self, name: str, share: float) -> float:
-        """The step size for a parameter (see `lingo_mi.fitting.models`) or 'pose' after a share of the decay, in [0, 1]."""
+        """Step size of a parameter (see `lingo_mi.fitting.models`) or of 'pose'. share: progress of the decay, in [0, 1]."""
         first, last = getattr(self, f'rate_{name}')
         return first ** (1 - share) * last**share
 
 
 @dataclass(frozen=True)
 class DensificationSettings:
-    """Adaptive density control (see `lingo_mi.fitting.densify`). Lengths are in the normalised frame; of `alpha` `split_size` and
-    `prune_size` are in units of the scene's radius.
+    """Adaptive density control (see `lingo_mi.fitting.densify`). Lengths are in the normalised frame; for `alpha`, `split_size`
+    and `prune_size` are in units of the scene's radius.
 
     densify_from, densify_until, densify_every   iterations (500, 15000, 100)
     densify_threshold  mean gradient of the projected centre, in normalised device units (5e-5)
-    birth              'clone': the small are cloned and the large split (R2); 'halve': all are cut in two along their longest
-                       axis, which keeps mass and covariance (own)
-    split_size         of `clone`: Gaussians with a larger standard deviation split (R2: 0.1 of the longest side)
-    prune_density      Gaussians below vanish, as do those outside the volume (1e-5); of `alpha` an opacity, and Gaussians
-                       outside stay (3DGS: 0.005)
-    reset_every        of `alpha`: iterations after which opacities are lowered to 0.01, while densification lasts (3DGS: 3000);
+    birth              'clone': small Gaussians are cloned, large ones split (R2); 'halve': all are cut in two along their
+                       longest axis, which keeps mass and covariance (own)
+    split_size         for 'clone': Gaussians with a larger standard deviation are split (R2: 0.1 of the longest side)
+    prune_density      Gaussians of lower density are removed, and those outside the volume (1e-5); for `alpha` it is an
+                       opacity, and Gaussians outside stay (3DGS: 0.005)
+    reset_every        for `alpha`: iterations between resets of the opacities to 0.01, during densification (3DGS: 3000);
                        0: never
-    prune_size         of `alpha`: Gaussians with a larger standard deviation vanish after the first reset (3DGS: 0.1)
-    max_gaussians      no densification beyond (500k)
+    prune_size         for `alpha`: Gaussians with a larger standard deviation are removed after the first reset (3DGS: 0.1)
+    max_gaussians      largest number of Gaussians that densification makes (500k)
     values_per_gaussian
-                       measured values that there must be for each Gaussian (own; 0: any number): bounds the Gaussians at
-                       the start and later, since a small scan cannot determine many
+                       least number of measured values for each Gaussian (own; 0: no limit). Limits the Gaussians at the
+                       start and later, since a small scan cannot determine many
     """
 
     densify_from: int = 500
@@ -212,7 +211,7 @@ class DensificationSettings:
 
 @dataclass(frozen=True)
 class ScaleBounds:
-    """What standard deviations lie between, in the normalised frame (R2: 5e-4 and 0.5 of the longest side)."""
+    """Bounds of standard deviations, in the normalised frame (R2: 5e-4 and 0.5 of the longest side)."""
 
     scale_min: float = 1e-3
     scale_max: float = 1.0
@@ -224,17 +223,17 @@ class ScaleBounds:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a fit does. In the normalised frame the volume's longest side is 2. Defaults are R2-Gaussian's published values.
+    """All settings of a fit. In the normalised frame the volume's longest side is 2. Defaults are R2-Gaussian's published values.
 
     iterations         Adam steps
-    decay_steps        iterations over which the rates fall from first to last; 0 stands for `iterations`
-    batch              views a step
-    coarse_share       share of the iterations, the first ones, that see views binned 2 x 2 (own): a quarter of the pixels
-    checkpoint_seconds how often a checkpoint is written
+    decay_steps        iterations over which the rates fall from first to last; 0: `iterations`
+    batch              views per step
+    coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
+    checkpoint_seconds time between checkpoints
     start, model, loss, adam, densification, bounds
                        the parts, each with its own documentation
 
-    Raises InputError for a value out of its range, and for values that contradict each other.
+    Raises InputError for a value out of its range, and for contradictory values.
     """
 
     iterations: int = 30_000
@@ -268,7 +267,7 @@ class Settings:
 
     @property
     def volumetric(self) -> bool:
-        """Whether a fit finds densities, and so a volume: all but alpha compositing do."""
+        """Whether a fit finds densities and so a volume. Only alpha compositing does not."""
         return self.model.render == 'integral'
 
     def rate(self, name: str, iteration: int) -> float:
@@ -276,11 +275,11 @@ class Settings:
         return self.adam.rate(name, min(iteration / max(self.decay_steps or self.iterations, 1), 1.0))
 
     def flat(self) -> dict:
-        """All values by their flat names, as files and command lines know them."""
+        """All values by their flat names, as in files and on command lines."""
         return {name: value for _, values in self._parts() for name, value in values.items()}
 
     def changed(self, **values: Any) -> Settings:
-        """These settings with some of them, by their flat names, replaced; values may be strings, as from a command line.
+        """A copy with new values, by flat name. Values may be strings, as from a command line.
 
         Raises InputError for an unknown name or a value of the wrong kind.
 
@@ -302,7 +301,7 @@ class Settings:
         return replace(self, **changes)
 
     def _parts(self):
-        """The flat values of every part, by its name; the first ones, by the name '', are in no part."""
+        """Pairs (name of a part, its flat values). The first pair, with the name '', has the values that are in no part."""
         own = {f.name: getattr(self, f.name) for f in fields(self)}
         yield '', {name: value for name, value in own.items() if not is_dataclass(value)}
         for name, part in own.items():
@@ -316,7 +315,7 @@ def _require(good: bool, message: str):
 
 
 def _require_finite(part):
-    """Raise InputError where a number of a part is not finite."""
+    """Raise InputError if a number of a part is not finite."""
     for f in fields(part):
         value = getattr(part, f.name)
         numbers = [x for x in (value if isinstance(value, tuple) else [value]) if isinstance(x, int | float)]
@@ -324,7 +323,7 @@ def _require_finite(part):
 
 
 def _require_at_least(least: int, part, *names: str):
-    """Raise InputError where one of the numbers is below 0 or 1."""
+    """Raise InputError if one of the named numbers is below `least` (0 or 1)."""
     for name in names:
         value = getattr(part, name)
         say = 'not be negative' if least == 0 else f'be at least {least}'

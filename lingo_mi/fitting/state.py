@@ -1,4 +1,4 @@
-"""The state of a fit: everything that a step changes, and how raw parameters become Gaussians."""
+"""The state of a fit: all that a step changes, and the conversion of raw parameters to Gaussians."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class State:
 
     values             raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`
     first, second      Adam's moments, like `values`
-    gradient, visits   densification statistic: summed norms of the projected centre's gradient, and in how many views it was
-                       seen [N]
-    born               whether a Gaussian came from a clone or a split [N]
+    gradient, visits   densification statistic [N]: sum of the norms of the projected centre's gradient, and number of views in
+                       which the Gaussian was visible
+    born               whether densification made the Gaussian [N]
     """
 
     values: dict[str, np.ndarray]
@@ -34,10 +34,10 @@ class State:
 
 
 def start(points, spacing, density, settings: Settings) -> State:
-    """The state that begins a fit: isotropic Gaussians, unrotated, without moments.
+    """The state at the start of a fit: isotropic Gaussians, unrotated, with zero moments.
 
-    points [N, 3], spacing [N] standard deviations, density [N] at the centres, in the fit's unit; normalised frame. Alpha
-    compositing takes None for the density.
+    points [N, 3]; spacing [N], standard deviations; density [N] at the centres, in the fit's unit (None for alpha
+    compositing). All in the normalised frame.
     """
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     n = len(points)
@@ -63,7 +63,7 @@ def start(points, spacing, density, settings: Settings) -> State:
 def activate(state: State, settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Centres, standard deviations, unit quaternions (x, y, z, w) and densities or opacities, float64 [N, ...].
 
-    Scales by a sigmoid between the bounds (R2-Gaussian), the last by the forward model.
+    Scales are a sigmoid between the bounds (R2-Gaussian). The forward model gives densities or opacities.
     """
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     centre, scale, rotation = (state.values[k].astype(float) for k in ('centre', 'scale', 'rotation'))

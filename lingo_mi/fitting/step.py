@@ -1,4 +1,4 @@
-"""One step of the fit: compare the views of a scan with the cloud's, differentiate, and move the Gaussians."""
+"""One step of the fit: render views of the cloud, compare them with the measured ones, and update the Gaussians."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.scan import Scan
 
-SHARES_RENEWED = 50  # steps after which the shares of two materials are looked at again
+SHARES_RENEWED = 50  # steps between updates of the shares of two materials
 
 
 class Stepper:
     """The optimisation of a cloud on one scan with one set of settings, step by step.
 
-    model       what a cloud looks like (`CloudModel`)
+    model       the fit's `CloudModel`
     targets     the measured views, on the device; `coarse`: the same binned 2 x 2, for the first iterations
-    poses       corrections of the views; None where they stay as given
-    share       the second of two materials in every Gaussian, as the steps know it
-    scattered   what `ScatteredLight.estimate` gave, as the steps know it
+    poses       corrections of the views; None if poses are not fitted
+    share       current share of the second of two materials in every Gaussian
+    scattered   current result of `ScatteredLight.estimate`
     """
 
     def __init__(self, scan: Scan, settings: Settings):
@@ -50,14 +50,14 @@ class Stepper:
         self.coarse_until = round(settings.coarse_share * settings.iterations)
         self.coarse = _targets(scan.binned(2), unit, settings) if self.coarse_until else []
         self.half = scan.geometry.half
-        # A fan beam in one plane says nothing about the direction across: nothing moves or turns out of the plane.
+        # A fan beam does not determine the direction across its plane: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
         self.poses = Poses(len(scan), self.flat) if max(settings.adam.rate_pose) > 0 else None
 
     def step(self, state: DeviceState, views: Sequence[int], iteration: int, rng: np.random.Generator) -> Any:
-        """Advance the state by one Adam step on the given views; returns the loss, Float [1], not yet evaluated.
+        """Advance the state by one Adam step on the given views. Returns the loss, Float [1], not yet evaluated.
 
-        iteration counts from 0. rng places the total variation's cube.
+        `iteration` counts from 0. `rng` places the cube of the total variation.
         """
         s = self.settings
         if self.share is None or iteration % SHARES_RENEWED == 0 or dr.width(self.share) != len(state):
@@ -68,7 +68,7 @@ class Stepper:
         for value in state.values.values():
             dr.enable_grad(value)
         gaussians = self.forward.gaussians(state.values)
-        # Each view and the cube add their derivatives to these; then one pass takes them to the raw parameters.
+        # Views and cube accumulate derivatives in these. Then one pass propagates them to the raw parameters.
         leaf = leaves(gaussians)
         total = mi.Float(0)
         targets = self.coarse if iteration < self.coarse_until else self.targets
@@ -95,17 +95,17 @@ class Stepper:
         return total
 
     def corrected(self) -> Geometry:
-        """The scan's geometry with its views where the fit has put them: as given, where it left them alone."""
+        """The scan's geometry with corrected poses; the given geometry if poses are not fitted."""
         return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
     def arrays(self) -> dict:
-        """What steps keep beside the state, by name, for a checkpoint."""
+        """The arrays that steps keep besides the state, by name, for a checkpoint."""
         share = {} if self.share is None else dict(share=self.share.numpy())
         scattered = {} if self.scattered is None else dict(scattered=self.scattered)
         return ({} if self.poses is None else self.poses.arrays()) | share | scattered
 
     def restore(self, arrays: dict) -> None:
-        """Take over what `arrays` gave."""
+        """Restore the output of `arrays`."""
         if self.poses is not None:
             self.poses.restore(arrays)
         if 'share' in arrays:
@@ -115,7 +115,7 @@ class Stepper:
             self._light_targets()
 
     def renew_light(self, state: DeviceState) -> None:
-        """Estimate anew what the cloud scatters into the views."""
+        """Estimate again the light that the cloud scatters into the views."""
         self.scattered = self.model.scattered_light(state, self.corrected())
         self._light_targets()
 
@@ -129,7 +129,7 @@ class Stepper:
                 target.scattered = uploaded(image.ravel())
 
     def _view(self, leaf, target, batch):
-        """`differentiate` a view: replayed, where nothing but line integrals from known poses is fitted."""
+        """`differentiate` a view; replayed if the fit is of plain line integrals with known poses."""
         if self.model.signal is None and self.poses is None and self.forward.replayable:
             return differentiate_replayed(leaf, target, self.settings, batch)
         return differentiate(leaf, target, self.settings, batch, self.model.signal, self.share)

@@ -1,4 +1,4 @@
-"""The total variation of a fit's cloud, sampled in a random cube a step (R2-Gaussian, section 4.2)."""
+"""Total variation of a fit's cloud, sampled in one random cube per step (R2-Gaussian, section 4.2)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from lingo_mi.projectors.voxelize import Grid, voxelize
 
 
 def random_cube_variation(gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator) -> Any:
-    """Add the gradient of the total variation of a cube at a random place to that of the Gaussians; returns lambda_tv times
-    it, Float [1].
+    """Total variation of a randomly placed cube of samples.
 
-    gaussians   centres, standard deviations, quaternions and densities, whose gradients are enabled; normalised frame
-    geometry    says the voxels, `tv_stride` of which lie between two samples: all between the centres of the first and the
-                last ones
+    Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
+
+    gaussians   centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame
+    geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
     """
     s, half, extent = settings.loss, geometry.half, settings.model.extent
     voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1

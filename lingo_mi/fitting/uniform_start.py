@@ -1,4 +1,4 @@
-"""Initial clouds of the baselines by alpha compositing: points that know nothing of the projections. NumPy."""
+"""Initial clouds of the alpha-compositing baselines: points that do not depend on the projections. NumPy."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from lingo_mi.lingo.voxel_filter import voxel_centres
 
 
 def random_points(half, flat: bool, n_points: int, rng) -> InitialCloud:
-    """Points drawn evenly from the volume (3DGS, where it is not given any; there from a cube around the scene).
+    """Points drawn uniformly from the volume (3DGS without given points draws them from a cube around the scene).
 
     half       half the volume's sides in the normalised frame, [3]
-    flat       whether all points lie in the plane z = 0 of a fan beam
+    flat       True for a fan beam: all points lie in the plane z = 0
     rng        numpy Generator
     """
     points = rng.uniform(-1, 1, (n_points, 3)) * half * (1, 1, 0 if flat else 1)

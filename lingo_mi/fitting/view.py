@@ -28,10 +28,10 @@ class Target:
 
     view       its rays
     pixels     Float [height * width], normalised line integrals over the fit's unit of density
-    weights    Float, what they were multiplied by and images are before they are compared; None: nothing
-    valid      Bool, which of them are valid; None: all
-    rays       the geometry's `Rays` of the view alone
-    scattered  Float, the scattered light that is expected in them; None: none
+    weights    Float, factor applied to `pixels` and to rendered images before comparison; None: 1
+    valid      Bool, which pixels are valid; None: all
+    rays       the geometry's `Rays` of this view alone
+    scattered  Float, expected scattered light in the pixels; None: none
     """
 
     view: View
@@ -54,14 +54,14 @@ class Target:
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)
-        # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
-        # panel would otherwise leave the fast path.
+        # The object lies between source and panel, so integrals need not end at the panel. If they did, a Gaussian that
+        # grows to the panel would leave the fast path.
         return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), weights, valid, rays)
 
     def masked(self, image):
-        """An image as this view compares it: weighted, and pixels that are not valid are zero, in it as in the measured one.
+        """The image prepared for comparison: weighted, invalid pixels zero (as in `pixels`).
 
-        To SSIM's windows they are then like the surroundings of the panel. Their derivatives vanish.
+        SSIM treats invalid pixels like the outside of the panel. Their derivatives vanish.
         """
         if self.weights is not None:
             image = image * self.weights
@@ -69,21 +69,21 @@ class Target:
 
 
 def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
-    """Add the gradient of one view's loss to that of the Gaussians, whose gradients are enabled.
+    """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
 
-    batch   views of a step, over which the loss is a mean
+    batch   views per step; the loss is their mean
     signal  `ExpectedSignal` of the detector; None: line integrals
-    share   of the second of two materials in every Gaussian, Float [N]; None: there is one
+    share   of the second of two materials in every Gaussian, Float [N]; None: one material
 
-    Returns its part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the gradient by the
-    footprint's place, and 1 where a Gaussian is seen.
+    Returns the view's part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the
+    gradient by the projected centre, and 1 if the Gaussian is visible.
     """
     s, view, forward = settings.loss, target.view, forward_model(settings)
-    bundles = []  # of rays: one, or all those that the signal is a mean over
+    bundles = []  # of rays: one, or several if the signal is a mean over them
 
     def image_along(rays):
         footprints = forward.footprints(gaussians, rays)
-        leaf = leaves(footprints.values)  # the statistic is made of their derivatives
+        leaf = leaves(footprints.values)  # their derivatives make the statistic
         bundles.append((footprints, leaf))
         return forward.integrals(replace(footprints, values=leaf), rays, share)
 
@@ -91,24 +91,24 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
     loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
-    # Bundles share what leads to a view's pose, so its edges must outlast all but the last.
+    # Bundles share the graph from the pose, so its edges must be kept until the last bundle.
     flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
     dr.backward(loss * weight * (1 / batch), flags=flags)
-    # Not while derivatives are suspended: they would read as zero.
+    # Outside `suspend_grad`, where gradients read as zero.
     gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
     footprints = bundles[len(bundles) // 2][0]
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         visible = dr.select(footprints.visible, mi.Float(1), 0)
-    for footprints, leaf in bundles:  # one by one: a kernel for all of them would take long to compile
+    for footprints, leaf in bundles:  # one by one: a single kernel for all would take long to compile
         pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, visible
 
 
 def differentiate_replayed(gaussians, target: Target, settings: Settings, batch: int):
-    """`differentiate` line integrals that are fitted as they are, replayed; the view's pose is a constant."""
+    """`differentiate` for plain line integrals, replayed from a recording. The view's pose is constant."""
     view = target.view
     *found, gradients = _REPLAY(
         *gaussians,
@@ -142,5 +142,5 @@ _REPLAY = Replay(_differentiated)
 
 
 def evaluate(values):
-    """Evaluate all derivatives in one kernel; one by one, each would repeat the work that they share."""
+    """Evaluate all derivatives in one kernel: separate kernels would repeat their common work."""
     dr.eval([dr.grad(value) for value in values])

@@ -86,16 +86,16 @@ class LingoSettings:
 
 
 def draw(cells, count: int, rng):
-    """Draw `count` of the cells, without replacement while they last: (cells [count], is a repeat [count]).
+    """Draw `count` of the cells, without replacement while they last: (cells [count], whether each is a repeat [count]).
 
-    When there are fewer cells than points, every cell is taken once, then again, as evenly as it goes.
+    If there are fewer cells than points, cells are repeated as evenly as possible.
     """
     rounds = [rng.permutation(cells) for _ in range(max(-(-count // len(cells)), 1))]
     return np.concatenate(rounds)[:count], np.arange(count) >= len(cells)
 
 
 def _outside(wanted: str, found) -> str:
-    """What views say of cells outside their images, after a word on truncated scans."""
+    """The rule for cells outside an image ('invalid' or 'ignore'). Warns of truncated scans."""
     cut = truncated(found)
     if not cut.any():
         return 'invalid' if wanted == 'auto' else wanted
@@ -123,12 +123,11 @@ def initialise(
                  of that cloud of isotropic Gaussians, for the view indices `views`
     fdk          for the init_density 'fdk': the reconstruction [x, y, z]
 
-    Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid; points of the low set
-    sit at the cell centres, but for repeats (there may be fewer valid cells than points), which are jittered
-    too. There is no jitter along an axis of one cell. An empty high set leaves all the points to the low set.
-    A point's density is that of its cell.
+    Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid. Points of the low set lie at the
+    cell centres, except repeats, which are jittered too (there may be fewer valid cells than points). An axis of one
+    cell has no jitter. If the high set is empty, all points come from the low set. A point has its cell's density.
 
-    Raises InputError where no cell is valid, or where the density lacks what it needs.
+    Raises InputError if no cell is valid, or if `render` or `fdk` is missing for the chosen `init_density`.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng(0) if rng is None else rng

@@ -1,4 +1,4 @@
-"""Chains of derivatives that are cut in two: what lies behind the cut is differentiated first, and its derivatives passed on."""
+"""Backpropagation in two stages: first from the loss to copies (`leaves`), then from these to the inputs (`pass_on`)."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import drjit as dr
 
 
 def leaves(values):
-    """Copies that gather derivatives, cut off from what the values were made of."""
+    """Detached copies that accumulate derivatives."""
     copies = tuple(dr.detach(v) for v in values)
     dr.enable_grad(copies)
     return copies
 
 
 def pass_on(values, gradients, flags=dr.ADFlag.Default):
-    """Propagate derivatives by some values, one each, through the making of these."""
+    """Backpropagate given gradients, one per value, to whatever the values were computed from."""
     for value, gradient in zip(values, gradients):
         if dr.grad_enabled(value):
             dr.set_grad(value, gradient)

@@ -1,4 +1,4 @@
-"""Line integrals of a cloud of Gaussians: the splat, and the general form for the few that it cannot express."""
+"""Line integrals of a cloud of Gaussians: the splat, and a general integral for the few that have no footprint."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from lingo_mi.projectors.segment import add_straddling
 from lingo_mi.projectors.splat import Plan, by_values, prepare, splat
 from lingo_mi.projectors.view import View
 
-DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'  # a footprint's numbers for how |d|^2 varies over it
+DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'  # numbers that say how |d|^2 varies over a footprint
 POSE = 4  # arrays at the end of the inputs: source, corner, u, v
-PIXEL_VARIANCE = 1 / 12  # of a square of side 1, along either side
+PIXEL_VARIANCE = 1 / 12  # of a unit square, along each axis
 
 
 def columns(rows: Any) -> tuple[Any, Any, Any]:
@@ -41,9 +41,9 @@ def line_integrals(
     centre, scale   Point3f, Vector3f [N]; standard deviations
     rotation        Vector4f [N], quaternion (x, y, z, w)
     density         Float [N], value at the centre
-    view            whose pixels: one ray each, or its mean over their area; `options.subdivided` gives more rays
+    view            its pixels: one ray each, or the mean over the pixel (`options.area`); for more rays `options.subdivided`
     options         cut-off, footprint, area and sharing
-    primal          False where only derivatives are wanted: the image is then left at zero
+    primal          False if only derivatives are needed: the image is then zero
 
     Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
     no extent or no rotation leaves no finite pixel. Raises InputError for an empty cloud.
@@ -52,8 +52,7 @@ def line_integrals(
 
 
 def line_integrals_of_rows(rows: Any, density: Any, view: View, options: RenderOptions, primal: bool = True) -> Any:
-    """`line_integrals` of rows of ten numbers, Float [10 N], whose `columns` are centres, scales and rotations: saves a copy of
-    them."""
+    """`line_integrals` from rows of ten numbers, Float [10 N]: centre, scale, rotation (see `columns`). Saves a copy."""
     return _of_inputs((rows, density), view, options, primal)
 
 
@@ -67,7 +66,7 @@ def _of_inputs(gaussians, view, options, primal):
 
 @dataclass(frozen=True)
 class _Panel:
-    """What recordings know of a view: all but its pose. As for `View`."""
+    """The constants of a view in a recording: all fields of `View` but the pose."""
 
     width: int
     height: int
@@ -83,10 +82,10 @@ class _Panel:
 
 
 class _LineIntegrals(dr.CustomOp):
-    """The splat of what can be splatted, of which all but tangents is replayed, and the rest, one by one.
+    """Splats all Gaussians that have a footprint and integrates the others one by one.
 
-    In how many parts to add up and what the rest is, the host learns from the footprints, before the splat is launched: it then
-    goes on while the device adds up pixels.
+    All but forward-mode derivatives is replayed. The footprints tell the host, before the splat starts, how many partial sums
+    are needed and which Gaussians are left over. The host then goes on while the device adds up pixels.
     """
 
     def eval(self, inputs, wanted, settings, primal):
@@ -119,12 +118,12 @@ class _LineIntegrals(dr.CustomOp):
         self.set_grad_out(dr.grad(image))
 
     def backward(self):
-        of_pose = any(self.wanted[-POSE:])  # which changes what the splat's image is multiplied by, too
+        of_pose = any(self.wanted[-POSE:])  # the pose also changes the rays' lengths, which multiply the image
         prepared, straddling = self.known or self._look(deep=of_pose)
         self.known = None
         upstream: Any = self.grad_out()
         found = _GATHER(*prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings)
-        del prepared  # as large as all that follows
+        del prepared  # frees memory: as large as all that follows
         gradients = _BY_INPUTS(*self.inputs, *found, wanted=self.wanted, **self.settings)
         if dr.width(straddling) and not self.settings['panel'].parallel:
             leaf = leaves(self.inputs)
@@ -136,8 +135,8 @@ class _LineIntegrals(dr.CustomOp):
         return 'line integrals'
 
     def _look(self, deep=True):
-        """What `splat.Plan` takes, and the indices of what cannot be splatted; with `deep`, finds in how many parts to add up.
-        Waits for the device."""
+        """The arrays for `splat.Plan`, and the indices of Gaussians that cannot be splatted. With `deep`, also sets the number
+        of partial sums. Waits for the device."""
         *prepared, straddles, depth = _PREPARE(*self.inputs, **self.settings, deep=deep)
         if deep:
             self.parts = parts_of(depth)
@@ -145,7 +144,7 @@ class _LineIntegrals(dr.CustomOp):
 
 
 def _read(*inputs, panel, **_) -> tuple[tuple[Any, ...], View]:
-    """Centres, scales, rotations and densities, and the view, that the inputs are."""
+    """The inputs as (centres, scales, rotations, densities) and the view."""
     *shapes, density = inputs[:-POSE]
     shapes = columns(*shapes) if len(shapes) == 1 else shapes
     return (*shapes, density), panel.view(inputs[-POSE:])
@@ -159,7 +158,7 @@ def _footprints(*inputs, panel, options):
 
 
 def _with_rest(image, inputs, settings, indices):
-    """An image with the Gaussians of some indices, which cannot be splatted; in a parallel beam nothing can integrate them."""
+    """The image plus the Gaussians at `indices`, which cannot be splatted. In a parallel beam these are invalid: NaN."""
     if dr.width(indices) == 0:
         return image
     gaussians, view = _read(*inputs, **settings)
@@ -167,7 +166,7 @@ def _with_rest(image, inputs, settings, indices):
 
 
 def _prepare(*inputs, deep, panel, options):
-    """What `splat.Plan` takes, then which Gaussians cannot be splatted, Bool [N], and how deep they lie."""
+    """The arrays for `splat.Plan`; which Gaussians cannot be splatted, Bool [N]; the overlap depth if `deep`, else None."""
     view, f = _footprints(*inputs, panel=panel, options=options)
     found = prepare(f.values, replace(f, values=()), options.sharing)
     return *found, f.straddles, deepest((f.column, f.row), f.area, (view.width, view.height)) if deep else None
@@ -183,8 +182,7 @@ def _draw(*arrays, panel, options, parts):
 
 
 def _gather(*arrays, panel, options, image, parts):
-    """What `Plan.gradient` gives, then the derivative by the rays' lengths, Float [pixels], where the `image` is wanted for
-    it."""
+    """The result of `Plan.gradient`; then, if `image`, the derivative by the rays' lengths, Float [pixels]; else None."""
     *prepared, source, corner, u, v, upstream = arrays
     plan = _plan(prepared, panel, options)
     lengths = panel.view((source, corner, u, v)).lengths()
@@ -192,7 +190,7 @@ def _gather(*arrays, panel, options, image, parts):
 
 
 def _by_inputs(*arrays, wanted, **settings):
-    """Derivatives by the inputs from what `_gather` gives, which follow the inputs in `arrays`."""
+    """Derivatives by the inputs. `arrays`: the inputs, then the result of `_gather`."""
     inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
     view, footprints = _footprints(*inputs, **settings)
@@ -207,7 +205,7 @@ _PREPARE, _DRAW, _GATHER, _BY_INPUTS = map(Replay, (_prepare, _draw, _gather, _b
 
 
 def _affine(footprints):
-    """Footprints whose denominators are 1; opaque zeros, so that the kernels are those of the exact model."""
+    """Footprints with denominator 1. The zeros are opaque, so that the exact model's kernels are reused."""
     zero = dr.opaque(mi.Float, 0, dr.width(footprints.column))
     values = (zero if name in DENOMINATOR else value for name, value in zip(NAMES, footprints.values))
     return replace(footprints, values=tuple(values))

@@ -1,8 +1,8 @@
-"""How many items lie on top of each other, and in how many parts their sum must be taken.
+"""How many items overlap, and how many partial sums they need.
 
-An element of an image that n equal numbers are added to one by one in float32 is off by some n 2e-9 of itself. Where more
-than DEEP items lie at one place, they are therefore added up in parts, each into a sum of its own, and the sums in float64.
-Items that overlap from different places add different numbers, of which the rounding cancels: RANDOM times as many do no more.
+Adding n equal numbers one by one in float32 leaves a relative error of about n 2e-9. If more than DEEP items lie at one place,
+they are therefore added into several partial sums, and these are added in float64. Items at different places that overlap add
+different numbers, and their rounding errors cancel: RANDOM times as many cause no larger error.
 """
 
 from __future__ import annotations
@@ -14,30 +14,29 @@ import mitsuba as mi
 
 DEEP = 1_000  # 2e-6
 RANDOM = 32
-CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by the number of axes, along each of them: of one element, and of two sizes
-SAMPLE = 16384  # items that are looked at
+CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by number of axes: cells per axis at the first three levels
+SAMPLE = 16384  # items counted at most
 
 
 def hashed(i):
-    """Numbers that follow in no order from those that do, UInt32 (Knuth's multiplicative hash): clouds may be periodic."""
+    """Knuth's multiplicative hash, UInt32: an irregular sample, because clouds may be periodic."""
     return i * 2654435761 // 65536
 
 
 def parts_of(depth) -> int:
-    """In how many parts to add up items that lie so `deepest`. Waits for the device."""
+    """Number of partial sums for a depth that `deepest` returned. Waits for the device."""
     return max(-(-int(depth[0]) // DEEP), 1)
 
 
 def deepest(places, covered, shape):
-    """How many items lie on top of each other where they do most, on a grid of elements: Float [1], 0 where few are there.
+    """The largest number of items that overlap in one element of a grid: Float [1], 0 for few items.
 
     places    Int32 [N] for each axis, an item's element; it may lie outside the grid
     covered   Float [N], elements that an item covers
     shape     elements along each axis
 
-    Covered elements are counted by the cell in which the items' centres lie: cells of one element, of which those a number of
-    cells apart count as one; cells of some share of the grid, and larger ones; and the whole grid. Of many items a sample is
-    counted.
+    Counts covered elements per cell (the cell of an item's centre) at four levels: single elements, with wrapped indices; two
+    coarser grids; and the whole grid. Large clouds are sampled.
     """
     count = dr.width(covered)
     if count <= DEEP:

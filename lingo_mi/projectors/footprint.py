@@ -5,8 +5,9 @@ For a ray :math:`o + tD` and a Gaussian (p, R, s, rho), whitened by :math:`W = \
 
 .. math::  \rho \sqrt{2\pi} \, |D| / |d| \; \exp(-\tfrac12 |w \times d|^2 / |d|^2).
 
-On a flat detector :math:`D = k(p - o) + \delta x\, a + \delta y\, b`, with the pixel steps a and b and the pixel position
-relative to the projected centre. The constant term of :math:`w \times d` vanishes, so nothing cancels near the centre:
+On a flat detector :math:`D = k(p - o) + \delta x\, a + \delta y\, b`. Here a and b are the pixel steps, and (dx, dy) is the
+pixel position relative to the projected centre. The constant term of :math:`w \times d` vanishes, so there is no cancellation
+near the centre:
 
     |w x d|^2 = |dx na + dy nb|^2             na = w x Wa,  nb = w x Wb
     |d|^2     = |k w + dx Wa + dy Wb|^2
@@ -17,13 +18,13 @@ Both are divided by (k|w|)^2, and the first is sheared to a sum of two squares, 
     den = 1 + e1 t + e2 dy + e11 t^2 + 2 e12 t dy + e22 dy^2
     integral = |D| amplitude den^(-1/2) exp(-num / (2 den))
 
-The sum of squares is what keeps a needle's footprint accurate in float32. For a parallel beam den = 1. These eleven numbers
-a Gaussian (amplitude, mx, my, shear, e1 ... e22, and the centre) are computed in float64, which costs nothing beside the
-pixels and saves the digits that differences of world coordinates lose. Shear and centre are handed on in float64, since a
-needle that crosses the image cancels t to its own width, the others in float32.
+The sum of squares keeps a needle's footprint accurate in float32. For a parallel beam den = 1. The eleven numbers of a
+Gaussian (amplitude, mx, my, shear, e1 ... e22, and the centre) are computed in float64: differences of world coordinates
+lose digits, and the cost is negligible beside that of the pixels. Shear and centre are also stored in float64, because for a
+needle across the image t cancels down to the needle's width. The others are stored in float32.
 
-The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|: an ellipse as long as the
-kappa-ellipsoid lies between source and detector. Gaussians for which it does not are left to `segment`.
+The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|. It is an ellipse if the
+kappa-ellipsoid lies between source and detector. Other Gaussians are left to `segment`.
 """
 
 from __future__ import annotations
@@ -48,14 +49,14 @@ DOUBLE = 'shear', 'x', 'y'
 class Footprints:
     """Footprints of N Gaussians in one view.
 
-    values    the eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; x and y
-              place the projected centre, in pixels from the centre of the pixel (column, row) in which it lies
+    values    the eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; (x, y) is
+              the projected centre, in pixels from the centre of pixel (column, row), which contains it
     column, row            Int32 [N]
-    row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; empty where it has none
+    row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; an empty range if there are none
     width                  Float [N], pixels across the widest row, for balancing work
-    area                   Float [N], pixels covered: of the ellipse, or of the box where that is smaller
-    straddles              Bool [N], Gaussians that this chart cannot express and `segment` must integrate; also those that
-                           nothing can, because a number is not finite or a scale or quaternion zero
+    area                   Float [N], covered pixels: those of the ellipse or of the box, whichever are fewer
+    straddles              Bool [N], Gaussians without a footprint, which `segment` must integrate; also invalid ones (a number
+                           that is not finite, or a zero scale or quaternion)
     """
 
     values: tuple
@@ -78,11 +79,13 @@ def project(
 ) -> Footprints:
     """Footprints of N Gaussians in a view.
 
+    Names in the functional API: means = centre, scales = scale, quaternions = rotation here.
+
     centre, scale   Point3f, Vector3f [N]; standard deviations
     rotation        Vector4f [N], quaternion (x, y, z, w), normalised here
     density         Float [N], value at the centre
     extent          cut-off in standard deviations
-    widen           variance in pixels^2 of a round Gaussian that footprints are convolved with, |d|^2 taken as constant
+    widen           variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
     """
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
@@ -123,7 +126,7 @@ def project(
             sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(inverse) + rho)
             straddles = straddles & ~hidden | ~sound
             visible = ~hidden & ~straddles
-        r = dr.select(visible, r, n)  # along the panel's normal nothing below vanishes
+        r = dr.select(visible, r, n)  # invisible ones: a safe value, to avoid division by zero below
         depth = dr.dot(n, r)
         k = plane / depth
         hit = k * r - axis
@@ -138,7 +141,7 @@ def project(
         factor = length * dr.square(norm)
 
     amplitude = rho * SQRT_2PI * norm
-    # |na x nb|, from the determinant of the whitening: a needle's na and nb are all but parallel.
+    # |na x nb|, from the determinant of W: for a needle, na and nb are nearly parallel and their product would cancel.
     det = factor * dr.abs(depth) * inverse.x * inverse.y * inverse.z
     aa, ab, bb = dr.squared_norm(na), dr.dot(na, nb), dr.squared_norm(nb)
     with dr.suspend_grad():
@@ -146,7 +149,7 @@ def project(
             high_x, high_y = extent * dr.sqrt(bb) / det, extent * dr.sqrt(aa) / det
             low_x, low_y = -high_x, -high_y
         else:
-            # Detector rows and columns are planes through the source; whitened, the outermost touch the kappa-sphere.
+            # Detector rows and columns are planes through the source. The outermost, whitened, touch the kappa-sphere.
             reach = extent * dr.abs(depth) / det
             offset = extent * reach
             low_y, high_y = _roots(quad, -offset * dr.dot(na, support), dr.square(reach) * aa)

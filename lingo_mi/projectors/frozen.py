@@ -1,9 +1,8 @@
 """Computations that are traced once and then replayed: a call costs some ten microseconds of Python instead of a millisecond.
 
-Dr.Jit traces a function anew in every call, even where its kernels are in the cache; `dr.freeze` launches the kernels of an
-earlier call instead. It infers how large a launch is from the sizes of the inputs, which goes wrong where sizes agree by chance,
-and it takes numbers of Python's for constants. A `Replay` therefore keeps a recording of its own for each combination of sizes
-and settings.
+Dr.Jit traces a function anew in every call, even if its kernels are cached. `dr.freeze` instead launches the kernels of an
+earlier call. It infers launch sizes from input sizes, which fails if sizes agree by chance, and it treats Python numbers as
+constants. A `Replay` therefore keeps a separate recording for each combination of sizes and settings.
 """
 
 from __future__ import annotations
@@ -14,16 +13,16 @@ from contextlib import contextmanager
 
 import drjit as dr
 
-MOST = 16  # recordings of a function, the latest ones
+MOST = 16  # latest recordings kept per function
 
 
 class Replay:
-    """A function of Dr.Jit arrays, or None in their place, and of settings, which are hashable keyword arguments.
+    """A function of Dr.Jit arrays (or None) and of settings, which are hashable keyword arguments.
 
-    It may differentiate within, but no derivatives pass through it, and it must not wait for the device. No array may be empty.
-    What it returns is evaluated; what it raises, the caller gets. Whatever else it reads, names of its module for one, is a
-    constant to the recordings, of which new variants, flags and literals make new ones. It is not for several threads at once.
-    `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` has it traced in every call.
+    It may differentiate inside, but is not differentiable from outside. It must not wait for the device. Arrays must not be
+    empty. Results are evaluated; exceptions pass through. Everything else it reads (module globals) is frozen; a new variant,
+    flag or literal makes a new recording. Not thread-safe.
+    `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` traces every call instead.
     """
 
     def __init__(self, function):
@@ -39,13 +38,13 @@ class Replay:
         try:
             with _uncollected():
                 return recording(*(None if x is None else dr.detach(x) for x in arrays))
-        except RuntimeError as error:  # Dr.Jit's, around what was raised in a recording
+        except RuntimeError as error:  # Dr.Jit wraps the exception raised in a recording
             raise (error.__cause__ or error) from None
 
 
 @contextmanager
 def _uncollected():
-    """No garbage is collected: a Mitsuba scene's end, for one, cannot be recorded and would kill the process."""
+    """Suspend garbage collection: destroying a Mitsuba scene, for example, while recording would crash the process."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -1,16 +1,17 @@
 """The balanced splat: footprints to an image and back, with work shared out by pixel count.
 
-Every lane works on one detector row of a Gaussian, four pixels (a packet) at a step; `balance` shares the rows out.
+Each lane works on one detector row of a Gaussian, four pixels (a packet) per step; `balance` shares the rows out.
 
-Backward is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers. Nothing is
-stored between forward and backward but the footprints.
+The backward pass is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers.
+Only the footprints are stored between the two passes.
 
-Each row of a footprint is cut exactly where the cut-off ends, then widened to whole packets. Forward, backward and tangent
-visit the same pixels, so they are each other's exact adjoints and derivatives.
+Each row of a footprint ends exactly at the cut-off and is then widened to whole packets. Forward, backward and tangent
+visit the same pixels. So backward is the exact adjoint of tangent, and tangent the exact derivative of forward.
 
-t = dx + shear dy cancels where a needle leans: thousands of pixels from its centre, t is a fraction of a pixel. Therefore
-the kernels know where the ridge t = 0 crosses the row of the centre (`ridge`, rather than the centre's x) and take it from
-row to row in twice float32's digits. In a row, t is then the whole pixels from the one on the ridge, less a fraction.
+t = dx + shear dy suffers cancellation for an oblique needle: thousands of pixels from its centre, t is a fraction of a
+pixel. The kernels therefore store where the ridge t = 0 crosses the row of the centre (`ridge`, in place of the centre's
+x). They follow it from row to row with twice float32's digits. Within a row, t is a whole number of pixels from the pixel
+on the ridge, less a fraction.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ def splat(footprints: Footprints, height: int, width: int, extent: float, parts:
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
     extent    cut-off in standard deviations
-    parts     in how many parts the footprints are added up (`depth`)
-    sharing   how the work is shared out
+    parts     number of partial sums (see `depth`)
+    sharing   how the work is shared out (see `balance`)
 
     Differentiable in `footprints.values`, in forward and in reverse mode.
     """
@@ -76,7 +77,7 @@ class _Splat(dr.CustomOp):
 
 
 def prepare(values, rest, sharing: Sharing):
-    """Footprints as the kernels take them, evaluated arrays for `Plan`; those of `rest` are evaluated with them."""
+    """Pack footprints into the evaluated arrays that `Plan` takes. Evaluates the arrays of `rest` with them."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
     ridge = x + shear * y
     steps = whole(ridge)
@@ -86,7 +87,7 @@ def prepare(values, rest, sharing: Sharing):
     places = pack(mi.Vector4i, mi.Int32, (rest.column + mi.Int32(steps), rest.row, rest.row_begin, rest.row_end))
     blocks = mi.UInt32(rest.row_end - rest.row_begin + (sharing.lanes - 1)) // sharing.lanes
     cost = mi.UInt32(rest.width) // PACKET + SETUP
-    dr.eval(packed, places, blocks, cost, rest)  # together: each alone would project all Gaussians again
+    dr.eval(packed, places, blocks, cost, rest)  # in one kernel: otherwise each would project all Gaussians again
     return packed, places, *Work.of(blocks, cost, sharing).arrays
 
 
@@ -94,10 +95,10 @@ def prepare(values, rest, sharing: Sharing):
 class _Packed:
     """Footprints as a kernel reads them.
 
-    numbers   Float [12 N], those of `Footprints` with the ridge in the place of the centre's x
+    numbers   Float [12 N], those of `Footprints` with the ridge in place of the centre's x
     places    Int32 [4 N]: column of the ridge, row of the centre, first row and end of the rows
     extent2   Float, the cut-off squared
-    packets   Int32, of a row of the image
+    packets   Int32, packets per image row
     """
 
     numbers: Any
@@ -124,9 +125,9 @@ class Plan:
         return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed)
 
     def tangent(self, tangents, shear, parts: int = 1):
-        """The image's derivative in a direction of the footprints' numbers, of which `shear` is one."""
+        """The image's derivative along `tangents` of `Footprints.values`. shear: one of these values."""
         *others, x, y = tangents
-        # A needle that moves along itself: in float32 its ridge would seem to move, too.
+        # In float64: a needle that moves along itself must not move its ridge by rounding.
         ridge = type(shear)(x) + shear * type(shear)(y)
         zeros = dr.zeros(mi.Float, self.work.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
@@ -134,8 +135,10 @@ class Plan:
         return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed, moved=moved)
 
     def gradient(self, grad_image):
-        """Derivatives by the footprints' numbers from that by the image, Float [N] each, the last with the ridge left where it
-        is: see `by_values`."""
+        """Derivatives by the footprints' numbers, Float [N] each, from the derivative by the image.
+
+        The last, by y, is taken with the ridge fixed; `by_values` converts it.
+        """
         upstream = pad(grad_image, self.height, self.width)
         out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
         dr.make_opaque(upstream, out)
@@ -144,7 +147,7 @@ class Plan:
 
 
 def by_values(found, shear):
-    """Derivatives by the values of `Footprints`, of which `shear` is one, from those that `Plan.gradient` gives."""
+    """Convert the result of `Plan.gradient` to derivatives by `Footprints.values`. shear: one of these values."""
     *others, x, y = found
     y = type(shear)(y) + shear * type(shear)(x)
     return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
@@ -153,8 +156,7 @@ def by_values(found, shear):
 def _row(c, w, y, f: _Packed):
     """Constants of row y of a footprint and its packets [begin, end).
 
-    Returns dy, m = (my dy)^2, d0 and d1 with den = d0 + t (d1 + e11 t), where t is 0 (a column and a fraction), begin,
-    end.
+    Returns dy; m = (my dy)^2; d0 and d1 with den = d0 + t (d1 + e11 t); where t is 0, as a column and a fraction; begin; end.
     """
     _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
     shear_low, ridge_low = unpack_halves(low)
@@ -168,7 +170,7 @@ def _row(c, w, y, f: _Packed):
     root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
     along, along_low = times(shear, shear_low, n)
     steps = whole(along - ridge)
-    # Where the ridge is close to a pixel's centre, so that t needs its digits, these differences are exact.
+    # Near the ridge t needs all its digits; there these differences are exact.
     offset = (ridge - (along - steps)) + (ridge_low - along_low)
     column = w.x - mi.Int32(steps)
     begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, f.packets)
@@ -225,12 +227,12 @@ def _gather(share: Share, f: _Packed, upstream, out):
                 s, n0, n1, n2, q0, q1, q2 = moments
                 t = position(packet, column, offset)
                 inverse, exponent, shape = _shape(t, c, m, d0, d1)
-                # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), but for the amplitude
+                # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), each times the amplitude
                 value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
                 n = value * inverse
                 q = n * exponent
                 nt, qt = n * t, q * t
-                # Summed at once: packets of sums do not fit the CPU's registers.
+                # Reduce each packet now: packets of sums do not fit into the CPU's registers.
                 return (
                     s + dr.sum(value),
                     n0 + dr.sum(n),
@@ -257,7 +259,7 @@ def _add_row(sums, c, dy, moments):
     half = -0.5 * amplitude
     h0, h1, h2 = (dr.fma(1 / HALF_LOG2E, q, n) for q, n in zip((q0, q1, q2), (n0, n1, n2)))
     n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
-    # t and dy are where the centre enters: t = dx + shear dy, d0 and d1 are polynomials of dy. The last number is the
+    # The centre enters through t = dx + shear dy and through dy (d0 and d1 are polynomials in dy). The last number is the
     # derivative by the centre's y along the ridge, at constant t.
     d1 = dr.fma(2 * e12, dy, e1)
     dt = 2 * dr.square(mx) * n1 + d1 * h0 + 2 * e11 * h1

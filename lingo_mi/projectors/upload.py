@@ -10,15 +10,15 @@ import numpy as np
 def uploaded(values):
     """A copy of NumPy's values, Float [N], that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
 
-    Dr.Jit reads NumPy's memory in place and compiles its alignment into the kernels, which would then be others after every
-    densification.
+    Dr.Jit uses NumPy's memory in place and compiles its alignment into kernels. Without this copy, each densification would
+    compile new ones.
     """
     room = np.empty(len(values) + 16, np.float32)
     start = -room.ctypes.data % 64 // 4
     out = room[start : start + len(values)]
     out[:] = values
     out = mi.Float(out)
-    dr.make_opaque(out)  # one value alone would otherwise be a literal, and be compiled in
+    dr.make_opaque(out)  # a single value would otherwise become a literal, compiled into kernels
     return out
 
 

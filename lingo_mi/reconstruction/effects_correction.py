@@ -1,4 +1,4 @@
-"""Line integrals from projections with effects, for what knows none: voxel algorithms and initial clouds."""
+"""Line integrals from projections with effects, for voxel algorithms and initial clouds, which do not model effects."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.scan import Scan
 from lingo_mi.scene.simulate import render_objects, render_with
 
-PASSES = 2  # over the scattered light; from the third on, FDK's own errors grow
+PASSES = 2  # of the scatter correction; more of them let FDK's own errors grow
 
 
 def corrected(scan: Scan, effects: Effects, objects: Sequence, extent: float = cutoff.SIMULATE) -> Scan:
-    """The line integrals of measured views at the reference energy, by objects that resemble what was scanned.
+    """Correct line integrals by simulation, at the reference energy.
 
-    Linearised, less what linearising leaves of the effects in the objects' own views: blur, scatter, and the second material,
-    as Joseph and Spital (J. Comput. Assist. Tomogr. 2, 1978) do.
+    Linearises the measured views, then subtracts the error that linearising leaves in simulated views of `objects`: blur,
+    scatter and the second material (Joseph and Spital, J. Comput. Assist. Tomogr. 2, 1978).
 
-    effects   without noise: they say what is expected
-    objects   as of `projectors.objects.find_objects`; Gaussians end at `extent` standard deviations
+    effects   without noise, so that simulated views are expected ones
+    objects   similar to the scanned ones, as from `projectors.objects.find_objects`; Gaussians end at `extent` deviations
     """
     clean = render_objects(objects, scan.geometry, extent)
     seen = render_with(effects, objects, scan.geometry, np.arange(len(scan)), 0, extent)
@@ -36,10 +36,11 @@ def corrected(scan: Scan, effects: Effects, objects: Sequence, extent: float = c
 
 
 def linearised(scan: Scan, effects: Effects) -> Scan:
-    """`Effects.linearised`, with saturated pixels taken for air, and where there is scatter, `corrected` by coarse FDK volumes
-    of its own (Poludniowski et al., Phys. Med. Biol. 54, 2009): the first, of projections with their scatter, is too thin.
+    """`Effects.linearised`, with saturated pixels taken for air.
 
-    A scan that FDK cannot reconstruct keeps its scatter, with a warning.
+    With scatter, the result is then `corrected` with coarse FDK volumes of itself (Poludniowski et al., Phys. Med. Biol. 54,
+    2009), in `PASSES` passes: the first volume still contains scatter, so its density is too low. A scan that FDK cannot
+    reconstruct keeps its scatter, with a warning.
     """
     found = effects.linearised(scan)
     if effects.detector and effects.detector.saturation:

@@ -1,7 +1,7 @@
-"""Scans whose panel is turned, tilted or beside the central ray, as an upright panel behind the same source sees them.
+"""Rectification: resamples a scan with a turned, tilted or offset panel to an upright panel behind the same source.
 
-The same rays cross both planes, so that positions on one are a homography of those on the other (Hartley and Zisserman,
-"Multiple View Geometry", 2nd edition, 2004, section 2.3), and line integrals stay what they are: nothing is weighted.
+The same rays cross both planes, so a homography maps positions on one to positions on the other (Hartley and Zisserman,
+"Multiple View Geometry", 2nd edition, 2004, section 2.3). Line integrals stay the same; no weights are needed.
 """
 
 from __future__ import annotations
@@ -19,20 +19,19 @@ from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.preconditions import require_pixels
 from lingo_mi.scan import Scan
 
-MOVES = 0.1  # of the panel's size by which its shadow may move from view to view
+MOVES = 0.1  # share of its size by which the panel's shadow may move between views
 
 
 def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
-    """The scan on a panel that is the same in all views: columns along z, rows along the source's circle, in its middle the
-    ray through the axis.
+    """The scan on an upright panel, the same in all views: columns along z, rows along the source's circle.
 
-    scan   all pixels valid; the source moves on a circle about z around the origin, the panel with it
-    what   needs such a panel, for messages
+    scan   all pixels valid; the source moves on a circle about z around the origin, and the panel with it
+    what   the algorithm that needs such a panel, for messages
 
-    The geometry is `rectified_geometry`. Values between pixels are those of cubic splines, and zero from half a pixel beside the
-    real panel on. A scan on a circle before an upright panel is returned as it is.
+    The geometry is `rectified_geometry`. Values are interpolated by cubic splines, and zero beyond half a pixel outside the real
+    panel. A circular scan with an upright panel is returned unchanged.
 
-    Raises InputError for pixels that are not valid, and for a source or a panel that moves otherwise.
+    Raises InputError for invalid pixels, and for a source or a panel that moves otherwise.
     """
     require_pixels(scan, what)
     geometry, (n_v, n_u) = rectified_geometry(scan.geometry, what), scan.geometry.nDetector
@@ -44,7 +43,7 @@ def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     for view, to_real in enumerate(_homographies(geometry.rays(), scan.geometry.rays())):
         x, y, w = to_real @ there
         x, y = x / w, y / w
-        # Half a pixel more than there is: a single row that is turned by little lies between two new ones.
+        # Half a pixel of margin: a single row that is slightly turned lies between two new rows.
         seen = (w > 0) & (x > -0.5) & (x < n_u + 0.5) & (y > -0.5) & (y < n_v + 0.5)
         value = ndimage.map_coordinates(scan.projections[view], [y - 0.5, x - 0.5], order=3, mode='nearest')
         out[view] = np.where(seen, value, 0).reshape(geometry.nDetector)
@@ -52,7 +51,7 @@ def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
 
 
 def can_rectify(scan: Scan) -> bool:
-    """Whether `rectified` knows the scan: an upright panel before a source on a circle, turned and tilted ones too."""
+    """Whether `rectified` accepts the scan: all pixels valid, the source on a circle, the panel moving with it."""
     try:
         require_pixels(scan, '')
         rectified_geometry(scan.geometry)
@@ -62,19 +61,19 @@ def can_rectify(scan: Scan) -> bool:
 
 
 def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> CircularGeometry:
-    """The same rays before an upright panel that holds the real panel's shadow of all views, with pixels no coarser.
+    """The geometry of an upright panel that contains the real panel's shadow in all views, with pixels no coarser.
 
-    Where a closed circle is seen by a panel that reaches farther on one side of the axis, the new one ends on the other side
-    where the last row begins to see: `fdk.ray_weights` knows no rows. Else that of a closed circle reaches as far on both.
+    With an offset panel on a closed circle, the new panel is cut on the short side where its last row begins to see, because
+    `fdk.ray_weights` treats all rows alike. Otherwise, on a closed circle, it is symmetric.
 
-    Raises InputError where the source leaves a circle about z, where the panel moves against it by more than a tenth of its
-    size, is turned so far that no line along the circle crosses it, or is not wholly before the source.
+    Raises InputError if the source leaves a circle about z, or if the panel moves relative to the source by more than a tenth
+    of its size, is turned too far for any line along the circle to cross it, or lies partly behind the source.
     """
     if isinstance(geometry, CircularGeometry):
         return geometry
     rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
     DSO, DSD, angles = _circle(geometry, what)
-    # Its positions are mm from the central ray, along the circle and downwards.
+    # Positions on this plane: mm from the central ray, along the circle and downwards.
     plane = scanner_rays(angles, DSO, DSD, (0, 0), (1.0, 1.0), rays.parallel)
     corners = np.array([[0, n_u, 0, n_u], [0, 0, n_v, n_v], [1, 1, 1, 1]], float)
     shadow = _homographies(rays, plane) @ corners
@@ -115,7 +114,7 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
 
 
 def _circle(geometry: Geometry, what: str):
-    """DSO, the mean DSD and the angles [view] of the circle about z that the source moves on, InputError where it does not."""
+    """DSO, mean DSD and angles [view] of the source's circle about z. Raises InputError if there is no such circle."""
     rays = geometry.rays()
     out = -rays.source if rays.parallel else rays.source
     angles = np.arctan2(out[:, 1], out[:, 0])
@@ -130,7 +129,7 @@ def _circle(geometry: Geometry, what: str):
 
 
 def _ends(shadow):
-    """How far a shadow's edges [view, 3, corner] reach along both axes: out and in on one side, in and out on the other."""
+    """Extents of a shadow [view, 3, corner], for each axis: outer and inner end on one side, inner and outer on the other."""
     across, down = np.abs(shadow[:, :2, 1:3] - shadow[:, :2, :1]).mean(0).T
     if across[0] < down[0]:  # a panel on its side: its columns lie along the circle
         shadow = shadow[:, :, [0, 2, 1, 3]]
@@ -140,7 +139,7 @@ def _ends(shadow):
 
 
 def _homographies(of: Rays, on: Rays) -> np.ndarray:
-    """Matrices [view, 3, 3] from positions (x, y, 1) on one panel to (x w, y w, w) on another that the same rays meet there.
+    """Homographies [view, 3, 3] from positions (x, y, 1) on one panel to (x w, y w, w) on another, along the same rays.
 
     w is positive in front of the source.
     """
@@ -151,7 +150,7 @@ def _homographies(of: Rays, on: Rays) -> np.ndarray:
 
 
 def _steps(to_pixels, at) -> np.ndarray:
-    """The steps along both axes of a plane, [2], none of which is longer than a pixel of any view.
+    """Pixel sizes along both axes of a plane, [2], no larger than a pixel of any view there.
 
     to_pixels   homographies [view, 3, 3] from the plane
     at          positions [view, 3, corner] where they are compared

@@ -1,4 +1,4 @@
-"""A volume on voxels that starts from a cloud's own: the best that few views and a fitted cloud give (docs/benchmarks)."""
+"""The best voxel volume from few views and a fitted cloud; it starts from the cloud's volume (docs/benchmarks/volumes.md)."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ from lingo_mi.reconstruction.system import System, on_voxels
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan
 
-SPREAD = 1.0  # standard deviation in voxels of what `structure` means by around a voxel
-LMBDA_RED = 0.99  # of the passes over completed views, as `SART`'s
-FLOOR = 0.05  # least weight over the root of the mean square
+SPREAD = 1.0  # neighbourhood of a voxel in `structure`: standard deviation, voxels
+LMBDA_RED = 0.99  # reduction of lmbda per pass over completed views, as in `SART`
+FLOOR = 0.05  # least weight, relative to the root mean square of all
 
 
 @dataclass(frozen=True)
 class Refined(Algorithm):
     """SART on views completed from a cloud, then ASD-POCS on the measured ones alone, both from the cloud's own volume.
 
-    The cloud's views are wrong by little, but where the measured ones see nothing; so they are met first, and what they have
-    wrong is put right by the measured ones. Both passes P, over completed and over measured views, weigh the voxels by the
-    `structure` s of the volume V that they start from, and where pixels are wider than voxels, blur G what they change to the
-    pixels' width (`excess_width`):
+    Rendered views are accurate except where no measured view constrains them. They are fitted first; the measured views then
+    correct their errors. A pass P over the completed or the measured views weights the voxels by the `structure` s of the
+    volume V that it starts from. If pixels are wider than voxels, a blur G (`excess_width`) smooths the change to the pixels'
+    width:
 
         x  <-  x + lmbda s (A_b^T W (b - A_b x)) / (A_b^T 1),  W = 1 / (A_b s),  s = root mean square gradient of V
         x  <-  max(x + G (P(x) - x), 0)
 
-    for a cloud is wrong at edges, hardly where it is even. Total variation is smoothed away in long steps, which shorten until
-    they change the volume by `rmax` of what the data do. Where Joseph's projector is off, the projections are corrected for it.
+    since a cloud errs at edges and hardly in uniform regions. The TV steps start long and shorten until they change the volume
+    by `rmax` of what the data steps do. The projections are corrected for the error of Joseph's projector (`exact_every`).
 
-    Structure finer than the voxels has no place on them and becomes streaks. The cloud has no voxels, so that it may be sampled
-    on smaller ones: with `finer` all of this is done on these, and their means are returned. It pays for clean projections of
-    objects finer than the voxels. One that was simulated on these very voxels is blurred by it, and noise finds more room
-    (docs/benchmarks/volumes.md, "Better volumes from 25 views").
+    Structure finer than the voxels causes streaks. A cloud can be sampled on smaller voxels: with `finer`, all steps use these,
+    and the result is their mean over each voxel. This helps for clean projections of objects finer than the voxels. It blurs
+    an object that was simulated on the scan's own voxels, and lets in more noise (docs/benchmarks/volumes.md, "Better volumes
+    from 25 views").
 
-    niter             passes over the measured views, from 1 on
-    completed_niter   passes over the completed views before, from 0 on
+    niter             passes over the measured views, at least 1
+    completed_niter   passes over the completed views before, at least 0
     tviter, alpha, alpha_red, rmax, maxl2err, exact_every
-                      of `ASDPOCS`. The defaults are for clean projections; with noise, maxl2err says how well to meet them
-    finer             parts along each side of a voxel, from 1 on; memory grows with its cube
-    seed              of the random orders, from 0 on
+                      see `ASDPOCS`. The defaults are for clean projections; with noise, maxl2err sets how closely to match them
+    finer             parts along each side of a voxel, at least 1; memory grows with its cube
+    seed              of the random orders, at least 0
 
-    Prefer it for few views wherever a cloud has been fitted to them (`lingo_mi.completion` prepares what it needs).
+    Use it for few views if a cloud has been fitted to them (`lingo_mi.completion` prepares its inputs).
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> found = x3d_scan.scan(make('foot', 24), views=10, pixels=48)
@@ -100,14 +100,14 @@ class Refined(Algorithm):
         sample: Callable[[Geometry], np.ndarray] | None = None,
         completed: Scan | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of measured projections. The residuals are theirs.
+        """Reconstruct the volume from measured projections. The residuals are those of the measured views.
 
-        start       the cloud's volume [x, y, z], density per mm; in its place, and where `finer` is above 1:
-        sample      the cloud's densities per mm [x, y, z] at the voxel centres of a geometry, a function of that
-        completed   measured views, then those between (`completion.views.insert_views`); None where completed_niter is 0
-        progress    called as progress(passes done, passes, residual), None for the residual of completed views
+        start       the cloud's volume [x, y, z], density per mm; give either this or `sample`
+        sample      function of a geometry: the cloud's densities per mm [x, y, z] at its voxel centres; needed for `finer` > 1
+        completed   the measured views, then those between (`completion.views.insert_views`); None if completed_niter is 0
+        progress    called as progress(passes done, passes, residual); the residual is None in passes over completed views
 
-        Raises InputError where one of these is missing or does not fit the geometry, and where the result is not finite.
+        Raises InputError if an input is missing or does not fit the geometry, and if the result is not finite.
         """
         began = time.perf_counter()
         geometry, steps = scan.geometry, self.steps(scan)
@@ -153,14 +153,14 @@ class Refined(Algorithm):
 
 
 def _continued(progress: Progress | None, before: int, steps: int) -> Progress | None:
-    """`progress` for one of several stages, of `steps` together, `before` of which are done."""
+    """`progress` for one of several stages: `before` of all `steps` were done in earlier stages."""
     if progress is None:
         return None
     return lambda done, _, residual: progress(before + done, steps, residual)
 
 
 def _on_completed(scan: Scan, niter: int, volume: np.ndarray, blur, seed: int, progress: Progress | None) -> np.ndarray:
-    """A volume after passes of SART from this one, weighted by its own `structure`; without residuals, which nobody reads."""
+    """The volume after `niter` passes of SART, weighted by the `structure` of the start. No residuals are computed."""
     system, order = System(scan, structure(volume), blur), passes(scan.geometry.angles, 1, 'random', seed)
     x = system.start(volume)
     for k in range(niter):
@@ -171,9 +171,9 @@ def _on_completed(scan: Scan, niter: int, volume: np.ndarray, blur, seed: int, p
 
 
 def structure(volume: np.ndarray) -> np.ndarray:
-    """How much a volume [x, y, z] changes around each voxel, as weights for SART: the root of the mean square gradient there.
+    """Weights for SART from a volume [x, y, z]: the root mean square gradient around each voxel.
 
-    Nowhere below `FLOOR` of its own root mean square, so that nothing is held fast; ones where a volume is the same throughout.
+    At least `FLOOR` of the weights' own root mean square, so that every voxel can change. Ones for a constant volume.
     """
     square = np.zeros_like(volume)
     for axis, count in enumerate(volume.shape):

@@ -1,27 +1,28 @@
-"""SART, OS-SART and SIRT: one update rule, taken a view, a block of views, or all views at a time.
+"""SART, OS-SART and SIRT: one update rule, applied to one view, a block of views, or all views at a time.
 
 Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984). For the rows A_b of a
 block,
 
     x  <-  x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1),    W = 1 / (A_b 1)
 
-where division is by voxel and by pixel, and what no ray crosses is left alone. With weights s of the voxels these are the
-same steps for z in x = x_0 + diag(s) z, A diag(s) in A's place:
+with element-wise divisions. Voxels and pixels without rays stay unchanged. With weights s of the voxels these are the same
+steps for z in x = x_0 + diag(s) z, with A diag(s) in place of A:
 
     x  <-  x + lmbda s (A_b^T W (b - A_b x)) / (A_b^T 1),  W = 1 / (A_b s)
 
-so that of all volumes that meet the projections the one is approached whose change is least, measured in s.
+Among all volumes that match the projections, the iteration approaches the one with the smallest change from x_0, measured in
+units of s.
 
-Pixels wider than the voxels see little of what is as fine as these, and steps for them leave the rays' own pattern. A `blur` G,
-a Gaussian, smooths what a pass P of these steps has changed:
+Pixels wider than the voxels hardly resolve single voxels, and the steps leave a pattern of the rays. A Gaussian `blur` G
+smooths the change that a pass P of these steps makes:
 
     x  <-  max(x + G (P(x) - x), 0)
 
-It leaves alone what P leaves alone, so that what is approached in the end still meets the projections. Voxels between rays
-that hardly any ray crosses change as those around them (`wide_pixels.Between`).
+A volume that P does not change, the blur does not change either, so the limit still matches the projections. Voxels that
+hardly any ray crosses change like their neighbours (`wide_pixels.Between`).
 
-Parameters that TIGRE has carry its names for Python; lmbda, lmbda_red, blocksize and noneg have its defaults, OrderStrategy
-that of TIGRE for MATLAB.
+Parameters have the names of TIGRE for Python, if it has them. lmbda, lmbda_red, blocksize and noneg have its defaults;
+OrderStrategy has that of TIGRE for MATLAB.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Pixels wider than voxels: rays that leave voxels between them out, and their pattern in a volume.
+"""Pixels wider than voxels: voxels that rays miss, and the pattern that rays leave in a volume.
 
-Rays go to pixels' centres, and a projector's weights reach one voxel to either side of a ray. Where pixels at the axis are
-two voxels wide or more, some voxels are crossed by no ray of any view.
+Rays go to pixel centres, and a projector's weights reach one voxel to either side of a ray. If pixels at the axis are two or
+more voxels wide, some voxels are crossed by no ray of any view.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from lingo_mi.geometry.base import Geometry
 
-LEAST = 0.1  # A^T 1 over its mean around a voxel, above which rays count as crossing it
+LEAST = 0.1  # a voxel counts as crossed if A^T 1 is above this share of its neighbourhood's mean
 
 
 def pitch(geometry: Geometry) -> tuple[float, float, float]:
-    """The distance between rays at the axis, (x, y, z) voxels: columns are as far apart along x and y, rows along z."""
+    """The distance between rays at the axis, in voxels (x, y, z): between columns along x and y, between rows along z."""
     at_axis = geometry.DSO / geometry.DSD if geometry.mode == 'cone' else 1.0
     v, u = (at_axis * d for d in geometry.dDetector)
     x, y, z = geometry.dVoxel
@@ -32,28 +32,28 @@ def leave_voxels_out(geometry: Geometry) -> bool:
 
 
 def excess_width(geometry: Geometry) -> tuple[float, float, float]:
-    """The Gaussian that makes voxels as wide as pixels at the axis, twice, as `blur` for `sart`: deviations (x, y, z), voxels.
+    """Standard deviations (x, y, z), in voxels, of the `blur` for `sart`: a Gaussian that widens voxels to pixels at the axis.
 
-    Variances add up, and that of a box is a twelfth of its width's square; twice, since a pixel's width comes in with A and
-    with A^T. Zero where pixels are no wider than voxels.
+    Variances add up; that of a box is width^2 / 12. It is doubled, since a pixel's width enters with A and with A^T. Zero if
+    pixels are no wider than voxels.
     """
     x, y, z = (sqrt(max(p**2 - 1, 0) / 6) for p in pitch(geometry))
     return x, y, z
 
 
 class Between:
-    """The voxels between rays, crossed by none, or by few at a corner, among voxels that rays do cross.
+    """Voxels that no ray crosses, or few rays at a corner, among neighbours that rays cross.
 
     geometry   of the scan
     A, views   its projector and views
 
-    Few and small steps leave such a voxel behind those around it, which meet the projections without it. Beyond the rays, where
-    less than half of what is around a voxel is crossed, nothing counts as between.
+    Few small steps leave these voxels behind their neighbours. Outside the field of view (less than half of the neighbourhood
+    crossed) nothing counts as between.
     """
 
     @classmethod
     def of(cls, geometry: Geometry, A, views: np.ndarray) -> Between | None:
-        """None where rays are too close for there to be any."""
+        """None if rays are too close for such voxels."""
         return cls(geometry, A, views) if leave_voxels_out(geometry) else None
 
     def __init__(self, geometry: Geometry, A, views: np.ndarray):
@@ -63,11 +63,11 @@ class Between:
         share = blurred(dr.select(self.crossed, mi.Float(1), 0), self.size, self.deviations)
         self.share = dr.select(
             self.crossed | (share < 0.5), 0, share
-        )  # of what rays cross around a voxel between them, 0 elsewhere
+        )  # crossed part of the neighbourhood of a voxel between rays; 0 for other voxels
         dr.eval(self.crossed, self.share)
 
     def filled(self, change: mi.Float) -> mi.Float:
-        """A change of the volume (mi.Float [voxels]), the voxels between rays changed as those around them."""
+        """A change of the volume (mi.Float [voxels]) in which voxels between rays change like their neighbours."""
         around = blurred(dr.select(self.crossed, change, 0), self.size, self.deviations)
         return dr.select(self.share > 0, around / self.share, change)
 
@@ -75,7 +75,7 @@ class Between:
 def blurred(volume: mi.Float, size: tuple[int, int, int], deviations: Sequence[float]) -> mi.Float:
     """A volume (mi.Float [voxels]) convolved with a Gaussian of these standard deviations, in voxels along x, y, z.
 
-    Cut off at 4 of them; beyond the border the volume is mirrored. Deviations above the volume's own side count as that.
+    Cut off at 4 standard deviations; the volume is mirrored at its borders. No deviation exceeds the volume's own side.
     """
     tensor = mi.TensorXf(volume, size)
     for axis, (deviation, count) in enumerate(zip(deviations, size)):

@@ -365,7 +365,7 @@ def test_missing_views_come_from_the_checkpoint(result, scene, tmp_path):
     code, _, err = run_script(
         reconstruct, scene, '--algorithm', 'voxelize', *complete_it[:2], '--out', tmp_path / 'w.nii'
     )
-    assert code == 2 and 'make no volume' in err
+    assert code == 2 and 'has no volume' in err
 
 
 def test_checkpoints_that_complete_nothing(scan, tmp_path):

@@ -1,4 +1,4 @@
-"""Forward models: what a Gaussian's raw parameters are, and how Gaussians become the image of a view."""
+"""Forward models: the raw parameters of a Gaussian, and how Gaussians become the image of a view."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from lingo_mi.fitting.settings import Settings
 
 
 def forward_model(settings: Settings) -> ForwardModel:
-    """The forward model that the settings name by `render`."""
+    """The forward model for the setting `render`."""
     return {'integral': LineIntegrals, 'alpha': AlphaCompositing}[settings.model.render](settings)

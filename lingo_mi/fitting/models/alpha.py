@@ -1,6 +1,6 @@
 """Grey images composited front to back from opacities and radiances: the forward model of 3DGS and of X-Gaussian.
 
-It knows no densities and makes no volume. The projections over their maximum are taken for grey images.
+It has no densities and no volume. The grey images are the projections divided by their maximum.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ OPACITY = 0.1  # of all Gaussians at the start of a fit (3DGS)
 
 
 class AlphaCompositing(ForwardModel):
-    """Opacities by a sigmoid (3DGS), radiances as of `projectors.radiance`; clones and halves keep both.
+    """Opacities by a sigmoid (3DGS), radiances as in `projectors.radiance`. Clones and halves keep both.
 
-    Its raw parameters besides the shape: 'opacity', 'radiance', and 'harmonics', coefficients of the radiance's spherical
+    Raw parameters besides the shape: 'opacity', 'radiance' and 'harmonics', the coefficients of the radiance's spherical
     harmonics from degree 1 on, degree by degree.
     """
 
@@ -37,7 +37,7 @@ class AlphaCompositing(ForwardModel):
         return SHAPE | {'opacity': 1, 'radiance': 1} | harmonics
 
     def initial(self, n, density):
-        """Opacities of 0.1 and half grey (3DGS), whatever the density."""
+        """Opacity 0.1 and half grey for all Gaussians (3DGS). The density is not used."""
         own = {k: np.zeros((n, size)) for k, size in self.parameters.items() if k not in SHAPE}
         return own | {'opacity': np.full((n, 1), inverse_sigmoid(OPACITY))}
 
@@ -45,15 +45,15 @@ class AlphaCompositing(ForwardModel):
         return sigmoid(values['opacity'][:, 0].astype(float))
 
     def shared(self, values, chosen, factor):
-        """As they are: opacities are not shared."""
+        """Unchanged: duplicates keep the opacity."""
         return values
 
     def may_stay(self, centre, scale, half, largest):
-        """Those that are not too large, in the volume or not (3DGS)."""
+        """Gaussians that are not too large, inside the volume or not (3DGS)."""
         return scale.max(1) <= largest
 
     def with_lengths(self, geometry: Geometry) -> Settings:
-        """`rate_centre`, `split_size` and `prune_size` are in units of the scene's radius."""
+        """Converts `rate_centre`, `split_size` and `prune_size` from units of the scene's radius."""
         radius, s = scene_radius(geometry), self.settings
         return s.changed(
             rate_centre=tuple(radius * r for r in s.adam.rate_centre),
@@ -62,7 +62,7 @@ class AlphaCompositing(ForwardModel):
         )
 
     def gaussians(self, values):
-        """Followed by what `projectors.radiance.radiance_towards` takes."""
+        """As in `ForwardModel`; the further arguments are those of `projectors.radiance.radiance_towards`."""
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
         return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
 
@@ -71,11 +71,11 @@ class AlphaCompositing(ForwardModel):
         return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
 
     def integrals(self, footprints, rays, share=None):
-        """The grey image, taken for line integrals."""
+        """The grey image, in place of line integrals."""
         return [composite(footprints, rays.height, rays.width)]
 
     def hold_back(self, gradients, iteration):
-        """Harmonics of a degree that has not joined in stay at zero (3DGS)."""
+        """Harmonics of degrees that have not started stay zero (3DGS)."""
         if 'harmonics' not in gradients:
             return
         model = self.settings.model
@@ -86,9 +86,10 @@ class AlphaCompositing(ForwardModel):
 
 
 def harmonics(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of the radiance's spherical harmonics: of degree 0 [N], to whose harmonic 1/2 is added, and higher [N, M].
+    """Coefficients of the radiance's spherical harmonics: degree 0 [N], and higher degrees [N, M].
 
-    Radiance that is the same in all directions is a sigmoid of its raw value (see `projectors.radiance`).
+    The radiance is 1/2 plus their sum. If it is the same in all directions, it is a sigmoid of the raw value (see
+    `projectors.radiance`), here converted to degree 0.
     """
     raw = values['radiance'][:, 0].astype(float)
     if 'harmonics' in values:
@@ -99,7 +100,7 @@ def harmonics(values: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def scene_radius(geometry: Geometry) -> float:
     """3DGS's unit of length: 1.1 times the largest distance of a source from the mean of all, in the normalised frame.
 
-    1 where there is no such distance: for a single view, and for a parallel beam, which has no source.
+    1 for a single view and for a parallel beam, where that distance does not exist.
     """
     rays = geometry.normalised_rays()
     if rays.parallel:

@@ -1,4 +1,4 @@
-"""What a forward model must say, for a fit to find its parameters."""
+"""The interface between a forward model and a fit of its parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lingo_mi.projectors.alpha import Discs
 from lingo_mi.projectors.footprint import Footprints
 from lingo_mi.projectors.view import View
 
-SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of every Gaussian's shape, whatever is rendered
+SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of the shape, in all forward models
 
 
 class ForwardModel(ABC):
@@ -33,15 +33,15 @@ class ForwardModel(ABC):
     @property
     @abstractmethod
     def parameters(self) -> dict[str, int]:
-        """The raw parameters of a Gaussian by name, and how many numbers each is: `SHAPE` and the model's own."""
+        """Sizes of a Gaussian's raw parameters, by name: `SHAPE` and the model's own."""
 
     # ---- on the host ----
 
     @abstractmethod
     def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
-        """The model's own raw parameters of the n Gaussians that a fit starts with, float [n, size].
+        """The model's own raw parameters at the start of a fit with n Gaussians, float [n, size].
 
-        density   at the centres, in the fit's unit, [n]; None where the initial cloud knows none
+        density   at the centres, in the fit's unit, [n]; None if the initial cloud has no densities
         """
 
     @abstractmethod
@@ -50,9 +50,9 @@ class ForwardModel(ABC):
 
     @abstractmethod
     def shared(self, values: dict[str, np.ndarray], chosen: np.ndarray, factor: float) -> dict[str, np.ndarray]:
-        """The values with those of the chosen Gaussians [N] as each of the two should have that replace one.
+        """The values after each chosen Gaussian [N] has been prepared for duplication: its density is multiplied by `factor`.
 
-        factor   of the density
+        Opacities stay.
         """
 
     @abstractmethod
@@ -61,33 +61,33 @@ class ForwardModel(ABC):
 
         centre, scale   [N, 3]
         half            half the volume's sides, [3]
-        largest         bound of the standard deviations, where the model has one
+        largest         upper bound of the standard deviations, if the model has one
         """
 
     def with_lengths(self, geometry: Geometry) -> Settings:
-        """The settings with what the model has in another unit of length in that of the normalised frame."""
+        """The settings with lengths converted to the normalised frame, where the model uses another unit."""
         return self.settings
 
     # ---- on the device ----
 
     @abstractmethod
     def gaussians(self, values: dict) -> tuple:
-        """Centres, standard deviations, quaternions (not normalised) and densities or opacities, and whatever else
-        `footprints` takes; differentiable."""
+        """Centres, standard deviations, quaternions (not normalised), densities or opacities, and further arguments of
+        `footprints`. Differentiable."""
 
     @abstractmethod
     def footprints(self, gaussians: tuple, rays: View) -> Footprints | Discs:
-        """A cloud on a view's panel, the last two of whose `values` are x and y in pixels; differentiable."""
+        """Footprints of a cloud on a view's panel. The last two `values` are x and y in pixels. Differentiable."""
 
     @abstractmethod
     def integrals(self, footprints, rays: View, share=None) -> list:
-        """Line integrals along the rays of a view, a list of Float [height * width]; differentiable.
+        """Line integrals along the rays of a view: a list of Float [height * width], one for each material. Differentiable.
 
-        share   of the second of two materials in every Gaussian, Float [N], which makes the list of two; None: one material
+        share   of the second of two materials in every Gaussian, Float [N]; None: one material
         """
 
     def hold_back(self, gradients: dict, iteration: int):  # noqa: B027 - most models hold nothing back
-        """Set to zero the gradients of what is not fitted yet at an iteration."""
+        """Set the gradients of parameters to zero that are not fitted yet at this iteration."""
 
     def _shape(self, values: dict):
         """Centres, standard deviations by a sigmoid between the bounds (R2-Gaussian), and quaternions, on the device."""

@@ -16,7 +16,7 @@ PARAMETERS = SHAPE | {'density': 1}
 
 
 class LineIntegrals(ForwardModel):
-    """Densities by softplus (R2-Gaussian, section 4.1); pixels are line integrals, exact but for the cut-off `extent`."""
+    """Densities by softplus (R2-Gaussian, section 4.1). Pixels are line integrals, exact up to the cut-off `extent`."""
 
     replayable = True
 
@@ -31,13 +31,13 @@ class LineIntegrals(ForwardModel):
         return softplus(values['density'][:, 0].astype(float))
 
     def shared(self, values, chosen, factor):
-        """Half the density, or what keeps the mass: `factor` of it."""
+        """The chosen densities are multiplied by `factor`."""
         raw = values['density'].astype(float)
         raw[chosen] = inverse_softplus(softplus(raw[chosen]) * factor)
         return values | {'density': raw.astype(np.float32)}
 
     def may_stay(self, centre, scale, half, largest):
-        """Those whose centre is in the volume."""
+        """Gaussians centred inside the volume."""
         return (np.abs(centre) <= np.asarray(half)).all(1)
 
     def gaussians(self, values):
@@ -57,8 +57,8 @@ class LineIntegrals(ForwardModel):
 
 
 def _softplus(x):
-    """ln(1 + e^x) without overflow, to float32's relative precision at both ends."""
-    above = x > 0  # not by maximum and abs, whose derivatives at 0 add up to 0
+    """ln(1 + e^x) without overflow, with float32's relative precision at both ends."""
+    above = x > 0  # maximum and abs would have derivatives at 0 that sum to 0
     small = dr.exp(dr.select(above, -x, x))
     series = small * (1 - small * (1 / 2 - small * (1 / 3 - small / 4)))  # 1 + small would round small away
     return dr.select(above, x, 0) + dr.select(small < 0.01, series, dr.log(1 + small))
