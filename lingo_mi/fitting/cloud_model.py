@@ -74,7 +74,6 @@ class CloudModel:
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
         """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
 
-        The grid must have the size of the scan's volume, but may have other voxels.
         None for alpha compositing, whose opacities are not densities.
         """
         if not self.settings.volumetric:
