@@ -37,7 +37,7 @@ SUMMARY = {
 }
 
 
-def arguments():
+def arguments() -> tuple[argparse.Namespace, str]:
     listing = '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
     parser = Parser(
         description=__doc__, epilog=EPILOG.format(list=listing), formatter_class=argparse.RawDescriptionHelpFormatter
@@ -74,7 +74,7 @@ def arguments():
     return parser.parse_args(), listing
 
 
-def check(args):
+def check(args: argparse.Namespace) -> None:
     """Everything that can be refused before the work begins."""
     if args.name is None:
         raise InputError(f'name a phantom: one of {", ".join(phantoms.names())}')
@@ -125,7 +125,7 @@ def write_ply(path, phantom):
         print(f'{name}: {len(mesh.faces)} triangles')
 
 
-def main():
+def main() -> None:
     args, listing = arguments()
     if args.list:
         print(listing)

@@ -29,7 +29,14 @@ APART = 0.7  # distance of a half's centre from its parent's, in the parent's st
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
-def densify(state: State, settings: Settings, half, rng, flat: bool = False, largest: float = np.inf) -> State:
+def densify(
+    state: State,
+    settings: Settings,
+    half: np.ndarray,
+    rng: np.random.Generator,
+    flat: bool = False,
+    largest: float = np.inf,
+) -> State:
     """Clone and split, or halve, and prune once, then clear the statistic.
 
     half      half the volume's sides, [3]: Gaussians centred outside are removed

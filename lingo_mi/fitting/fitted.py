@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -75,7 +76,7 @@ class Fitted:
         """The geometry with its views where the fit has put them: `geometry` itself, where it left them alone."""
         return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
-    def render(self, geometry: Geometry, progress=None) -> np.ndarray:
+    def render(self, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
         """What the scan's detector would see in a geometry, float32 [view, v, u]: see `CloudModel.render`."""
         return self.model.render(DeviceState(self.state), geometry, progress)
 

@@ -85,7 +85,7 @@ class LingoSettings:
             raise InputError(f'init_density {self.init_density!r} is unknown: use one of {", ".join(MODES)}')
 
 
-def draw(cells, count: int, rng):
+def draw(cells: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw `count` of the cells, without replacement while they last: (cells [count], is a repeat [count]).
 
     When there are fewer cells than points, every cell is taken once, then again, as evenly as it goes.

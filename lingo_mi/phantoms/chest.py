@@ -9,6 +9,7 @@ is exactly 0. A voxel holds its average to first order; textures are fixed in sp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -36,7 +37,7 @@ _COARSE = 96  # lattice of the smooth fields, for all sizes
 _SIDES = (1, -1)
 
 
-def density(hu):
+def density(hu: Any) -> Any:
     """Hounsfield units to [0, 1]: (clip(hu, -1000, 2000) + 1000) / 3000."""
     return (np.clip(hu, -1000, 2000) + 1000) / 3000
 

@@ -147,4 +147,4 @@ def build(size: int, seed: int):
     part."""
     analytic = Mesh(flange())
     step = SIDE / size
-    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size,) * 3), SIDE, analytic
+    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size, size, size)), SIDE, analytic

@@ -8,6 +8,8 @@ Items that overlap from different places add different numbers, of which the rou
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,17 +20,17 @@ CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by the number of axes, along each o
 SAMPLE = 16384  # items that are looked at
 
 
-def hashed(i):
+def hashed(i: Any) -> Any:
     """Numbers that follow in no order from those that do, UInt32 (Knuth's multiplicative hash): clouds may be periodic."""
     return i * 2654435761 // 65536
 
 
-def parts_of(depth) -> int:
+def parts_of(depth: Any) -> int:
     """In how many parts to add up items that lie so `deepest`. Waits for the device."""
     return max(-(-int(depth[0]) // DEEP), 1)
 
 
-def deepest(places, covered, shape):
+def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
     """How many items lie on top of each other where they do most, on a grid of elements: Float [1], 0 where few are there.
 
     places    Int32 [N] for each axis, an item's element; it may lie outside the grid

@@ -76,7 +76,7 @@ class Workload:
         """The image [v, u] and the derivatives by name."""
         if self._truth is None:
             self._truth = image_and_gradients(
-                self.columns, self.geometry.rays(), (self.pixels,) * 2, self.weights, self.order
+                self.columns, self.geometry.rays(), (self.pixels, self.pixels), self.weights, self.order
             )
         return self._truth
 

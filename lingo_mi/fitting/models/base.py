@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -80,13 +81,13 @@ class ForwardModel(ABC):
         """A cloud on a view's panel, the last two of whose `values` are x and y in pixels; differentiable."""
 
     @abstractmethod
-    def integrals(self, footprints, rays: View, share=None) -> list:
+    def integrals(self, footprints: Any, rays: View, share: Any = None) -> list:
         """Line integrals along the rays of a view, a list of Float [height * width]; differentiable.
 
         share   of the second of two materials in every Gaussian, Float [N], which makes the list of two; None: one material
         """
 
-    def hold_back(self, gradients: dict, iteration: int):
+    def hold_back(self, gradients: dict, iteration: int) -> None:
         """Set to zero the gradients of what is not fitted yet at an iteration."""
 
     def _shape(self, values: dict):
