@@ -19,6 +19,8 @@ from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
@@ -124,7 +126,7 @@ def ssim_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = N
     return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
 
 
-def ssim_map(a, b, axes=(0, 1)) -> np.ndarray:
+def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.ndarray:
     """SSIM of two images [rows, columns], or volumes, at every pixel, for values with full scale 1.
 
     The window is a Gaussian of sigma 1.5, 11 wide along each of the `axes`, the image is continued by zeros, variances are

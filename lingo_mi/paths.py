@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from lingo_mi.errors import InputError
 
@@ -80,7 +81,7 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
         yield temporary
 
 
-def optional(module: str):
+def optional(module: str) -> Any:
     """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
     import importlib
 

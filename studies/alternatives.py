@@ -95,7 +95,7 @@ def _sum_gaussians(columns, start, direction, count, Float, Vector, compensated)
 # ------------------------------------------------------------------------------------------------------------
 
 
-def march(data, size, half, origin, direction, step: float):
+def march(data: Any, size: int, half: float, origin: Any, direction: Any, step: float) -> Any:
     """Line integrals of a grid by the midpoint rule with steps of `step` along the rays, in the box [-half, half]^3.
 
     data                Float [size^3], x fastest: values at the voxel centres, interpolated trilinearly

@@ -12,6 +12,7 @@ says why both are needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -63,10 +64,13 @@ def image_and_gradients(
     return image, gradients if weights is not None else {}
 
 
-def rays_and_gradients(gaussians: Sequence[np.ndarray], start: np.ndarray, direction: np.ndarray, weights: np.ndarray):
+def rays_and_gradients(
+    gaussians: Sequence[np.ndarray], start: np.ndarray, direction: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Line integrals of a cloud along rays [M, 3], float64 [M], and derivatives as `image_and_gradients` gives them."""
     gaussians = [np.asarray(x, float) for x in gaussians]
-    total, rows = 0.0, []
+    total: Any = 0.0
+    rows = []
     for one in zip(*gaussians):
         value, row = _gaussian(one, start, direction, weights)
         total = total + value

@@ -162,7 +162,7 @@ class Detector:
             variance = variance + light / self.photons + (self.electronic_noise / self.photons) ** 2
         return np.sqrt(variance) / light
 
-    def maps(self, shape: tuple[int, int]):
+    def maps(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""
         return _maps(self.seed, self.gain, self.dead, tuple(shape))
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import pickle
 from os import PathLike
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -179,7 +179,7 @@ def _resolve(value, depth=0):
     raise _Refused(f'a value of type {type(value).__name__}')
 
 
-def load_pickle(path: PathLike | str):
+def load_pickle(path: PathLike | str) -> Any:
     """The plain data in a pickle, protocols 0 to 5 of Python 3, written by NumPy 1 or 2.
 
     Raises InputError if the file is missing, truncated, or holds anything but dictionaries, lists, tuples,

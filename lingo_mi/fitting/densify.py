@@ -62,13 +62,13 @@ def densify(
     return prune(state, settings, half, largest)
 
 
-def clone(state: State, chosen, settings: Settings) -> State:
+def clone(state: State, chosen: np.ndarray, settings: Settings) -> State:
     """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
     halved = _shared(state, chosen, 0.5, settings)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
-def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> State:
+def split(state: State, chosen: np.ndarray, settings: Settings, rng: np.random.Generator, flat: bool = False) -> State:
     """Replace each of the chosen Gaussians [N] by two smaller ones at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
@@ -84,7 +84,7 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     return _append(_take(state, ~chosen), children)
 
 
-def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State:
+def halve(state: State, chosen: np.ndarray, settings: Settings, flat: bool = False) -> State:
     """Replace each of the chosen Gaussians [N] by two, side by side along its longest axis, with its mass and covariance."""
     parents = np.flatnonzero(chosen)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
@@ -100,7 +100,7 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
     return _append(_take(state, ~chosen), children)
 
 
-def prune(state: State, settings: Settings, half, largest: float = np.inf) -> State:
+def prune(state: State, settings: Settings, half: np.ndarray, largest: float = np.inf) -> State:
     """Remove Gaussians whose density or opacity is below the bound, and those that the forward model does not let stay: whose
     centre left the volume, or a standard deviation of which is above `largest`. Clear the statistic."""
     centre, scale, _, amount = activate(state, settings)

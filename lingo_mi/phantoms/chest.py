@@ -51,13 +51,13 @@ class Stack:
 
     rows: tuple
 
-    def at(self, z):
+    def at(self, z: np.ndarray) -> list[np.ndarray]:
         """Half width, half depth and centre's y at heights z, constant beyond the rows."""
         rows = np.array(self.rows, float)
         z = np.clip(z, rows[0, 0], rows[-1, 0])
         return [PchipInterpolator(rows[:, 0], rows[:, i])(z).astype(np.float32) for i in (1, 2, 3)]
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         a, b, c = self.at(z)
         y = y - c
         u, v = (np.abs(x) / a) ** 2.4, (np.abs(y) / b) ** 2.4
@@ -256,7 +256,7 @@ def _trees(rng, is_lung):
     return vessels, airways
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     """Data float32 [size]^3 in [0, 1], side in mm, and no analytic form (see `phantoms.make`)."""
     rng = np.random.default_rng(seed)
     grid, coarse = (Grid(n, SIDE, np.full(3, -SIDE / 2)) for n in (size, _COARSE))

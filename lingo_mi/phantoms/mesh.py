@@ -12,6 +12,7 @@ Mitsuba's `ply` and `obj` shapes:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -142,7 +143,7 @@ class Mesh:
         return out.astype(np.float32)
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
     """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed plays no
     part."""
     analytic = Mesh(flange())

@@ -159,7 +159,7 @@ def statistics(times: dict) -> dict:
     return out
 
 
-def peak_memory(function: Callable):
+def peak_memory(function: Callable[[], Any]) -> tuple[Any, float]:
     """What a call gives, and the MB that Dr.Jit holds at most during it, above what it held before."""
     gc.collect()
     dr.sync_thread()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 
@@ -80,7 +82,7 @@ class Workload:
             )
         return self._truth
 
-    def gaussians(self):
+    def gaussians(self) -> tuple[Any, Any, Any, Any]:
         """Centre, scale, rotation and density as new Dr.Jit arrays."""
         centre, scale, rotation = ([mi.Float(c) for c in x.T] for x in self.columns[:3])
         return mi.Point3f(*centre), mi.Vector3f(*scale), mi.Vector4f(*rotation), mi.Float(self.columns[3])
