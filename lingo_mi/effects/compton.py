@@ -14,6 +14,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.effects.spectrum import compound, library
 from lingo_mi.errors import InputError
@@ -26,7 +27,7 @@ _LEAST_Q = 1.1e-3  # 1/Angstrom, below which its tables of S end; it is next to 
 _HC = 12.398420  # keV Angstrom
 
 
-def klein_nishina(cosine, energy: float, response: str = 'count') -> np.ndarray:
+def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> np.ndarray:
     """d sigma / d Omega of a free electron over r_e^2, 1/sr, float64, by the cosine of the scattering angle (any shape).
 
     energy     keV

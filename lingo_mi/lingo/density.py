@@ -13,6 +13,7 @@ factor is the one thing chosen here:
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lingo_mi.geometry.camera import camera_matrices
@@ -24,7 +25,7 @@ MODES = (*FACTORS, 'lsq', 'fdk')
 FAINTEST = 0.02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
 
 
-def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
+def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
     rays         n views in the normalised frame
@@ -46,7 +47,7 @@ def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
     return total / np.maximum(seen, 1)
 
 
-def trilinear(volume: np.ndarray, points, half) -> np.ndarray:
+def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """A volume's trilinear values at points, [N]; beyond the outermost voxels' centres, those voxels'.
 
     volume  [x, y, z]
@@ -56,12 +57,12 @@ def trilinear(volume: np.ndarray, points, half) -> np.ndarray:
     return ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
 
 
-def sampled(volume: np.ndarray, points, half) -> np.ndarray:
+def sampled(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """The `trilinear` values of a volume of densities, at least FAINTEST of its largest one."""
     return np.maximum(trilinear(volume, points, half), FAINTEST * volume.max())
 
 
-def least_squares_factor(measured, rendered) -> float:
+def least_squares_factor(measured: np.ndarray, rendered: np.ndarray) -> float:
     """alpha = <I, Ihat> / <Ihat, Ihat>, which minimises |I - alpha Ihat|^2; 1 where the rendering is empty.
 
     The sums are in float64. A negative factor (projections that are mostly below zero) is replaced by 1 as

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -99,7 +100,7 @@ class System:
         return volume
 
 
-def evaluated(x) -> mi.Float:
+def evaluated(x: Any) -> mi.Float:
     """An array of the device itself, computed now."""
     dr.eval(x)
     return x

@@ -12,7 +12,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.memory import room
 
 
-def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0):
+def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0) -> None:
     """Refuse, before anything is allocated, a scan that this process cannot hold.
 
     views    of all geometries together (0: as many as they have)
@@ -31,7 +31,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
         )
 
 
-def warn_if_truncated(geometry: Geometry):
+def warn_if_truncated(geometry: Geometry) -> None:
     """Say so where the volume's midplane is wider than what the panels see of it."""
     rays, centre = geometry.rays(), np.array(geometry.offOrigin)
     widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]

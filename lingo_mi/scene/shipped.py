@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 
 from lingo_mi.errors import InputError
@@ -14,7 +15,7 @@ def scenes() -> dict[str, Path]:
     return {path.relative_to(root).with_suffix('').as_posix(): path for path in sorted(root.rglob('*.xml'))}
 
 
-def scene_path(scene) -> Path:
+def scene_path(scene: PathLike | str) -> Path:
     """The file of a scene: `scene` itself if there is such a file, else the shipped scene of that name.
 
     A folder is no file: results in a folder `x3d_foot` do not hide the scene of that name.
