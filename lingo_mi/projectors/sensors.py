@@ -12,7 +12,7 @@ from lingo_mi.projectors.view import View
 def view_of(sensor) -> View:
     """The rays through the pixel centres of a flat sensor's film.
 
-    `ct_scanner`, `perspective` (with principal point offsets) and `orthographic` are known; pixels are those of the film's
+    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's
     crop window. Raises InputError for any other sensor.
     """
     if hasattr(sensor, 'frame'):

@@ -1,4 +1,4 @@
-"""One flat-panel view as Dr.Jit values: what the projector kernels know of a sensor."""
+"""One flat-panel view as Dr.Jit values, for the projector kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 
 
 def vector64(xyz):
-    """An opaque Array3f64 of three Python numbers: a literal would be compiled into the kernel."""
+    """An opaque Array3f64 of three Python numbers; literals would be compiled into the kernel."""
     Array3d, Float64 = mi.Vector3d, dr.value_t(mi.Vector3d)
     return Array3d(*(dr.opaque(Float64, float(x)) for x in xyz))
 
@@ -25,8 +25,8 @@ class View:
     source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
     width, height          pixels
     parallel               whether the beam is parallel
-    panel                  whether integrals end at the detector (a scanner) or run on (a camera, whose image plane is
-                           only a chart of directions); those of a parallel beam are never cut
+    panel                  whether integrals end at the detector (a scanner) or continue (a camera, whose image plane
+                           only defines directions); those of a parallel beam never end
     """
 
     source: Any
@@ -56,6 +56,6 @@ class View:
         i = dr.arange(mi.UInt32, self.width * self.height)
         x, y = i % self.width + 0.5, i // self.width + 0.5
         axis = self.corner - self.source
-        # Two float32 products added to a float64 constant would promote everything; |D| only needs relative accuracy.
+        # All in float32, also the constant, which would promote the sum to float64: |D| only needs relative accuracy.
         d = mi.Vector3f(axis) + mi.Float(x) * mi.Vector3f(self.u) + mi.Float(y) * mi.Vector3f(self.v)
         return dr.norm(d)
