@@ -1,6 +1,6 @@
 """Spectra of X-ray tubes and attenuation of materials: tables of spekpy and xraylib (NumPy).
 
-Both libraries come with `pip install lingo_mi[physics]`. A spectrum takes spekpy seconds, so every one is kept in the
+Both libraries come with `pip install lingo_mi[physics]`. spekpy needs seconds for a spectrum, so spectra are cached in the
 user's cache folder.
 """
 
@@ -60,7 +60,7 @@ def monochromatic(energy: float) -> Spectrum:
 
 
 def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -> Spectrum:
-    """The spectrum of a tube with a tungsten anode, as spekpy tabulates it (Poludniowski et al., Med. Phys. 48, 2021).
+    """The spectrum of a tube with a tungsten anode, from spekpy (Poludniowski et al., Med. Phys. 48, 2021).
 
     kvp          peak voltage, kV, 20 to 300
     angle        of the anode, degrees, above 0 and below 90
@@ -78,7 +78,7 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     try:
         with np.load(path) as table:
             return Spectrum(table['energies'], table['photons'])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # none yet, or a damaged one
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # no cached file yet, or a damaged one
         pass
     tube = library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)
     try:
@@ -107,7 +107,7 @@ def attenuation(material: str, energies) -> np.ndarray:
 
 
 def compound(material: str) -> tuple[str, float]:
-    """The name by which xraylib knows a material, and its density in g/cm3. Raises InputError as `attenuation`."""
+    """A material's name in xraylib, and its density in g/cm3. Raises InputError as `attenuation` does."""
     xraylib = library('xraylib')
     formula, at, density = (part.strip() for part in material.partition('@'))
     formula = NAMES.get(formula.lower(), formula)
@@ -168,8 +168,8 @@ def _cache_folder() -> Path:
 
 
 def _store(path: Path, spectrum: Spectrum):
-    """Keep a table; a folder that cannot be written to costs time, not the result."""
-    part = path.with_name(f'{path.stem}.{os.getpid()}.npz')  # whole or not at all, whoever else writes it
+    """Cache a spectrum. If the folder cannot be written, only time is lost."""
+    part = path.with_name(f'{path.stem}.{os.getpid()}.npz')  # renamed when complete, so that other processes never read a part
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(part, energies=spectrum.energies, photons=spectrum.photons)
