@@ -1,4 +1,4 @@
-"""A scanner as a dictionary under TIGRE's names, nVoxel in (x, y, z): what the pickle, the R2 folder and the YAML file share."""
+"""A scanner as a dictionary with TIGRE's names, nVoxel in (x, y, z), as in the pickle, the R2 folder and the YAML file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 
 def _floats(value) -> np.ndarray:
-    """Raises ValueError or TypeError for what is no number, true and false among it."""
+    """Raises ValueError or TypeError for anything but numbers, also for true and false."""
     if np.asarray(value).dtype == bool:
         raise ValueError
     return np.asarray(value, float)
@@ -147,7 +147,7 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
         if values.get(name) is None:
             if mode != 'parallel':
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
-            values[name] = 0.0  # places the panel on the axis, where a parallel beam does not care
+            values[name] = 0.0  # puts the panel on the axis, which does not matter for a parallel beam
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
     try:
         if offset_order == 'vu' and (np.ndim(angles) == 2 or moves(values, len(angles))):
@@ -180,7 +180,7 @@ def to_posed(values: dict, views, where) -> Geometry:
 
     values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
 
-    Raises InputError where a value is missing or out of range, or one is given that the poses say already.
+    Raises InputError if a value is missing or out of range, or if one is given that the poses already contain.
     """
     known = [
         k
