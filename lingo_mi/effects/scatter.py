@@ -105,7 +105,7 @@ class Scatter:
         response   'energy' or 'count'
         index      key of the random numbers, together with `seed`
 
-        Raises InputError where an object has no material or reaches the panel.
+        Raises InputError if an object has no material or reaches the panel.
         """
         means, errors = self.estimate(objects, tube, response, view, index)
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())

@@ -66,7 +66,7 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     angle        of the anode, degrees, above 0 and below 90
     filtration   'Al 2.5, Cu 0.1': materials and thicknesses in mm; may be empty
 
-    Raises InputError where a parameter is out of range, spekpy does not know a material, or it is not installed.
+    Raises InputError if a parameter is out of range, spekpy does not know a material, or it is not installed.
     """
     if not LEAST_KVP <= kvp <= MOST_KVP:
         raise InputError(f'kvp must be from {LEAST_KVP:g} to {MOST_KVP:g} kV, not {kvp:g}')
@@ -145,7 +145,7 @@ def _filters(text: str) -> list[tuple[str, float]]:
 
 
 def library(name: str):
-    """The module spekpy or xraylib. Raises InputError where it is not installed."""
+    """The module spekpy or xraylib. Raises InputError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:

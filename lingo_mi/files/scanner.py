@@ -128,7 +128,7 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
                      and the panel's size are taken as (u, v)
     offset_order     'vu' (TIGRE) or 'uv' (NAF and R2-Gaussian, which hand it to TIGRE reversed)
 
-    Raises InputError where a value is missing, contradictory or out of range.
+    Raises InputError if a value is missing, contradictory or out of range.
     """
     values = dict(values)
     n_detector = _counts(values, 'nDetector', where, 2)
@@ -252,7 +252,7 @@ def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
 def one_circle(dataset: Dataset, where) -> CircularGeometry:
     """The geometry of the training views, for formats of circular scans.
 
-    Raises InputError where a view is not on the circle, or the test views differ in more than their angles.
+    Raises InputError if a view is not on the circle, or the test views differ in more than their angles.
     """
     geometry = dataset.train.geometry
     circular = all(

@@ -157,7 +157,7 @@ def _angles(values, key, n, where):
 
 
 def _valid(values, shape, where):
-    """The mask of valid pixels that a geometry file names; None where it names none."""
+    """The mask of valid pixels that a geometry file names; None if it names none."""
     name = values.get('valid')
     if name is None:
         return None

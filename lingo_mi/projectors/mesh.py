@@ -152,7 +152,7 @@ class _Packed:
 def from_mitsuba(shape) -> MeshPaths:
     """The paths through a Mitsuba mesh (`ply`, `obj`, `cube`, `mi.Mesh` ...), in the scene's unit.
 
-    Raises InputError where the shape is no mesh, or as `MeshPaths` does.
+    Raises InputError if the shape is no mesh, or as `MeshPaths` does.
     """
     name = shape.id()
     if not shape.is_mesh():

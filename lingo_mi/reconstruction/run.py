@@ -31,7 +31,7 @@ def reconstruct(
     progress   called as progress(steps done, steps, residual or None) after every step
     inputs     further arguments of this algorithm's `run`, such as `weights`, or `sample` and `completed` of `Refined`
 
-    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and where the result
+    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and if the result
     is not finite.
     """
     check_scan(scan.geometry, algorithm, max(len(scan), len(inputs.get('completed') or ())))

@@ -61,7 +61,7 @@ class System:
     def start(self, volume: ArrayLike | None) -> mi.Float:
         """The start volume on the device: zero, or `volume` [x, y, z], density per mm.
 
-        Raises InputError where it does not fit the geometry or is not finite.
+        Raises InputError if it does not fit the geometry or is not finite.
         """
         if volume is None:
             x = dr.zeros(mi.Float, self.A.voxels)
@@ -79,7 +79,7 @@ class System:
         return r, self.relative(r)
 
     def relative(self, r: mi.Float) -> float:
-        """The norm of a residual over that of b. Raises InputError where it is not finite."""
+        """The norm of a residual over that of b. Raises InputError if it is not finite."""
         value = norm(r) / self.size_b
         if not np.isfinite(value):
             raise InputError(DIVERGED)
@@ -97,7 +97,7 @@ class System:
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x: mi.Float) -> np.ndarray:
-        """A device volume as float32 [x, y, z]. Raises InputError where it is not finite."""
+        """A device volume as float32 [x, y, z]. Raises InputError if it is not finite."""
         volume = x.numpy().reshape(self.geometry.nVoxel)
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
@@ -126,7 +126,7 @@ def norm(a: mi.Float) -> float:
 
 
 def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
-    """A volume as float32 [x, y, z]. Raises InputError where it does not fit the geometry or is not finite."""
+    """A volume as float32 [x, y, z]. Raises InputError if it does not fit the geometry or is not finite."""
     volume = np.ascontiguousarray(volume, np.float32)
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')

@@ -74,7 +74,7 @@ class ReportData:
     cloud_density   [N] density at their centres, 1/mm, or the quantity that `cloud_unit` names
     command         the command line that reproduces this result
 
-    Raises InputError where shapes do not fit or an image holds NaN or infinity.
+    Raises InputError if shapes do not fit or an image holds NaN or infinity.
     """
 
     title: str

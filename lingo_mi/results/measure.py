@@ -34,7 +34,7 @@ def quick_measure(dataset: Dataset, most: int = 4):
 class Measured:
     """A finished fit, measured.
 
-    numbers   by name; None where there is no truth to compare with
+    numbers   by name; None if there is no truth to compare with
     volume    float32 [x, y, z], density per mm; None for alpha compositing
     truth     the true volume; None if unknown
     test      held-out views; None if there are none

@@ -37,7 +37,7 @@ def save(
     command    the command line that reproduces the result, for the same
 
     For alpha compositing there is no volume, and no scene, because no integrator renders it.
-    Raises InputError where a file cannot be written.
+    Raises InputError if a file cannot be written.
     """
     geometry, cloud = fitted.geometry, fitted.world_gaussians()
     if measured.volume is None:

@@ -15,7 +15,7 @@ def data_file(name: str, parameter: str) -> str:
 
     parameter   the scene's `<default>` that sets the file, for the message
 
-    Raises InputError, in one line, where there is no such file.
+    Raises InputError, in one line, if there is no such file.
     """
     found = Path(str(mi.file_resolver().resolve(name)))
     folder = os.environ.get('LINGO_MI_DATA')

@@ -60,7 +60,7 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
 
 
 def defaults(path) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError where the file is missing or no XML."""
+    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no XML."""
     if not Path(path).is_file():
         raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')
     try:

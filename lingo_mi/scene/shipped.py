@@ -19,7 +19,7 @@ def scene_path(scene) -> Path:
 
     Folders do not count: a result folder `x3d_foot` does not hide the scene of that name.
 
-    Raises InputError where there is neither; a folder of another name is left to whoever reads it to refuse.
+    Raises InputError if there is neither; a folder of another name is left to whoever reads it to refuse.
     """
     path = Path(scene)
     if path.is_file():
