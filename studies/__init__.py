@@ -2,12 +2,12 @@
 
 What is measured, each by a command of `lingo_mi.cli`:
 
-    accuracy         what accuracy costs in time, of every way to compute the same projections
+    accuracy         error against time, for all ways to compute the same projections
     benchmarks       times against a hand-written kernel, Mitsuba's tree, RTK and diffct
-    effects          what modelling an effect of real projections is worth
-    gradient_check   the derivatives of a scene's image against differences
-    hard_cases       needles, grazing rays, coincident Gaussians: where float32 is pressed
-    recipes          quality against time of fits
+    effects          gain from modelling an effect of real projections
+    gradient_check   the derivatives of a scene's image against finite differences
+    hard_cases       needles, grazing rays, coincident Gaussians: cases at the limits of float32
+    recipes          quality of fits against time
     tables           the paper's tables
 
 What it is measured against, and written down with:

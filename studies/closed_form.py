@@ -1,12 +1,12 @@
-"""Line integrals of a cloud of Gaussians and their derivatives in float64 NumPy: what errors are measured against.
+"""Line integrals of a cloud of Gaussians and their derivatives in float64 NumPy: the reference for errors.
 
 With W = diag(1/s) R^T, w = W (p - o), d = W D, m = w.d / |d|^2 and r = w - m d, from a ray's nearest point to the centre,
 
     integral = rho sqrt(2 pi) |D| / |d| exp(-|r|^2 / 2),    d ln(integral) = -r . dw + (m r - d / |d|^2) . dd
 
-Independent of the projector: the general form on explicit rays, no footprint, differentiated by hand. Integrals run along the
-whole line; `lingo_mi.studies.oracle`, by differences and Gaussian by Gaussian, has those that end at the source or the panel and
-says why both are needed.
+Independent of the projector: the general form on explicit rays, without footprints, differentiated by hand. Integrals are along
+the whole line. `lingo_mi.studies.oracle` uses finite differences, Gaussian by Gaussian. It also has integrals that end at the
+source or the panel, and explains why both are needed.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ The function is L = sum(weights * image) with fixed random weights, normal about
 differentiation are compared with
 
     ellipsoids   central differences of the closed form in float64 NumPy, since those of a float32 image are mostly
-                 rounding; the cut-off is put at 8 standard deviations, because the closed form has none
-    grids        the image of one voxel of density 1 in an empty grid, less that of the empty grid: integrals are linear
-                 in a grid, so that this large step has no error but rounding
+                 rounding; the cut-off is set to 8 standard deviations, because the closed form has none
+    grids        the image of one voxel of density 1 in an empty grid, minus that of the empty grid: integrals are
+                 linear in a grid, so the only error of this large step is rounding
 
 For a scene in transmission, I = exp(-p), both use dL = -sum(weights * I * dp).
 

@@ -1,4 +1,4 @@
-"""Markdown tables, and their places in a document: between `<!-- table NAME -->` and `<!-- end NAME -->`."""
+"""Markdown tables, and their positions in a document: between `<!-- table NAME -->` and `<!-- end NAME -->`."""
 
 from __future__ import annotations
 

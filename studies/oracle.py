@@ -5,10 +5,10 @@
 Along a ray o + t D every term is a Gaussian in t. With w = W(p - o), d = W D and m = w.d / |d|^2 it is
 rho exp(-1/2 |w - m d|^2) exp(-1/2 |d|^2 (t - m)^2), which integrates to the error function.
 
-Derivatives are differences by a five-point stencil. `lingo_mi.studies.closed_form` differentiates by hand instead. Both are
-needed: rays that end at a source or a panel, densities at points and derivatives by the pose are here alone; Gaussians so small
-that differences are too coarse, whole images of thousands of Gaussians and means over pixels are there alone. Each is tested
-against the other.
+Derivatives are finite differences with a five-point stencil. `lingo_mi.studies.closed_form` differentiates by hand instead. Both
+are needed. Only this module has rays that end at a source or a panel, densities at points, and derivatives by the pose. Only
+`closed_form` has Gaussians too small for finite differences, whole images of thousands of Gaussians, and means over pixels. Each
+is tested against the other.
 
     rng = np.random.default_rng(0)
     rays = geometry.rays()                       # of a lingo_mi.geometry.base.Geometry

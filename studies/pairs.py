@@ -1,4 +1,4 @@
-"""How much work an image of a cloud is."""
+"""The amount of work for an image of a cloud."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a table was made: the command, the commit, the date, the machine and the versions, as JSON beside it."""
+"""The provenance of a table: the command, the commit, the date, the machine and the versions, as JSON beside it."""
 
 from __future__ import annotations
 

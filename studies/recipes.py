@@ -1,7 +1,7 @@
-"""Recipes compared: quality against time of fits of some scenes, as curves and as a Markdown table.
+"""Comparison of recipes: quality of fits against time for some scenes, as curves and as a Markdown table.
 
-Each fit is a process of its own, `lingo-mi fit`, whose folder is named after its settings. A fit that has a result there is not
-run again; an interrupted one goes on.
+Each fit is a separate process, `lingo-mi fit`, in a folder named after its settings. A fit with a result is not run again; an
+interrupted one continues.
 
     comparison = Comparison(Path('out/recipes'), views=25, iterations=5000)
     results = comparison.results(['x3d_foot'], ['fast', 'r2:V_S=1'])

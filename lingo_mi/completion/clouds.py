@@ -1,4 +1,4 @@
-"""Clouds that a fit has left behind, loaded from its files."""
+"""Fitted clouds, loaded from a fit's files."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or 
 
 @dataclass(frozen=True)
 class FittedCloud:
-    """A cloud of Gaussians as the scene of a fit (result.xml) keeps it.
+    """A cloud of Gaussians as stored in the scene of a fit (result.xml).
 
     gaussians   densities in 1/mm
     geometry    of the scan that it was fitted to
-    corrected   the same with its views where the fit has put them: `geometry` itself, where it left them alone
+    corrected   the geometry with corrected poses; `geometry` itself if the fit has not corrected them
     extent      cut-off in standard deviations
-    effects     that the fit has modelled; None where it took the projections for line integrals
-    seed        of the fit, and of the noise that it has seen in a simulated scan; None where that is not known
+    effects     effects that the fit has modelled; None if it treated the projections as line integrals
+    seed        of the fit and of the noise in its simulated scan; None if unknown
     """
 
     gaussians: Ellipsoids
@@ -42,7 +42,7 @@ class FittedCloud:
 
     @classmethod
     def of(cls, fitted: Fitted) -> FittedCloud | Fitted:
-        """The cloud of a fit; the fit itself where it composites opacities, which are no Gaussians of density."""
+        """The cloud of a fit; for alpha compositing the fit itself, since its Gaussians have no densities."""
         gaussians = fitted.cloud()
         if gaussians is None:
             return fitted
@@ -55,9 +55,9 @@ class FittedCloud:
 
 
 def load_cloud(path: Path | str) -> FittedCloud | Fitted:
-    """The cloud of a scene such as a fit's result.xml; or the fit by alpha compositing that a checkpoint (.npz) keeps.
+    """The cloud of a scene such as a fit's result.xml, or a fit by alpha compositing from its checkpoint (.npz).
 
-    Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError where there is anything else.
+    Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError for any other file.
     """
     if Path(path).suffix == '.npz':
         return _composited(path)
@@ -78,7 +78,7 @@ def load_cloud(path: Path | str) -> FittedCloud | Fitted:
 
 
 def _record(path) -> dict:
-    """What the fit has noted beside its result.xml; nothing where there is no such file."""
+    """The metrics file of a fit, next to its result.xml; empty if there is none."""
     file = Path(path).with_name(METRICS)
     if not file.exists():
         return {}
@@ -90,7 +90,7 @@ def _record(path) -> dict:
 
 
 def _as_given(geometry: Geometry, record: dict, path) -> Geometry:
-    """The geometry that the fit was given, from the corrected one of its result.xml."""
+    """The fit's given geometry, from the corrected one in its result.xml."""
     if 'pose_turns_degrees' not in record:
         return geometry
     poses = Poses(len(geometry))

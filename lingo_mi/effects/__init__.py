@@ -1,1 +1,1 @@
-"""What a real detector sees besides line integrals; only where a scene calls for it."""
+"""Effects of a real tube and detector besides line integrals, as far as a scene declares them."""

@@ -1,12 +1,12 @@
 r"""A spectrum in a few energy bands: beam hardening as a short sum of exponentials, and its inverse (NumPy).
 
-A beam passes M materials whose line integrals at a reference energy E0 are p_m. With s(E) the detected spectrum and
-r_m(E) = mu_m(E) / mu_m(E0), what a detector measures is (Alvarez and Macovski, Phys. Med. Biol. 21, 1976, eq. 4)
+A beam passes M materials with line integrals p_m at a reference energy E0. Let s(E) be the detected spectrum and
+r_m(E) = mu_m(E) / mu_m(E0). A detector measures (Alvarez and Macovski, Phys. Med. Biol. 21, 1976, eq. 4)
 
     h(p) = -ln \int s(E) exp(-sum_m r_m(E) p_m) dE   ~   -ln sum_k w_k exp(-sum_m R_mk p_m)
 
-K terms with positive weights that sum to 1. They start as K intervals of energy, and are then moved, weights and ratios
-together, to where the mean square error of h over a range of p is least.
+with K terms of positive weights that sum to 1. The terms start as K intervals of energy. Weights and ratios are then
+optimised together for the least mean square error of h over a range of p.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.stats import qmc
 from lingo_mi.errors import InputError
 
 MOST_BANDS = 6
-MOST_STEPS = 1000  # of the search; the error it leaves is stated whatever it is
+MOST_STEPS = 1000  # of the search; the remaining error is `Bands.error`
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Bands:
     """A spectrum for a given choice of materials.
 
     weights   [K] shares of the signal; they sum to 1
-    ratios    [M, K] attenuation over that at the reference energy
-    error     largest error of h over the range that the bands were made for, against the full spectrum
+    ratios    [M, K] attenuation relative to that at the reference energy
+    error     largest error of h, against the full spectrum, over the range that the bands are for
     """
 
     weights: np.ndarray
@@ -41,13 +41,13 @@ class Bands:
     error: float = 0.0
 
     def hardened(self, *integrals: ArrayLike) -> np.ndarray:
-        """h: what a detector measures of line integrals at the reference energy, M arrays of one shape, float64."""
+        """h, float64: the measured signal for line integrals at the reference energy, M arrays of one shape."""
         return _hardened(np.stack([np.asarray(p, float) for p in integrals], -1), self.weights, self.ratios)
 
     def precorrected(self, measured: ArrayLike) -> np.ndarray:
         """The line integrals at the reference energy that h takes to `measured`, float64 (water precorrection, M = 1).
 
-        measured   an array of any shape; values below zero, which noise makes, are continued linearly
+        measured   an array of any shape; h is continued linearly to negative values, which occur with noise
 
         h rises and is concave, so Newton's method converges from any start.
         """
@@ -69,12 +69,12 @@ class Bands:
 
 
 def band(signal: ArrayLike, ratios: ArrayLike, count: int, largest: float) -> Bands:
-    """The best `count` bands for a spectrum.
+    """The `count` bands that fit a spectrum best.
 
     signal    [E] shares of the detected signal; they sum to 1
-    ratios    [M, E] attenuation of every material over that at the reference energy
+    ratios    [M, E] attenuation of every material, relative to that at the reference energy
     count     bands, 1 to 6
-    largest   sum of the line integrals up to which they are to be good
+    largest   largest sum of the line integrals that they are fitted for
 
     Raises InputError for a count out of range.
     """
@@ -93,7 +93,7 @@ def _band(signal, ratios, materials, count, largest):
         return Bands(signal, ratios)
     points = _points(materials, largest, 7)
     exact = _hardened(points, signal, ratios)
-    # Low energies are few, but what hardens the beam: narrow bands there.
+    # Narrow bands at low energies: few photons, but they cause the hardening.
     edges = np.searchsorted(np.cumsum(signal), (np.arange(1, count) / count) ** 2.5)
     parts = [i for i in np.split(np.arange(len(signal)), edges) if len(i)]
     count = len(parts)

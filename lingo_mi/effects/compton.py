@@ -1,12 +1,12 @@
-r"""Into which angles photons scatter: the Klein-Nishina formula, and the bound electrons of materials (NumPy).
+r"""Angular distribution of scattered photons: the Klein-Nishina formula, and bound electrons of materials (NumPy).
 
 For a photon of energy E, alpha = E / (m c^2), on a free electron at rest (Klein and Nishina, Z. Phys. 52, 1929),
 
     d sigma / d Omega = r_e^2 / 2  P^2 (P + 1/P - sin^2 theta),    P = E' / E = 1 / (1 + alpha (1 - cos theta))
 
-The electrons of a material are bound: xraylib multiplies this by the incoherent scattering function S(q), and adds the
-coherent (Rayleigh) part r_e^2 / 2 (1 + cos^2 theta) F(q)^2, atom by atom (Schoonjans et al., Spectrochim. Acta B 66, 2011).
-The interference of neighbouring molecules, which moves the coherent peak of water to some degrees, is not in its tables.
+The electrons of a material are bound. For each atom, xraylib multiplies this by the incoherent scattering function S(q) and
+adds the coherent (Rayleigh) part r_e^2 / 2 (1 + cos^2 theta) F(q)^2 (Schoonjans et al., Spectrochim. Acta B 66, 2011). Its
+tables do not include the interference of neighbouring molecules, which moves the coherent peak of water by some degrees.
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ from lingo_mi.errors import InputError
 
 ELECTRON = 510.99895  # m c^2, keV
 LEAST_ENERGY, MOST_ENERGY = 1.0, 800.0  # keV
-CELLS = 8192  # of cos theta from -1 to 1 in a table: the free electron's is right to 2e-6; forward, 1.3 degrees wide
-_FINE = 4096  # angles at which xraylib is asked
-_LEAST_Q = 1.1e-3  # 1/Angstrom, below which its tables of S end; it is next to 0 there, and F next to its largest
+CELLS = (
+    8192  # of a table over cos theta from -1 to 1: error 2e-6 for a free electron; 1.3 degrees wide at forward angles
+)
+_FINE = 4096  # angles at which xraylib is evaluated
+_LEAST_Q = 1.1e-3  # 1/Angstrom, lower end of xraylib's tables of S; there S is almost 0 and F almost at its maximum
 _HC = 12.398420  # keV Angstrom
 
 
 def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> np.ndarray:
-    """d sigma / d Omega of a free electron over r_e^2, 1/sr, float64, by the cosine of the scattering angle (any shape).
+    """d sigma / d Omega of a free electron, divided by r_e^2, 1/sr, float64. cosine: of the scattering angle, any shape.
 
     energy     keV
-    response   'energy' weights every photon by the share P of its energy that it keeps (the energy-scattering cross-section
-               of Evans, "The Atomic Nucleus", 1955, ch. 23), 'count' by 1
+    response   'energy' weights a photon by the share P of its energy that it keeps (the energy-scattering cross-section of
+               Evans, "The Atomic Nucleus", 1955, ch. 23); 'count' weights it by 1
     """
     cosine = np.asarray(cosine, float)
     kept = 1 / (1 + energy / ELECTRON * (1 - cosine))
@@ -44,12 +46,12 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     """A table of d mu / d Omega, and its integral over all directions.
 
     energy     keV, 1 to 800
-    material   as `spectrum.attenuation` takes it: bound electrons with coherent scattering, in 1/mm. None: a free electron,
-               over r_e^2
-    response   as of `klein_nishina`, for the incoherent part; the coherent one keeps the energy
+    material   as for `spectrum.attenuation`: bound electrons with coherent scattering, in 1/mm. None: a free electron,
+               divided by r_e^2
+    response   as for `klein_nishina`, for the incoherent part; coherent scattering keeps the energy
 
-    float64 [CELLS + 1], at equal steps of cos theta from -1 to 1, forward last; of a material, means over the cells around
-    the nodes. Raises InputError for an energy out of range and as `spectrum.attenuation` does.
+    The table is float64 [CELLS + 1], at equal steps of cos theta from -1 to 1 (forward). For a material, its values are means
+    over the cells around the nodes. Raises InputError for an energy out of range, and as `spectrum.attenuation` does.
     """
     if not LEAST_ENERGY <= energy <= MOST_ENERGY:
         raise InputError(f'energy must be from {LEAST_ENERGY:g} to {MOST_ENERGY:g} keV, not {energy:g}')
@@ -57,7 +59,7 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
         return _kept(klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response))
     formula, density = compound(material)
     xraylib = library('xraylib')
-    half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), in which a forward peak is broad
+    half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), which resolves a forward peak
     angles = (2 * np.arcsin(np.maximum(half, min(1.0, _LEAST_Q * _HC / energy)))).tolist()
     bound, coherent = (
         np.array([function(formula, float(energy), a) for a in angles])
@@ -66,8 +68,8 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     cosine = 1 - 2 * half**2
     kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.0
     fine = (bound * kept + coherent) * density / 10  # cm2/g to 1/mm
-    # Means over cells, so that a forward peak narrower than a cell keeps its integral. Between two fine angles the density is
-    # a line, so its integral is a parabola.
+    # Means over cells keep the integral of a forward peak narrower than a cell. The density is linear between fine angles, so
+    # its integral is a parabola.
     edges = np.concatenate([[-1.0], (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1, [1.0]])
     below = np.concatenate([[0.0], np.cumsum((fine[1:] + fine[:-1]) / 2 * np.diff(cosine))])
     i = np.clip(np.searchsorted(cosine, edges, 'right') - 1, 0, _FINE - 1)

@@ -1,17 +1,17 @@
-r"""What a flat panel makes of the intensity that reaches it, and back to line integrals (NumPy; the blur in Dr.Jit).
+r"""A flat panel: from the intensity that reaches it to its signal, and back to line integrals (NumPy; the blur in Dr.Jit).
 
-For the transmission T of a pixel, its gain g and the counts of its open beam I0,
+For a pixel with transmission T, gain g and open-beam counts I0:
 
     N = Poisson(I0 g T) + Normal(0, s_e)          counts (Barrett and Myers, "Foundations of Image Science", 2004, ch. 11)
     S = round(min(N / I0, top) / step) step       signal, step = top / (2^bits - 1)
     p = -ln(max(S / g, floor))                    line integral
 
-The floor is half of the least signal but zero, half a count or half a step, so that p is finite in any shadow. An
-energy-integrating panel's noise is a little larger than that of as many photons of one energy (its Swank factor, about
-0.9); `photons` is therefore the number of noise-equivalent quanta.
+The floor is half of the smallest nonzero signal (half a count or half a step), so that p is always finite. The noise of an
+energy-integrating panel is slightly larger than that of equally many photons of one energy (its Swank factor is about 0.9).
+Therefore `photons` is the number of noise-equivalent quanta.
 
-Random numbers are those of Philox4x64 (Salmon et al., SC 2011), a counter-based generator, keyed by seed and view: a view
-has the same noise whichever others are rendered, and in any order.
+Random numbers are from Philox4x64 (Salmon et al., SC 2011), a counter-based generator, keyed by seed and view. So the noise of
+a view does not depend on which other views are rendered, or in which order.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from lingo_mi.projectors.view import View
 
 RESPONSES = 'energy', 'count'
 MOST_PHOTONS = 1e15
-FULL_SCALE = 1.25  # of a converter, where no saturation is given: the open beam with its noise stays below
+FULL_SCALE = 1.25  # of the converter if no saturation is given; above the open beam with its noise
 DARKEST = 1e-30  # least transmission without noise; float32 holds 1e-38
-_MAPS = 2**63  # added to a seed: the maps of gains and dead pixels share no numbers with the noise
+_MAPS = 2**63  # added to a seed, so that gain and dead-pixel maps are independent of the noise
 
 
 @dataclass(frozen=True)
 class Detector:
-    """See the film `ct_detector`, whose parameters these are."""
+    """Parameters of the film `ct_detector`; see there."""
 
     DEFAULTS: ClassVar = dict(
         photons=0.0,
@@ -98,18 +98,18 @@ class Detector:
 
     @property
     def measures(self) -> bool:
-        """Whether anything happens to the signal after the light: noise, gains, saturation, digits, dead pixels."""
+        """Whether the electronics change the signal: noise, gains, saturation, digits or dead pixels."""
         return any((self.photons, self.saturation, self.bits, self.dead, self.gain))
 
     @property
     def expected(self) -> Detector:
-        """The same detector without noise, bits and dead pixels: blur and saturation stay."""
-        gain = self.gain if self.saturation and self.corrected else 0.0  # what is divided out moves the saturation
+        """The same detector without noise, bits and dead pixels. Blur and saturation stay, and gains if they affect it."""
+        gain = self.gain if self.saturation and self.corrected else 0.0  # corrected gains still move the saturation
         return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 
     @property
     def floor(self) -> float:
-        """The least transmission that is told from none."""
+        """The smallest transmission that differs from zero in the signal."""
         return max(0.5 / self.photons if self.photons else DARKEST, 0.5 * self._step)
 
     @property
@@ -121,7 +121,7 @@ class Detector:
         return self._top / (2**self.bits - 1) if self.bits else 0.0
 
     def signal(self, transmission: ArrayLike, view: int, seed: int = 0) -> np.ndarray:
-        """The signal of a view, in units of the open beam's, float64 [v, u], gains and dead pixels as they are.
+        """The signal of a view, in units of the open beam's, float64 [v, u], without correction of gains and dead pixels.
 
         transmission   expected I / I0, [v, u], finite and not negative
         view, seed     key of the noise, whole numbers from 0
@@ -141,7 +141,7 @@ class Detector:
         return np.where(dead, 0, light)
 
     def measure(self, transmission: ArrayLike, view: int, seed: int = 0) -> np.ndarray:
-        """Line integrals -ln(I / I0) as a scanner reports them, float32 [v, u], finite; arguments as of `signal`."""
+        """Line integrals -ln(I / I0) as a scanner reports them, float32 [v, u], finite. Arguments as for `signal`."""
         light = self.signal(transmission, view, seed)
         if self.corrected:
             gains, dead = self.maps(light.shape)
@@ -149,7 +149,7 @@ class Detector:
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
 
     def least(self, shape: tuple[int, int]) -> np.ndarray:
-        """The line integrals at which pixels saturate, float64 [v, u]; less is not told from them."""
+        """The line integrals at which pixels saturate, float64 [v, u]: the smallest that the detector can report."""
         gains = self.maps(shape)[0] if self.corrected else 1
         return np.broadcast_to(-np.log(self.saturation / gains), shape)
 

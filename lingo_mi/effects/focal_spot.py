@@ -26,7 +26,7 @@ MOST_ORDER = 16
 
 @dataclass(frozen=True)
 class FocalSpot:
-    """size: width and height in mm, along u and v; order: n of n x n points, 1 to 16."""
+    """size: width and height in mm, along u and v. order: n, for n x n points, 1 to 16."""
 
     size: tuple[float, float] = (0.0, 0.0)
     order: int = 3
@@ -43,7 +43,7 @@ class FocalSpot:
         return FocalSpot((numbers[0], numbers[-1]), checked_order(order, 'focal_order'))
 
     def views(self, view: View) -> list:
-        """(weight, View) of every point of the focal spot; the view itself for a point."""
+        """(weight, View) of every point of the focal spot; the view itself for a point source."""
         if self.size == (0.0, 0.0):
             return [(1.0, view)]
         u, v = dr.normalize(view.u), dr.normalize(view.v)
@@ -53,11 +53,11 @@ class FocalSpot:
         ]
 
     def scaled(self, factor: float) -> FocalSpot:
-        """The same spot where lengths are multiplied by `factor`."""
+        """The same spot with lengths multiplied by `factor`."""
         return replace(self, size=(factor * self.size[0], factor * self.size[1]))
 
     def check(self, distance: float | None) -> None:
-        """Raises InputError unless the spot is smaller than its distance to the axis, mm; None is a parallel beam."""
+        """Raises InputError unless the spot is smaller than its distance to the axis, mm (None: a parallel beam)."""
         if max(self.size) > 0 and distance is None:
             raise InputError('focal_spot: a parallel beam has no focal spot')
         if distance is not None and max(self.size) >= distance:
@@ -88,12 +88,12 @@ def square(order: int, wide: bool = True, high: bool = True) -> list:
 
 
 def checked_order(order: Any, name: str) -> int:
-    """Raises InputError unless a number of quadrature points is whole and from 1 to 16."""
+    """Raises InputError unless the number of quadrature points is an integer from 1 to 16."""
     if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= MOST_ORDER:
         raise InputError(f'{name} must be a whole number from 1 to {MOST_ORDER}, not {order!r}')
     return order
 
 
 def _opaque(x: float):
-    """A literal would be compiled into the kernel, one for each point."""
+    """An opaque number: a literal would be compiled into a kernel for each point."""
     return dr.opaque(dr.value_t(mi.Vector3d), x)

@@ -1,4 +1,4 @@
-"""The effects that a scene calls for, and what its detector then sees (Dr.Jit)."""
+"""The effects that a scene declares, and the signal of its detector with them (Dr.Jit)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lingo_mi.scan import Scan
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects of a scene; None for an element that it lacks.
+    """The effects of a scene; None for elements that it does not have.
 
     tube, spot, scatter   spectrum, focal spot and scattered photons of its `xray_tube`
     detector              of the sensor's `ct_detector`
@@ -61,7 +61,7 @@ class Effects:
         return self.detector.response if self.detector else 'energy'
 
     def views(self, view: View) -> list[tuple[float, View]]:
-        """(weight, View) of all bundles of rays whose mean intensity a view's pixels see."""
+        """(weight, View) of all ray bundles; a view's pixels measure their mean intensity."""
         views = self.spot.views(view) if self.spot else [(1.0, view)]
         if self.detector:
             d = self.detector
@@ -74,7 +74,7 @@ class Effects:
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
         objects   of `projectors.objects.find_objects`
-        options   whose n x n rays a pixel are averaged as intensities
+        options   its n x n rays per pixel are averaged as intensities
         """
         groups, bands = {'': objects}, None
         if self.tube and self.tube.hardens:
@@ -99,8 +99,8 @@ class Effects:
     def averaged(self, along: Callable[[View], Any], view: View, options: RenderOptions, scattered: Any = None) -> Any:
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
 
-        along       gives -ln of the intensity along the rays of a View, Float
-        scattered   added to the intensity, over the open beam's, Float [height * width]
+        along       function of a View: -ln of the intensity along its rays, Float
+        scattered   scattered intensity to add, relative to the open beam's, Float [height * width]
         """
         views = self.views(view)
         blurring = self.detector if self.detector and self.detector.psf else None
@@ -109,7 +109,7 @@ class Effects:
         light = mi.Float(0)
         for weight, one in views:
             light += dr.opaque(mi.Float, weight) * options.averaged(dr.exp(-along(one)), view)
-            if len(views) > 1:  # one small kernel for all of them, instead of a large one that takes long to compile
+            if len(views) > 1:  # one small kernel, launched for each, instead of a large one that takes long to compile
                 dr.eval(light)
         if scattered is not None:
             light += scattered
@@ -118,14 +118,13 @@ class Effects:
         return -dr.log(dr.maximum(light, DARKEST))
 
     def saturated(self, integrals: Any, view: View) -> Any:
-        """Expected -ln(I / I0), Float [height * width], no less than the detector can tell; the derivative of what is less
-        is zero."""
+        """Expected -ln(I / I0) with saturation, Float [height * width]. The derivative of saturated pixels is zero."""
         if not (self.detector and self.detector.saturation):
             return integrals
         return dr.maximum(integrals, mi.Float(self.detector.least((view.height, view.width)).ravel()))
 
     def masked(self, scan: Scan) -> Scan:
-        """A scan without the pixels that are dead."""
+        """The scan with dead pixels invalid."""
         if not (self.detector and self.detector.dead):
             return scan
         alive = ~self.detector.maps(scan.geometry.nDetector)[1]
@@ -133,10 +132,10 @@ class Effects:
         return replace(scan, valid=known & alive)
 
     def linearised(self, scan: Scan) -> Scan:
-        """A scan's line integrals at the reference energy, as far as single pixels tell them; it has no effects left.
+        """A scan's line integrals at the reference energy, corrected pixel by pixel; the result has no effects.
 
-        Beam hardening is inverted as if all were of one material, the first of two (water precorrection, Kachelriess et
-        al., Med. Phys. 33, 2006). Blur stays.
+        Beam hardening is inverted for a single material, the first of two (water precorrection, Kachelriess et al., Med. Phys.
+        33, 2006). Blur stays.
         """
         projections = scan.projections
         if self.tube and self.tube.hardens:
@@ -145,7 +144,7 @@ class Effects:
         return replace(scan, projections=projections, effects=None)
 
     def measured(self, integrals: Any, view: View, seed: int) -> Any:
-        """Line integrals as the detector reports them, with its noise, from the expected ones; not differentiable."""
+        """Line integrals as the detector reports them, with noise, from expected ones. Not differentiable."""
         if not (self.detector and self.detector.measures):
             return integrals
         light = np.exp(-integrals.numpy().astype(float)).reshape(view.height, view.width)
@@ -153,7 +152,7 @@ class Effects:
 
 
 def find_effects(scene: Any, sensor: Any) -> Effects | None:
-    """The effects of a scene seen by a sensor, None without any. Raises InputError for ones that cannot be."""
+    """The effects of a scene with a sensor; None without any. Raises InputError for impossible ones."""
     tubes = [e for e in scene.emitters() if hasattr(e, 'tube')]
     detector = getattr(sensor, 'detector', None) or getattr(sensor.film(), 'detector', None)
     if not tubes and detector is None:

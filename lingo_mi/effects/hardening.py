@@ -1,8 +1,8 @@
 """Beam hardening: objects of one or two materials under a spectrum (Dr.Jit), and its correction in volumes (NumPy).
 
-The density of an object is its attenuation at the tube's reference energy E0. A material m of it attenuates like
-mu_m(E) / mu_m(E0) at another energy, so the line integrals of the densities, one a material, are all that is needed of the
-objects; `bands` turns them into what a detector measures.
+The density of an object is its attenuation at the tube's reference energy E0. At another energy E, material m attenuates
+mu_m(E) / mu_m(E0) times as much. So one line integral of the density per material suffices; `bands` converts them to the
+measured signal.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from lingo_mi.effects.spectrum import Spectrum, attenuation, monochromatic, tube
 from lingo_mi.errors import InputError
 
 REFERENCE = 60.0  # keV; water attenuates .0206 per mm
-LARGEST = 10.0  # sum of line integrals up to which bands are fitted: behind it, 5e-5 of the photons are left
+LARGEST = 10.0  # sum of line integrals up to which bands are fitted; 5e-5 of the photons remain there
 
 
 @dataclass(frozen=True)
 class TubeParameters:
-    """The parameters of `xray_tube` that concern its spectrum, as a scene gives them; its documentation says what they are.
+    """The parameters of `xray_tube` that concern its spectrum, as a scene gives them; see its documentation.
 
     materials   those of single shapes, by name: the parameters material_NAME
     """
@@ -41,7 +41,7 @@ class TubeParameters:
     materials: dict[str, str] = field(default_factory=dict)
 
     def given(self) -> dict:
-        """The parameters by the names that a scene has for them."""
+        """The parameters by their names in a scene."""
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'materials'}
         return own | {f'material_{name}': text for name, text in self.materials.items()}
 
@@ -51,11 +51,11 @@ class Tube:
     """A spectrum, and the materials of the objects it passes.
 
     reference   energy at which densities are attenuation in 1/mm, keV
-    material    names of one or two materials, as `spectrum.attenuation` takes them; none if a scene does not say
-    materials   the same for shapes by name, where they differ
-    split       densities between which a grid of two materials goes from the first to the second, 1/mm
-    bands       terms that stand for the spectrum
-    given       the parameters that `of` made it from, by name; those of shapes as material_NAME
+    material    names of one or two materials, as for `spectrum.attenuation`; empty if a scene does not name any
+    materials   the same for single shapes, by name
+    split       densities between which a grid of two materials changes from the first to the second, 1/mm
+    bands       number of terms for the spectrum
+    given       the parameters of `of`, by name; those of shapes as material_NAME
     """
 
     spectrum: Spectrum
@@ -107,11 +107,11 @@ class Tube:
 
     @property
     def hardens(self) -> bool:
-        """Whether anything changes: photons of the reference energy alone leave line integrals as they are."""
+        """Whether the spectrum changes line integrals: photons of the reference energy alone do not."""
         return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
 
     def made_of(self, name: str) -> tuple[str, ...]:
-        """The materials of a shape. Raises InputError where the scene does not say."""
+        """The materials of a shape. Raises InputError if the scene does not say."""
         names = self.materials.get(name, self.material)
         if not names:
             raise InputError(
@@ -121,7 +121,7 @@ class Tube:
         return names
 
     def fitted(self) -> tuple[str, ...]:
-        """The materials of all objects, one or two: what a cloud without shapes may be of. Raises InputError."""
+        """The materials of all objects, one or two, for a fitted cloud, which has no shapes. Raises InputError."""
         names = tuple(dict.fromkeys([*self.material, *(name for shape in self.materials.values() for name in shape)]))
         if not names:
             raise InputError(
@@ -137,7 +137,7 @@ class Tube:
         return names
 
     def signal(self, names: Iterable[str], response: str = 'energy') -> energy_bands.Bands:
-        """The bands of materials (names), for a detector that integrates energy or counts."""
+        """The bands for materials (names). response: the detector integrates 'energy' or counts photons ('count')."""
         ratios = [attenuation(n, self.spectrum.energies) / attenuation(n, [self.reference]) for n in names]
         return energy_bands.band(self.spectrum.detected(response), ratios, self.bands, LARGEST)
 
@@ -148,9 +148,9 @@ class Tube:
 
 
 def hardened(integrals: Sequence, bands: energy_bands.Bands) -> Any:
-    """What a detector measures of line integrals at the reference energy, one Float [pixels] a material.
+    """The measured signal for line integrals at the reference energy, one Float [pixels] per material.
 
-    Differentiable, in float32 to 1e-6 whatever the integrals.
+    Differentiable. The error in float32 is 1e-6 for any integrals.
     """
     exponents: list[Any] = [sum(float(r) * p for r, p in zip(ratios, integrals)) for ratios in bands.ratios.T]
     if len(exponents) == 1:
@@ -164,7 +164,7 @@ def hardened(integrals: Sequence, bands: energy_bands.Bands) -> Any:
 
 
 def by_material(objects: Iterable, tube: Tube) -> dict[str, list]:
-    """The objects of a scene (`projectors.objects`), or the parts of them, that are made of each material."""
+    """For each material, the objects of a scene (`projectors.objects`), or parts of objects, made of it."""
     out = {}
     for thing in objects:
         names = tube.made_of(thing.name)
@@ -175,14 +175,14 @@ def by_material(objects: Iterable, tube: Tube) -> dict[str, list]:
 
 
 def second_share(density: Any, split: tuple[float, float]) -> Any:
-    """The share of the second of two materials where the density is `density` (Dr.Jit or NumPy array)."""
+    """The share of the second of two materials at a density (Dr.Jit or NumPy array)."""
     low, high = split
     share = (density - low) * (1 / (high - low))
     return np.clip(share, 0, 1) if isinstance(share, np.ndarray) else dr.clip(share, 0, 1)
 
 
 def _parts(thing, split):
-    """Two copies of an object, each with the density that one of its two materials has."""
+    """Two copies of an object, with the densities of its two materials."""
     first, second = copy.copy(thing), copy.copy(thing)
     if hasattr(thing, 'data'):
         share = second_share(thing.data * thing.scale, split)

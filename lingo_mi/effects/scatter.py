@@ -1,16 +1,16 @@
 r"""Scattered photons: Mitsuba's volume path tracer on a coarse grid of the panel, smoothed (Dr.Jit and NumPy).
 
-The signal of a panel is the photons through its surface. Relative to the open beam I0 at a point x of it, those that
-scattered are
+The signal of a panel is the photons that cross its surface. At a point x of the panel, the scattered signal relative to the
+open beam I0 is
 
     S(x) = 1 / I0(x)  \int L(x, w) cos(w, n) dw,    I0(x) = cos(x - s, n) / |x - s|^2
 
-for a source s of intensity 1; L, the radiance that arrives from w, is what `volpath` computes: in the collimated beam of the
-view (`ct_beam`), only after one or more scatterings, with the tables of `compton` as phase functions. Directions are those to
-points drawn uniformly from the box of the objects, by a lattice with a random shift in each of BATCHES batches, whose spread
-gives the error of a mean. A smoothing spline that leaves residuals of that size takes the means to the pixels.
+for a source s of intensity 1. L is the radiance that arrives from direction w. `volpath` computes it in the collimated beam of
+the view (`ct_beam`), after one or more scatterings, with the tables of `compton` as phase functions. Directions point to
+samples distributed uniformly in the box of the objects: a lattice with a random shift in each of BATCHES batches. The spread of
+the batches gives the error of a mean. A smoothing spline with residuals of that size interpolates the means at the pixels.
 
-Scattered photons are attenuated at the energy at which they left the tube.
+Scattered photons are attenuated at their initial energy.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lingo_mi.projectors.sampling import bounds, on_grid
 from lingo_mi.projectors.view import View
 
 BATCHES = 16
-MOST_LANES = 2**22  # paths at a time: a few hundred megabytes
+MOST_LANES = 2**22  # paths per launch: a few hundred megabytes
 LEAST_GRID, MOST_GRID = 4, 256  # a bicubic spline needs four points
 MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2**20, 512, 16, 1000
 _LATTICE = [int(2**32 / 1.2207440846057596**k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
@@ -54,7 +54,7 @@ class Scatter:
 
     @staticmethod
     def of(paths: Any, grid: Any, orders: Any, voxels: Any, energies: Any, seed: Any, box: Any) -> Scatter | None:
-        """From plugin parameters, None without paths. Raises InputError."""
+        """From plugin parameters; None without paths. Raises InputError."""
         for name, value, least, most in (
             ('scatter', paths, 0, MOST_PATHS),
             ('scatter_orders', orders, -1, MOST_ORDERS),
@@ -80,7 +80,7 @@ class Scatter:
         )
 
     def within(self, geometry: Geometry) -> Scatter:
-        """The same, but nothing scatters outside the volume of a `Geometry`."""
+        """The same, but nothing scatters outside a geometry's volume."""
         centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
         return replace(self, box=(tuple((centre - half).tolist()), tuple((centre + half).tolist())))
 
@@ -101,14 +101,14 @@ class Scatter:
         )
 
     def light(self, objects: list, tube: Tube, response: str, view: View, index: int) -> Any:
-        """Scattered signal over the open beam's, Float [height * width], at the pixel centres of a view; not differentiable.
+        """Scattered signal, relative to the open beam's, at a view's pixel centres, Float [height * width]. Not differentiable.
 
         objects    of `projectors.objects.find_objects`
-        tube       `hardening.Tube`, whose materials the objects are of
+        tube       `hardening.Tube` with the objects' materials
         response   'energy' or 'count'
-        index      with `seed` the key of the random numbers
+        index      key of the random numbers, together with `seed`
 
-        Raises InputError where an object has no material or reaches the panel.
+        Raises InputError if an object has no material or reaches the panel.
         """
         means, errors = self.estimate(objects, tube, response, view, index)
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
@@ -116,7 +116,7 @@ class Scatter:
     def estimate(
         self, objects: list, tube: Tube, response: str, view: View, index: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
+        """`light` on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
             key, made_of = (response, self.voxels, self.energies, self.box), (tube, *objects)
             if not (
@@ -138,7 +138,7 @@ class Scatter:
             return total.mean(-1), total.std(-1, ddof=1) / np.sqrt(BATCHES)
 
 
-_LATEST: list = []  # what was last made of which objects: all views of a scan share it
+_LATEST: list = []  # cache of the last scenes and their objects, for all views of a scan
 
 
 def _corners(text):
@@ -157,8 +157,8 @@ def _corners(text):
 def smoothed(means: np.ndarray, errors: np.ndarray, height: int, width: int) -> np.ndarray:
     """A bicubic smoothing spline at the pixel centres, [height, width], not negative.
 
-    means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's residuals add up to the errors'
-                    squares (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
+    means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's squared residuals sum to
+                    the squared errors (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
     """
     rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
     residual: Any = float((errors**2).sum())  # SciPy declares a whole number
@@ -172,7 +172,7 @@ def smoothed(means: np.ndarray, errors: np.ndarray, height: int, width: int) -> 
 
 
 def _scenes(objects, tube, response, voxels, energies, box):
-    """The box of the objects, the beam, and (weight, scene) of every energy; none where nothing attenuates."""
+    """The box of the objects, the beam, and (weight, scene) for every energy; no scenes if nothing attenuates."""
     low, high = bounds(objects) if box is None else np.array(box)
     if len(objects) == 1 and isinstance(objects[0], GridInCube) and box is None:
         shape = tuple(objects[0].size)
@@ -208,7 +208,7 @@ def _scenes(objects, tube, response, voxels, energies, box):
 
 
 def _energies(energies, shares, count):
-    """(weight, energy) of a spectrum in parts of equal signal, each at its mean energy."""
+    """(weight, energy) of parts of a spectrum with equal signal; a part's energy is its mean."""
     parts = np.minimum((np.cumsum(shares) - shares / 2) * count, count - 1e-9).astype(int)
     weights = np.bincount(parts, shares)
     means = np.bincount(parts, shares * energies)
@@ -250,7 +250,7 @@ def _phase(name, energy, response):
 
 
 def _ratio(part, whole):
-    """part / whole; in empty voxels that of their neighbours, because between voxels it is interpolated."""
+    """part / whole; in empty voxels the value of their neighbours, because it is interpolated between voxels."""
     near, around = uniform_filter(part, 3), uniform_filter(whole, 3)
     near = np.divide(near, around, out=np.zeros_like(near), where=around > 0)
     return np.divide(part, whole, out=near, where=whole > 0)
@@ -273,7 +273,7 @@ def _box(low, high, medium):
 
 
 class _Rays:
-    """From the points of a coarse grid on the panel to points in a box: `batches` of `count` each, as memory bears."""
+    """Rays from a coarse grid of points on the panel to points in a box, in batches that fit into memory."""
 
     def __init__(self, view: View, grid: tuple[int, int], count: int, low: np.ndarray, high: np.ndarray):
         self.grid, self.count, self.batches = grid, count, BATCHES
@@ -306,7 +306,7 @@ class _Rays:
         dr.eval(self.shifted, self.origin, self.normal, self.open)
 
     def means(self, integrator: Any, scene: Any, rng: np.random.Generator) -> np.ndarray:
-        """Scattered signal over the open beam's, float64 [rows, columns, batches]."""
+        """Scattered signal, relative to the open beam's, float64 [rows, columns, batches]."""
         shape = *self.grid, self.batches
         sampler = mi.load_dict(dict(type='independent'))
         sampler.seed(dr.opaque(mi.UInt32, int(rng.integers(2**32))), dr.width(self.shifted))
@@ -316,7 +316,7 @@ class _Rays:
             *(mi.Float((j * a + dr.gather(mi.UInt32, s, self.shifted)) >> 8) * 2**-24 for a, s in zip(_LATTICE, shift))
         )
         direction = dr.normalize(self.low + xi * self.extent - self.origin)
-        # A uniform point of the box lies in a direction with the density of the cone's volume: (far^3 - near^3) / 3 of all.
+        # For uniform points in the box, the density of a direction is (far^3 - near^3) / 3 over the box's volume.
         a, b = (self.low - self.origin) / direction, (self.low + self.extent - self.origin) / direction
         near, far = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
         weight = 3 * dr.prod(self.extent) / ((far - near) * (far * far + far * near + near * near))

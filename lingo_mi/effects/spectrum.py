@@ -1,6 +1,6 @@
 """Spectra of X-ray tubes and attenuation of materials: tables of spekpy and xraylib (NumPy).
 
-Both libraries come with `pip install lingo_mi[physics]`. A spectrum takes spekpy seconds, so every one is kept in the
+Both libraries come with `pip install lingo_mi[physics]`. spekpy needs seconds for a spectrum, so spectra are cached in the
 user's cache folder.
 """
 
@@ -62,13 +62,13 @@ def monochromatic(energy: float) -> Spectrum:
 
 
 def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -> Spectrum:
-    """The spectrum of a tube with a tungsten anode, as spekpy tabulates it (Poludniowski et al., Med. Phys. 48, 2021).
+    """The spectrum of a tube with a tungsten anode, from spekpy (Poludniowski et al., Med. Phys. 48, 2021).
 
     kvp          peak voltage, kV, 20 to 300
     angle        of the anode, degrees, above 0 and below 90
     filtration   'Al 2.5, Cu 0.1': materials and thicknesses in mm; may be empty
 
-    Raises InputError where a parameter is out of range, spekpy does not know a material, or it is not installed.
+    Raises InputError if a parameter is out of range, spekpy does not know a material, or it is not installed.
     """
     if not LEAST_KVP <= kvp <= MOST_KVP:
         raise InputError(f'kvp must be from {LEAST_KVP:g} to {MOST_KVP:g} kV, not {kvp:g}')
@@ -80,7 +80,7 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     try:
         with np.load(path) as table:
             return Spectrum(table['energies'], table['photons'])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # none yet, or a damaged one
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # no cached file yet, or a damaged one
         pass
     tube = library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)
     try:
@@ -109,7 +109,7 @@ def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
 
 
 def compound(material: str) -> tuple[str, float]:
-    """The name by which xraylib knows a material, and its density in g/cm3. Raises InputError as `attenuation`."""
+    """A material's name in xraylib, and its density in g/cm3. Raises InputError as `attenuation` does."""
     xraylib = library('xraylib')
     formula, at, density = (part.strip() for part in material.partition('@'))
     formula = NAMES.get(formula.lower(), formula)
@@ -147,7 +147,7 @@ def _filters(text: str) -> list[tuple[str, float]]:
 
 
 def library(name: str) -> Any:
-    """The module spekpy or xraylib. Raises InputError where it is not installed."""
+    """The module spekpy or xraylib. Raises InputError if it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -170,8 +170,10 @@ def _cache_folder() -> Path:
 
 
 def _store(path: Path, spectrum: Spectrum):
-    """Keep a table; a folder that cannot be written to costs time, not the result."""
-    part = path.with_name(f'{path.stem}.{os.getpid()}.npz')  # whole or not at all, whoever else writes it
+    """Cache a spectrum. If the folder cannot be written, only time is lost."""
+    part = path.with_name(
+        f'{path.stem}.{os.getpid()}.npz'
+    )  # renamed when complete, so that other processes never read a part
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(part, energies=spectrum.energies, photons=spectrum.photons)

@@ -20,7 +20,7 @@ def write_exr(path: PathLike | str, image: np.ndarray) -> None:
     image = np.ascontiguousarray(numeric(np.asarray(image), path, 2), np.float32)
     header = {'compression': OpenEXR.ZIP_COMPRESSION, 'type': OpenEXR.scanlineimage}
     with replacing(path) as temporary:
-        open(temporary, 'wb').close()  # the library reports refusals less clearly than the file system does
+        open(temporary, 'wb').close()  # the file system's errors are clearer than the library's
         OpenEXR.File(header, {'Y': OpenEXR.Channel(image)}).write(str(temporary))
 
 

@@ -12,8 +12,8 @@ Facts of the format, from the generator and the readers that use it:
 - `image` is [x, y, z]; the held-out views are `val`, in some files `test`.
 
 A pickle is a program. Here it may only build dictionaries, lists, tuples, strings, numbers and numeric
-arrays: each of the few NumPy names it may mention stands for code of this module, so that not even NumPy's
-own functions run.
+arrays. The few NumPy names that it may use are replaced by code of this module, so that not even NumPy's own
+functions run.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from lingo_mi.scan import Dataset
 
 
 class _Refused(Exception):
-    """The pickle asks for something that is not data."""
+    """The pickle contains something that is not data."""
 
 
 class _DType:
@@ -93,7 +93,7 @@ class _Array:
 
 
 class _Name:
-    """What a global name of the pickle stands for. It has no attributes, so the pickle cannot change it."""
+    """Stands for a global name of the pickle. It has no attributes, so the pickle cannot change it."""
 
     __slots__ = ()
 
@@ -163,7 +163,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _resolve(value, depth=0):
-    """`value` with arrays for their stand-ins; only plain data passes."""
+    """`value` with real arrays in place of their stand-ins. Anything but plain data is refused."""
     if depth > 32:
         raise _Refused('data nested more than 32 deep')
     if isinstance(value, _Array):
@@ -265,8 +265,8 @@ def write(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
 
     Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v).
-    For a panel that is not square NAF's own code wants nDetector as (u, v); R2-Gaussian's and this module's
-    readers do not. Raises InputError if the file cannot be written or the test views have another scanner.
+    For a panel that is not square, NAF's own code expects nDetector as (u, v); the readers of R2-Gaussian and of
+    this module do not. Raises InputError if the file cannot be written or the test views have another scanner.
     """
     geometry = one_circle(dataset, path)
     start, total = angle_range(geometry.angles)

@@ -4,11 +4,11 @@ Binary little endian, all properties float32, in the order that Mitsuba's `ellip
 
     x y z  nx ny nz  f_dc_0..2  opacity  density  scale_0..2  rot_0..3
 
-scale is stored as its logarithm, rot with the real part first. `density` is ours; Mitsuba makes it the
-attribute `density`. The plugin takes a file for a 3DGS cloud, and would misread `density`, only if `opacity`
-directly precedes `scale_0`: here `density` does, so f_dc and opacity become plain attributes. They are there
-for viewers alone: mid-grey, and the logit of the opacity of a ray through the centre, 1 - exp(-density sqrt(2
-pi) s) with s the geometric mean of the scales. `read_ply` ignores them.
+scale is stored as its logarithm, rot with the real part first. `density` is this project's own; Mitsuba makes
+it the attribute `density`. The plugin treats a file as a 3DGS cloud, and would misread `density`, only if
+`opacity` directly precedes `scale_0`. Here `density` does, so f_dc and opacity become plain attributes. They are
+for viewers only: mid-grey, and the logit of the opacity of a ray through the centre, 1 - exp(-density sqrt(2
+pi) s), with s the geometric mean of the scales. `read_ply` ignores them.
 
 Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes exactly the columns of 3DGS.
 """
@@ -95,7 +95,7 @@ def write_ply(
     _check(path, centres, scales, quaternions, density)
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     depth = np.maximum(density, 0) * np.sqrt(2 * np.pi) * np.exp(np.log(scales).mean(1))
-    # logit(1 - exp(-t)) = log(exp(t) - 1), kept where viewers' sigmoid does not saturate
+    # logit(1 - exp(-t)) = log(exp(t) - 1), limited to where viewers' sigmoid does not saturate
     opacity = np.log(np.expm1(np.clip(depth, 1e-4, 10)))
     zeros = np.zeros((len(density), 6))
     more = [] if second is None else [np.asarray(second, float)[:, None]]
@@ -117,9 +117,9 @@ def write_radiance_ply(
 ) -> None:
     """Writes a grey cloud as 3DGS does, for its viewers, whole or not at all.
 
-    centres, scales, quaternions as for `write_ply`; opacity [N] in [0, 1]; radiance [N] and harmonics [N, 0, 3, 8 or 15],
-    coefficients of the spherical harmonics of degree 0 and of the higher ones, to which viewers add 1/2. Raises InputError as
-    `write_ply` does.
+    centres, scales, quaternions as for `write_ply`; opacity [N] in [0, 1]; radiance [N] and harmonics [N, 0, 3, 8 or 15]:
+    coefficients of the spherical harmonics of degree 0 and of higher degrees. Viewers add 1/2 to their sum. Raises InputError
+    as `write_ply` does.
     """
     centres, scales, quaternions, opacity = (np.asarray(a, float) for a in (centres, scales, quaternions, opacity))
     _check(path, centres, scales, quaternions, opacity, 'opacity')

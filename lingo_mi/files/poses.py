@@ -1,4 +1,4 @@
-"""Files of poses, one for every view, whatever their convention: `read_poses` finds the reader.
+"""Files with one pose per view, in several conventions. `read_poses` chooses the reader.
 
 .xml            RTK's geometry (`lingo_mi.geometry.rtk`): needs dDetector; the panel is centred but for the file's own offsets
 .npy, .txt, .csv   12 numbers a view, ASTRA's vectors (`astra`): [n, 12]; or projection matrices (`matrices`):
@@ -30,11 +30,11 @@ def read_poses(
     """The views of a file of poses, in mm.
 
     nDetector   (v, u) pixels
-    dDetector   (v, u) mm, where the file does not say it
-    parallel    the beam of a .npy, .txt or .csv; an .xml says it itself
-    towards     a point in front of every source, which settles a matrix's sign: the volume's centre
+    dDetector   (v, u) mm, if the file does not contain it
+    parallel    whether a .npy, .txt or .csv has a parallel beam; an .xml contains it
+    towards     a point in front of every source, such as the volume's centre; determines the sign of a matrix
 
-    Raises InputError where the file is missing, damaged, or of no known kind, or dDetector is wanted and missing.
+    Raises InputError if the file is missing, damaged, or of no known kind, or dDetector is wanted and missing.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -70,5 +70,5 @@ def _table(path):
         return np.array([[float(x) for x in row] for row in rows if row], float)
     except InputError:
         raise
-    except ValueError as error:  # also of rows of several lengths, and of bytes that are no text
+    except ValueError as error:  # also for rows of different lengths, and for bytes that are not text
         raise InputError(f'{path}: is no table of 12 numbers a view ({one_line(error)})') from None

@@ -1,4 +1,4 @@
-"""A scanner as a dictionary under TIGRE's names, nVoxel in (x, y, z): what the pickle, the R2 folder and the YAML file share."""
+"""A scanner as a dictionary with TIGRE's names, nVoxel in (x, y, z), as in the pickle, the R2 folder and the YAML file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 
 def _floats(value) -> np.ndarray:
-    """Raises ValueError or TypeError for what is no number, true and false among it."""
+    """Raises ValueError or TypeError for anything but numbers, also for true and false."""
     if np.asarray(value).dtype == bool:
         raise ValueError
     return np.asarray(value, float)
@@ -140,7 +140,7 @@ def to_geometry(
                      and the panel's size are taken as (u, v)
     offset_order     'vu' (TIGRE) or 'uv' (NAF and R2-Gaussian, which hand it to TIGRE reversed)
 
-    Raises InputError where a value is missing, contradictory or out of range.
+    Raises InputError if a value is missing, contradictory or out of range.
     """
     values, angles = dict(values), np.asarray(angles)
     n_detector = _counts(values, 'nDetector', where, 2)
@@ -159,7 +159,7 @@ def to_geometry(
         if values.get(name) is None:
             if mode != 'parallel':
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
-            values[name] = 0.0  # places the panel on the axis, where a parallel beam does not care
+            values[name] = 0.0  # puts the panel on the axis, which does not matter for a parallel beam
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
     sizes: dict[str, Any] = dict(nDetector=n_detector, dDetector=d_detector, nVoxel=n_voxel, dVoxel=d_voxel)
     try:
@@ -189,7 +189,7 @@ def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) ->
 
     values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
 
-    Raises InputError where a value is missing or out of range, or one is given that the poses say already.
+    Raises InputError if a value is missing or out of range, or if one is given that the poses already contain.
     """
     known = [
         k
@@ -263,7 +263,7 @@ def make_dataset(train: Scan, test: Scan | None, volume: np.ndarray | None, wher
 def one_circle(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
     """The geometry of the training views, for formats of circular scans.
 
-    Raises InputError where a view is not on the circle, or the test views differ in more than their angles.
+    Raises InputError if a view is not on the circle, or the test views differ in more than their angles.
     """
     geometry = dataset.train.geometry
     circular = all(

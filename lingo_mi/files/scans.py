@@ -1,4 +1,4 @@
-"""Scans in every format: `read_scan` finds the reader, `write_scan` the writer.
+"""Scans in all formats: `read_scan` and `write_scan` choose the reader and the writer.
 
 Besides the NAF pickle (`naf`) and the R2-Gaussian folder (`r2`):
 
@@ -28,8 +28,8 @@ degrees:
 DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one
 value for every view; an angle may be three, TIGRE's Euler angles.
 
-Any other name is refused, so that a misspelt or unsupported one is not lost; TIGRE's accuracy and filter,
-which do not describe the scanner, are passed over.
+Any other name is refused, so that a misspelt or unsupported one is noticed. TIGRE's accuracy and filter do not
+describe the scanner and are ignored.
 
 A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
@@ -158,7 +158,7 @@ def _angles(values, key, n, where):
 
 
 def _valid(values, shape, where):
-    """The mask of valid pixels that a geometry file names; None where it names none."""
+    """The mask of valid pixels that a geometry file names; None if it names none."""
     name = values.get('valid')
     if name is None:
         return None
@@ -218,7 +218,7 @@ def _read_npy(path, geometry):
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
     if valid is not None:
-        projections = np.where(valid, projections, 1)  # which has a logarithm
+        projections = np.where(valid, projections, 1)  # a value with a logarithm
     g = _geometry(values, len(projections), geometry)
     if str(values.get('poses')).lower().endswith('.xml'):
         projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
@@ -240,7 +240,7 @@ def _write_npy(path, dataset):
     if dataset.train.valid is not None:
         more['valid'] = path.stem + '.valid.npy'
         arrays.save(path.with_name(more['valid']), dataset.train.valid)
-    # Geometry first: without its projections it is never taken for a scan.
+    # Geometry first: a geometry file without projections is never read as a scan.
     with replacing(path.with_suffix('.yml')) as temporary:
         _dump_yaml(temporary, dataset.train.geometry, **more)
     arrays.save(path, dataset.train.projections)

@@ -1,17 +1,17 @@
 """CT volumes: NIfTI, NRRD/MetaImage, NumPy, raw bytes, TIFF stacks and DICOM folders in; NIfTI out.
 
-A volume is indexed [x, y, z] in the order of the file: nothing is flipped, and the affine says how the voxels
-lie in the world.
+A volume is indexed [x, y, z] in the order of the file. Nothing is flipped; the affine gives the voxels' positions
+in the world.
 
 Values become density by these rules, the first that applies:
 
 1. A NIfTI file that `write_volume` wrote is returned unchanged.
-2. Hounsfield units, recognised by a minimum of -500 or less, by DICOM or by `hu=True`, and taken for granted
-   with `mu_water` where rule 3 would refuse negative values: with `mu_water` (1/mm), mu_water (1 + HU / 1000),
-   not below 0, in 1/mm; without, clipped to [-1000, 2000] and mapped to [0, 1] (R2-Gaussian's rule).
-3. Anything else is a density: float values up to 1 stay; others are divided by their maximum. Negative
-   fractions down to -10 % of the maximum are the noise of a reconstruction and become 0; other negative
-   values are refused as ambiguous, unless `hu=False` says that they are to become 0 too.
+2. Hounsfield units. They are recognised by a minimum of -500 or less, by DICOM or by `hu=True`; with `mu_water`
+   also if rule 3 would refuse negative values. With `mu_water` (1/mm) they become mu_water (1 + HU / 1000), at
+   least 0, in 1/mm. Without, they are clipped to [-1000, 2000] and mapped to [0, 1] (R2-Gaussian's rule).
+3. Anything else is a density. Float values up to 1 stay; others are divided by their maximum. Negative
+   fractions down to -10 % of the maximum are the noise of a reconstruction and become 0. Other negative
+   values are refused as ambiguous; with `hu=False` they become 0 too.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _density(data, path, hu, mu_water):
     low, high = float(data.min()), float(data.max())
     if hu is None:
         hu = low <= -500
-        # Whole numbers are looked for in the values: a header's slope makes floats of integers.
+        # By value, not by type: a header's slope turns integers into floats.
         if not hu and low < 0 and (low < -0.1 * high or not (data != np.round(data)).any()):
             if mu_water is None:
                 raise InputError(
@@ -132,7 +132,7 @@ def _nifti(path):
 
 
 def _check_sum(path):
-    """Raises BadGzipFile where the content is not what was packed; nibabel stops short of the sum at the end."""
+    """Raises BadGzipFile if the content does not match its checksum, which nibabel does not read."""
     with gzip.open(path) as file:
         while file.read(1 << 20):
             pass
@@ -234,7 +234,7 @@ def _dicom(folder):
             with reading(file):
                 data = pydicom.dcmread(file)
         except pydicom.errors.InvalidDicomError:
-            continue  # notes and indices lie beside the slices
+            continue  # notes and indices in the same folder
         if 'PixelData' in data:
             slices.append((file, data))
     if not slices:
@@ -315,10 +315,10 @@ def read_volume(
     shape      of raw bytes, (x, y, z), x fastest
     dtype      of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3
                `foot`
-    spacing    voxel size in mm, one number or (x, y, z), for formats that carry none (1 mm otherwise)
-    hu         whether the values are Hounsfield units, where that cannot be told from them
+    spacing    voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm)
+    hu         whether the values are Hounsfield units, if that is not clear from the values
 
-    The values become density as the module's text says. Raises InputError if the file is missing, damaged,
+    Values become densities by the rules of the module. Raises InputError if the file is missing, damaged,
     empty, not 3D, not finite or ambiguous, slices are unevenly spaced, or a package of the `formats` extra is
     missing.
     """

@@ -1,1 +1,1 @@
-"""LINGO's initial cloud, to be read beside section III of the paper, and its measure IPSD."""
+"""LINGO's initial cloud, after section III of the paper, and its measure IPSD."""

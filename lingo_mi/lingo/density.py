@@ -1,13 +1,13 @@
-"""Initial densities (paper, section III-B): the mean pixel, and how it becomes a density. NumPy and SciPy.
+"""Initial densities (paper, section III-B): the mean pixel, and its conversion to a density. NumPy and SciPy.
 
-The paper takes the path length as 1, so that a pixel p = integral of sigma "is" sigma. A point's pixel is
-then a density up to a factor that depends on the object's size and on how much the Gaussians overlap. The
-factor is the one thing chosen here:
+The paper sets the path length to 1, so that a pixel p = integral of sigma "is" sigma. A point's pixel is then a
+density up to a factor, which depends on the object's size and on the overlap of the Gaussians. The factor is
+chosen here:
 
     'paper'   0.15, the constant of the R2-Gaussian backbone (the paper names none of its own)
     'raw'     1
-    'lsq'     the one factor that explains the projections best, see `least_squares_factor`
-    'fdk'     not the mean pixel, but an FDK volume at the point, times the factor of 'lsq' (own: a sharper guess)
+    'lsq'     the factor that fits the projections best, see `least_squares_factor`
+    'fdk'     an FDK volume at the point instead of the mean pixel, times the factor of 'lsq' (own: sharper)
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from lingo_mi.lingo.voxel_filter import pixels
 
 FACTORS = {'paper': 0.15, 'raw': 1.0}
 MODES = (*FACTORS, 'lsq', 'fdk')
-FAINTEST = 0.02  # of the FDK volume's largest value: its noise is no reason to start a Gaussian at nothing
+FAINTEST = (
+    0.02  # least initial density, relative to the FDK volume's largest: its noise must not start Gaussians at zero
+)
 
 
 def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
@@ -33,8 +35,8 @@ def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: n
     points       [N, 3]
     valid        bool [n, v, u], None: all pixels are valid
 
-    The mean is over the views whose image a point projects into (all of them in the paper's intersection), in a
-    valid pixel; a point that no view sees has the mean 0.
+    The mean is over the views in which the point projects to a valid pixel (in the paper's intersection, all
+    views). A point outside all views has the mean 0.
     """
     points = np.ascontiguousarray(np.asarray(points, float).T)
     total, seen = np.zeros(points.shape[1]), np.zeros(points.shape[1])
@@ -48,7 +50,7 @@ def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: n
 
 
 def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
-    """A volume's trilinear values at points, [N]; beyond the outermost voxels' centres, those voxels'.
+    """Trilinear interpolation of a volume at points, [N]; constant beyond the outermost voxel centres.
 
     volume  [x, y, z]
     points  [N, 3] and half, [3], half the volume's sides: both in the normalised frame
@@ -58,15 +60,14 @@ def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.nda
 
 
 def sampled(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
-    """The `trilinear` values of a volume of densities, at least FAINTEST of its largest one."""
+    """`trilinear` values of a volume of densities, raised to at least FAINTEST times its largest value."""
     return np.maximum(trilinear(volume, points, half), FAINTEST * volume.max())
 
 
 def least_squares_factor(measured: np.ndarray, rendered: np.ndarray) -> float:
     """alpha = <I, Ihat> / <Ihat, Ihat>, which minimises |I - alpha Ihat|^2; 1 where the rendering is empty.
 
-    The sums are in float64. A negative factor (projections that are mostly below zero) is replaced by 1 as
-    well.
+    The sums are in float64. A negative factor (for mostly negative projections) is also replaced by 1.
     """
     rendered = np.asarray(rendered, np.float64).ravel()
     power = rendered @ rendered

@@ -20,12 +20,12 @@ from lingo_mi.scan import Scan
 
 @dataclass(frozen=True)
 class InitialCloud:
-    """What a fit starts from, in the normalised frame.
+    """The initial cloud of a fit, in the normalised frame.
 
     points   float64 [N, 3]
-    density  float64 [N], value at the centre, in units of the volume's density; None for a cloud to be composited
+    density  float64 [N], value at the centre, in units of the volume's density; None for alpha compositing
     spacing  float64 [N], suggested standard deviation: rms distance to the three nearest neighbours
-    info     how it came about (numbers and strings only)
+    info     data on the initialisation (numbers and strings only)
     """
 
     points: np.ndarray
@@ -41,7 +41,7 @@ class InitialCloud:
         return replace(self, density=None if self.density is None else self.density * factor)
 
 
-LSQ_VIEWS = 8  # evenly spaced, that the factor of 'lsq' and 'fdk' is solved on (own choice: a few determine one number)
+LSQ_VIEWS = 8  # evenly spaced views for the factor of 'lsq' and 'fdk' (own choice: a few determine one number)
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class LingoSettings:
     """The parameters of the initialisation, each with its source.
 
     n_points           points of the cloud (paper, implementation details: 50k)
-    high_fraction      share of the points that the high-density set gives (paper: 25 %)
+    high_fraction      share of the points from the high-density set (paper: 25 %)
     low_factor         T_l = low_factor T_h (section III-A: 0.1)
     occupancy_voxels   V of the coarse grid for the occupancy (section III-B: 16)
     V_S                upper bound of the voxel scaling (section III-B: 20)
     misses             views that may miss a valid cell (paper: 0)
-    outside            'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`; 'auto' is 'ignore' where the
+    outside            'invalid' (paper) or 'ignore' for truncated scans, see `valid_voxels`; 'auto' is 'ignore' if the
                        object reaches the edge of the panel in some view (`masks.truncated`), else 'invalid'
-    init_density       'lsq', 'paper', 'raw' or 'fdk', see `lingo_mi.lingo.density` (the paper is silent on the factor)
+    init_density       'lsq', 'paper', 'raw' or 'fdk', see `lingo_mi.lingo.density` (the paper gives no factor)
 
     Raises InputError for a value out of its range.
     """

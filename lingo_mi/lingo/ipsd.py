@@ -11,10 +11,10 @@ def ipsd(initial: np.ndarray, structural: np.ndarray) -> float:
     """IPSD = 1/N sum over initial points of the distance to the closest structural point.
 
     initial     P, [N, 3]: the points the fit started from
-    structural  T, [M, 3]: current centres of the surviving Gaussians born by clone or split
+    structural  T, [M, 3]: current centres of the Gaussians that densification made and did not remove
 
-    Same units as the points (the paper's numbers: the frame whose longest side is 2). NaN where either set is
-    empty.
+    In the points' unit (the paper's numbers: the normalised frame, with a longest side of 2). NaN if either set
+    is empty.
     """
     if len(initial) == 0 or len(structural) == 0:
         return float('nan')
@@ -22,9 +22,9 @@ def ipsd(initial: np.ndarray, structural: np.ndarray) -> float:
 
 
 def reverse_distance(initial: np.ndarray, structural: np.ndarray) -> float:
-    """The mean distance from the structural points to the closest initial point: roles exchanged.
+    """The mean distance from the structural points to the closest initial point: IPSD with exchanged roles.
 
-    IPSD alone rewards splitting everywhere; this number tells how much structure the initial points had
+    IPSD alone is small if Gaussians split everywhere. This number shows how much structure the initial points
     missed.
     """
     return ipsd(structural, initial)
@@ -33,7 +33,7 @@ def reverse_distance(initial: np.ndarray, structural: np.ndarray) -> float:
 def neighbour_distance(points: ArrayLike, fallback: float) -> np.ndarray:
     """Root mean square distance to the three nearest neighbours, [N] (R2-Gaussian's initial scale).
 
-    With fewer than four points the neighbours there are count; a lone point gets `fallback`.
+    With fewer than four points, all others are neighbours. A single point gets `fallback`.
     """
     points = np.asarray(points, float)
     k = min(4, len(points))

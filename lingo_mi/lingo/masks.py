@@ -11,11 +11,11 @@ from lingo_mi.lingo.otsu import otsu
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks of n projections and what they were cut at.
+    """Masks of n projections and their thresholds.
 
-    low, high     bool [n, v, u]; high is part of low wherever the thresholds are positive
+    low, high     bool [n, v, u]; high is a subset of low if the thresholds are positive
     t_low, t_high float64 [n], in units of the projections
-    valid         bool [n, v, u], pixels that were measured; None: all of them
+    valid         bool [n, v, u], valid pixels; None: all
     """
 
     low: np.ndarray
@@ -29,7 +29,7 @@ def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | 
     """M_h = I > T_h with T_h = Otsu(I), and M_l = I > T_l with T_l = `low_factor` T_h, per view.
 
     projections  [n, v, u] line integrals (the object is bright)
-    valid        bool [n, v, u]; other pixels count for no threshold and are in no mask. None: all are valid
+    valid        bool [n, v, u]; invalid pixels affect no threshold and are in no mask. None: all are valid
     """
     projections = np.asarray(projections)
     known = [...] * len(projections) if valid is None else valid
@@ -43,10 +43,10 @@ def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | 
 
 
 def truncated(found: Masks, share: float = 0.05) -> np.ndarray:
-    """Views, bool [n], in which the object reaches the edge of the panel: the low mask holds more than `share` of the
+    """Views, bool [n], in which the object reaches the edge of the panel: the low mask contains more than `share` of the
     outermost pixels of a side.
 
-    Across a side of one pixel (a fan beam's rows) nothing is said.
+    An axis of one pixel (a fan beam's rows) is not checked.
     """
     low = found.low
     sides = [low[:, :, 0], low[:, :, -1]] if low.shape[2] > 1 else []

@@ -11,9 +11,8 @@ BINS = 256
 def otsu(image: np.ndarray) -> float:
     """The threshold t* = Otsu(I) that maximises the between-class variance, in the image's own units.
 
-    The histogram has 256 bins between the image's smallest and largest value; the threshold is a bin centre,
-    and pixels *above* it are foreground. A flat image has no two classes: its one value is returned, so that
-    no pixel lies above it. (The paper writes "intra-class variance"; Otsu's criterion is the variance between
-    the classes.)
+    The histogram has 256 bins between the image's smallest and largest value. The threshold is a bin centre,
+    and pixels *above* it are foreground. For a constant image its value is returned, so no pixel is above it.
+    (The paper writes "intra-class variance"; Otsu's criterion is the variance between the classes.)
     """
     return float(threshold_otsu(np.asarray(image, np.float32), nbins=BINS))

@@ -23,7 +23,7 @@ def occupancy(
     """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
 
     An axis with fewer than V voxels keeps them (a single slice stays one cell thick), and the count is
-    divided by the cells there are. The other arguments are those of `valid_voxels`.
+    divided by the actual number of cells. The other arguments are those of `valid_voxels`.
     """
     coarse = np.minimum(resolution, nVoxel)
     low, _ = valid_voxels(rays, masks, coarse, half, misses, outside)
@@ -36,6 +36,6 @@ def scale_factor(P: float, V_S: float = 20.0) -> float:
 
 
 def scaled_grid(nVoxel: Sequence[int], S: float, smallest: int = 8) -> tuple[int, int, int]:
-    """V_ds = V_d / S, rounded to whole cells, at least `smallest` (or all, where there are fewer)."""
+    """V_ds = V_d / S, rounded to whole cells, at least `smallest` (or all cells, if they are fewer)."""
     x, y, z = (max(int(n / S + 0.5), min(smallest, int(n))) for n in nVoxel)
     return x, y, z

@@ -1,7 +1,7 @@
 """Mask-guided voxel filtering (paper, section III-A): which voxel centres lie in the masks of all views.
 
-Points that project outside an image are removed, as the paper's text says, not moved to its border (as `clip`
-would). Pure NumPy.
+Points that project outside an image are removed, as in the paper's text, not moved to its border (as `clip`
+would do). Pure NumPy.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.lingo.masks import Masks
 
-CHUNK = 1 << 15  # points projected at a time: they stay in the cache
-BLOCK = 8  # cells along the side of a block that is tested at once
+CHUNK = 1 << 15  # points projected at once, so that they stay in the cache
+BLOCK = 8  # cells along the side of a block, which is tested as a whole
 
 
 def voxel_centres(grid: Sequence[int] | np.ndarray, half: ArrayLike, index: np.ndarray | None = None) -> np.ndarray:
@@ -52,11 +52,11 @@ def pixels(matrix: np.ndarray, points: np.ndarray, shape: tuple[int, int]) -> tu
 
 
 def _candidates(matrices, low_images, grid, half, misses, outside):
-    """Flat indices, sorted, of the cells that may be valid: all but blocks of cells that clearly are not.
+    """Flat indices, sorted, of the cells that may be valid: all but blocks of cells that are certainly invalid.
 
-    A block is the hull of its corners, so its cells project into the rectangle around the projected corners
-    (in front of the source). Where that holds no pixel of the low mask, the view misses every cell of the
-    block.
+    A block is the convex hull of its corners, so its cells project into the rectangle around the projected
+    corners (in front of the source). If this contains no pixel of the low mask, the view misses every cell of
+    the block.
     """
     shape = low_images[0].shape
     ends = [np.minimum(np.arange(0, n + BLOCK, BLOCK), n) for n in grid]
@@ -104,16 +104,16 @@ def valid_voxels(
     misses: int = 0,
     outside: str = 'invalid',
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The all-view intersections: flat cell indices (z fastest) of the low and the high valid set, sorted.
+    """The intersections of all views: flat cell indices (z fastest) of the low and the high valid set, sorted.
 
     rays     n views in the normalised frame
     masks    of the same n views
     grid     cells (x, y, z) over [-half, half]
-    misses   a cell stays valid when up to this many views do not see it in their mask (paper: 0)
-    outside  what a view says of a cell that projects outside its image: 'invalid' counts as a miss (paper);
-             'ignore' leaves the view out, for truncated scans (a cell that no view sees is still invalid)
+    misses   number of views in which a valid cell may lie outside the mask (paper: 0)
+    outside  for a cell that projects outside a view's image: 'invalid' counts as a miss (paper); 'ignore' leaves
+             the view out, for truncated scans (a cell outside all views is still invalid)
 
-    A view says nothing of a cell that it sees in a pixel that is not valid.
+    A view is left out for cells that project to its invalid pixels.
 
     Raises InputError for another value of `outside`, or a number of masks that is not the number of views.
     """
@@ -147,7 +147,7 @@ def valid_voxels(
             missed_high += counts & ~(high_image[index] & inside)
             seen += known
             keep = (missed_low <= misses) | (missed_high <= misses)
-            if np.count_nonzero(keep) < 0.9 * len(keep):  # a cell out of both sets never comes back
+            if np.count_nonzero(keep) < 0.9 * len(keep):  # cells that left both sets stay out
                 alive, points, missed_low, missed_high, seen = (
                     a[..., keep] for a in (alive, points, missed_low, missed_high, seen)
                 )

@@ -1,12 +1,12 @@
-"""Test objects made by formula: no file, no download, no Mitsuba.
+"""Computed test objects: no files, no download, no Mitsuba.
 
     from lingo_mi import phantoms
     phantoms.names()                        # ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
     foot = phantoms.make('foot', 128)
     foot.data, foot.spacing                 # float32 [x, y, z] in [0, 1], (2.0, 2.0, 2.0) mm
 
-Every phantom is a cube centred on the origin of the world frame. A seed decides textures, vessels and random
-clouds.
+Every phantom is a cube centred on the origin of the world frame. The seed determines textures, vessels and
+random clouds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
 
 
 class Analytic(Protocol):
-    """What knows its own line integrals."""
+    """An object with exact line integrals."""
 
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm."""
@@ -36,10 +36,10 @@ class Analytic(Protocol):
 class Phantom:
     """A voxelized test object.
 
-    data      float32 [x, y, z] in [0, 1], voxel averages or centre values as the phantom's module says
+    data      float32 [x, y, z] in [0, 1], voxel averages or centre values, see the phantom's module
     spacing   voxel size, mm, (x, y, z)
     name      its name in the registry
-    analytic  the same object with exact projections, or None where there is no closed form
+    analytic  the same object with exact projections; None if there is no closed form
     """
 
     data: np.ndarray
@@ -54,7 +54,7 @@ class Phantom:
 
 
 def names() -> tuple[str, ...]:
-    """The phantoms that `make` knows, sorted."""
+    """Names of the phantoms for `make`, sorted."""
     return _NAMES
 
 

@@ -1,4 +1,4 @@
-"""A cloud of random Gaussians known exactly: the truth for tests of projectors, voxelizers and fits.
+"""A random cloud of Gaussians, the exact reference for tests of projectors, voxelizers and fits.
 
     sigma(x) = sum_i rho_i exp(-1/2 |W_i (x - p_i)|^2),   W_i = diag(1 / s_i) R_i^T
 
@@ -70,8 +70,8 @@ class Cloud:
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm (computed in float64).
 
-        A Gaussian is evaluated on the bounding box of its 8 sigma outline; beyond, it is below 2e-14 of its
-        peak. Raises InputError if the source lies in or beside a Gaussian, where it has no outline on the
+        A Gaussian is evaluated on the bounding box of its 8 sigma outline; outside, it is below 2e-14 of its
+        peak. Raises InputError if the source lies in or beside a Gaussian, which then has no outline on the
         panel.
         """
         rays, whiten = geometry.rays(), self.whiten

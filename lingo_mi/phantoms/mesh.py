@@ -1,8 +1,8 @@
 """A welding-neck flange as a watertight mesh: sharp edges, flat faces, metal.
 
-The plate has eight bolt holes and a dowel hole a third as wide in the place of a ninth, which breaks its
+The plate has eight bolt holes. In place of a ninth it has a dowel hole a third as wide, which breaks the
 symmetry. The flange is tilted against all axes. Density is 1 inside, 0 outside. Data are voxel averages from
-4 x 4 columns a voxel, exact along the third axis; projections are exact chords through the mesh. For
+4 x 4 columns per voxel, exact along the third axis; projections are exact chords through the mesh. For
 Mitsuba's `ply` and `obj` shapes:
 
     flange().export('flange.ply')
@@ -27,7 +27,7 @@ BORE, NECK, ROOT, RIM = 32.0, 40.0, 54.0, 96.0  # radii, mm
 BOTTOM, PLATE, TOP = -38.0, -14.0, 44.0  # heights of the faces, mm
 BOLTS, BOLT_CIRCLE, BOLT, DOWEL = 9, 76.0, 10.0, 3.5  # count, radius of their circle, radii of the holes
 SHANK, HEAD, LENGTH = 9.5, 15.0, 10.0  # a bolt's radii and the height of its head
-GAP = 0.25  # between head and plate: parts that touch would share a face
+GAP = 0.25  # between head and plate, so that the parts share no face
 _ARC = 12  # mesh steps along a bolt's sector
 _FAN = 36  # vertices around a hole
 
@@ -144,8 +144,8 @@ class Mesh:
 
 
 def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
-    """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed plays no
-    part."""
+    """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed is not
+    used."""
     analytic = Mesh(flange())
     step = SIDE / size
     return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size, size, size)), SIDE, analytic

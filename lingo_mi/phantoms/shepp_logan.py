@@ -54,8 +54,7 @@ class Ellipsoids:
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm (computed in float64).
 
-        A chord is what the whole line has in common with an ellipsoid: source and panel lie outside the
-        object.
+        Chords are those of the whole line, so source and panel must lie outside the object.
         """
         rays = geometry.rays()
         nv, nu = geometry.nDetector
@@ -93,8 +92,8 @@ def ellipsoids() -> Ellipsoids:
 
 
 def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
-    """Data float32 [size]^3 in [0, 1], side in mm, and the ellipsoids (see `phantoms.make`). The seed plays
-    no part."""
+    """Data float32 [size]^3 in [0, 1], side in mm, and the ellipsoids (see `phantoms.make`). The seed is not
+    used."""
     analytic = ellipsoids()
     h = SIDE / size
     axis = (np.arange(size) + 0.5) * h - SIDE / 2

@@ -1,10 +1,10 @@
-"""Signed-distance solids, evaluated only near themselves, and textures fixed in space.
+"""Signed-distance solids, evaluated only near their surface, and textures fixed in space.
 
 A solid is a frozen dataclass with `bounds` (lower and upper corner, [2, 3]) and a call `solid(x, y, z)` that
 returns the signed distance (negative inside, same unit as the coordinates) on broadcastable float32
 coordinates. Distances of cones and ellipsoids are approximate away from their surface (the forms of I.
-Quilez, "Distance functions", iquilezles.org), exact to first order at it, which is where partial volumes are
-read.
+Quilez, "Distance functions", iquilezles.org). At the surface, where they give partial volumes, they are exact
+to first order.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def _f(p):
 
 @dataclass(frozen=True)
 class Cone:
-    """A capsule from a to b whose radius goes linearly from ra to rb."""
+    """A capsule from a to b with a radius that varies linearly from ra to rb."""
 
     a: Point
     b: Point
@@ -142,8 +142,7 @@ class Blend:
 
 @dataclass(frozen=True)
 class Cut:
-    """A solid without what lies behind the plane through `point`; `normal` (unit) points into the part
-    kept."""
+    """A solid cut by the plane through `point`. `normal` (unit) points into the part that is kept."""
 
     solid: Any
     point: Point

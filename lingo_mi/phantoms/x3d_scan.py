@@ -17,7 +17,7 @@ from lingo_mi.scan import Dataset, Scan
 def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = 512) -> Geometry:
     """X3D's scanner about a phantom.
 
-    DSD 1500 and DSO 1000 mm; `pixels` x `pixels` that together are twice as wide as the phantom's longest side (512
+    DSD 1500 and DSO 1000 mm. The panel of `pixels` x `pixels` is twice as wide as the phantom's longest side (512
     pixels of 1 mm for a cube of 256 mm).
     """
     pixel = 2 * max(n * d for n, d in zip(phantom.data.shape, phantom.spacing)) / pixels
@@ -35,7 +35,7 @@ def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = 512) -> 
 def simulate(phantom: Phantom, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Noise-free line integrals, float32 [view, v, u], density times mm.
 
-    Exact projections of the object where the phantom has them, else exact ones of its trilinear voxels, which
+    Exact projections of the object if the phantom has them, else exact projections of its trilinear voxels, which
     need an active Mitsuba variant. progress: called as progress(views done, views) after every view.
     """
     if phantom.analytic is None:
@@ -57,10 +57,10 @@ def scan(
     progress: Callable[[int, int], None] | None = None,
     pixels: int = 512,
 ) -> Dataset:
-    """The default scan: `views` evenly spaced over [0, 180) degrees to fit, as many random ones in it held
-    out.
+    """The default scan: `views` views to fit, evenly spaced over [0, 180) degrees, and as many held-out views at
+    random angles in this range.
 
-    seed decides the held-out angles, `pixels` the panel (see `default_geometry`). Raises InputError unless views is at least 1.
+    seed: of the held-out angles. pixels: of the panel (see `default_geometry`). Raises InputError unless views is at least 1.
     """
     if views < 1:
         raise InputError(f'a scan needs at least one view, not {views}')

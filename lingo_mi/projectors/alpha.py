@@ -7,14 +7,14 @@ With c the radiance of a Gaussian, o its opacity and q its squared distance in s
     alpha = min(0.99, o exp(-q / 2)), left out below 1/255
     C     = sum over Gaussians by depth  c alpha T,    T = product of (1 - alpha) of those in front
 
-which stops before T falls below 1e-4. Depth is that of the centre along the panel's normal. What this is not is an X-ray
-projection: these are the baselines that line integrals are compared with.
+which stops before T falls below 1e-4. Depth is that of the centre along the panel's normal. This is not an X-ray projection;
+it is the image formation of the baselines.
 
 The image is cut into tiles of 8 x 8 pixels. Gaussians are sorted by depth, each is listed in the tiles that it touches, and
-the list is sorted by tile (both sorts are Dr.Jit's, stable). A lane composites four pixels of a tile's row. Backward walks the
-same lists front to back once more: what lies behind a Gaussian is the finished pixel less what is in front. Every entry of a list
-has a slot for its part of the derivatives, added up Gaussian by Gaussian afterwards, so that results do not depend on
-the order of threads.
+the list is sorted by tile (with Dr.Jit's stable sort). A lane composites four pixels of a tile's row. The backward pass goes
+through the same lists front to back again: the light from behind a Gaussian is the finished pixel minus the light from its
+front. Each list entry has its own slot for its part of the derivatives. The slots are then summed for each Gaussian, so that
+results do not depend on the order of threads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
 
 TILE, PACKET = 8, 4
-LANES = TILE * TILE // PACKET  # of a tile
+LANES = TILE * TILE // PACKET  # per tile
 LEAST = 1 / 255  # Kerbl et al., appendix C: smaller contributions are left out
 MOST = 0.99  # appendix C: alpha is clamped
 STOP = 1e-4  # appendix C: accumulated opacity of 0.9999
@@ -42,9 +42,9 @@ NAMES = ('opacity', 'radiance', 'mx', 'my', 'shear', 'x', 'y')
 class Discs:
     """N projected Gaussians in one view.
 
-    values    Float [N] each, named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; x, y place the centre, in
+    values    Float [N] each, named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; (x, y) is the centre, in
               pixels from the image's corner
-    depth     Float [N] along the panel's normal; infinite for what cannot be drawn: behind the source, or reaching it
+    depth     Float [N] along the panel's normal; infinite for Gaussians that are not drawn (at or behind the source)
     first, count   UInt32 [N] each for columns and rows: the box of tiles that a Gaussian touches
     """
 
@@ -81,7 +81,7 @@ def flatten(centre: Any, scale: Any, rotation: Any, opacity: Any, radiance: Any,
             along = normal * dr.sign(dr.dot(normal, view.corner - view.source))
             depth = mi.Float(dr.dot(along, mi.Vector3d(centre) - view.source))
             drawn = ~footprints.straddles & (depth > 0)
-        # Where alpha falls below 1/255; the ellipse's box follows from q's inverse matrix.
+        # The distance at which alpha falls below 1/255. The ellipse's box follows from the inverse of q's matrix.
         reach = dr.sqrt(2 * dr.log(dr.maximum(opacity / LEAST, 1)))
         drawn &= reach > 0
         half_y = reach / my
@@ -152,9 +152,11 @@ class _Composite(dr.CustomOp):
 class _Lists:
     """For every tile the Gaussians that touch it, front to back.
 
-    length         entries in all
-    disc, entry    UInt32 [length], by tile: the Gaussian, and the number of the entry among its own (Gaussians by depth)
-    tile_ends      UInt32 [tiles]; ends, UInt32 [N] by depth; rank, UInt32 [N]: place of a Gaussian by depth
+    length         number of entries
+    disc, entry    UInt32 [length], sorted by tile: the Gaussian, and the entry's number when sorted by depth
+    tile_ends      UInt32 [tiles], end of each tile's entries
+    ends           UInt32 [N], end of each Gaussian's entries when sorted by depth
+    rank           UInt32 [N], a Gaussian's position by depth
     """
 
     def __init__(self, boxes, height, width):
@@ -217,7 +219,7 @@ def _pack(values):
 
 @dr.syntax
 def _owner(entry, ends, count):
-    """The item whose range of entries, given by the ends of all, an entry lies in."""
+    """The item that an entry belongs to, by binary search in the ends of all items' ranges."""
     low, size = mi.UInt32(0), mi.UInt32(count)
     while size > 0:
         middle = low + size // 2
@@ -230,7 +232,7 @@ def _owner(entry, ends, count):
 
 
 def _alpha(a, b, x, y):
-    """alpha of four pixels before it is clamped, with t and dy; 0 where it is left out."""
+    """alpha of four pixels before clamping (0 below `LEAST`), t and dy."""
     opacity, mx, my, shear = a[0], a[2], a[3], b[0]
     dy = y - b[2]
     t = mi.Vector4f(x, x + 1, x + 2, x + 3) - b[1] + shear * dy
@@ -254,7 +256,7 @@ def _forward(place, disc, packed, image):
 
 
 def _blend(colour, through, alpha, radiance):
-    """Colour and transmittance behind a Gaussian, and the weight alpha T that it got. A pixel that is finished has T = 0."""
+    """Colour and transmittance behind a Gaussian, and its weight alpha T. A finished pixel has T = 0."""
     left = through * (1 - alpha)
     weight = dr.select(left >= STOP, alpha * through, 0)
     return colour + weight * radiance, dr.select(left >= STOP, left, 0), weight
@@ -273,7 +275,7 @@ def _backward(place, lists, packed, image, upstream, slots):
         raw, t, dy = _alpha(a, b, x, y)
         alpha, before = dr.minimum(raw, MOST), mi.Vector4f(through)
         colour, through, weight = _blend(colour, through, alpha, a[1])
-        # dC / dalpha: the Gaussian's own light, less what it hides of all behind it.
+        # dC / dalpha: the Gaussian's own light minus the light from behind that it hides.
         by_alpha = grad * (before * a[1] - (total - colour) / (1 - alpha))
         u = dr.select((weight > 0) & (raw < MOST), by_alpha * alpha, 0)
         used = dr.max(weight) > 0
@@ -297,7 +299,7 @@ def _add_up(begin, end, slots):
 
 
 def _by_values(values, moments):
-    """Derivatives by the seven numbers from that by the radiance, and the moments of alpha dL/dalpha in t and dy."""
+    """Derivatives by the seven numbers, from the derivative by the radiance and moments of alpha dL/dalpha in t and dy."""
     light, u, ut, utt, uy, uty, uyy = moments
     opacity, _, mx, my, shear, _, _ = values
     along = dr.square(mx) * ut

@@ -1,12 +1,12 @@
-"""Sharing out uneven work: a fixed number of teams, each with the same share of the total cost.
+"""Load balancing of uneven work: a fixed number of teams, each with the same share of the total cost.
 
-An *item* (a Gaussian, a triangle) is some *blocks* of rows, each at the item's own cost; the ends of the items' costs are a
-prefix sum. A *team* is as many lanes as a block has rows, which walk one item at a time, a lane a row. Every team takes the
-blocks that begin within its share, so that one enormous item is shared by all, an empty one costs nothing, and neither the
-launch nor its kernel ever changes.
+An *item* (a Gaussian, a triangle) consists of *blocks* of rows. All blocks of an item have the same cost, and a prefix sum
+gives the end of each item's cost. A *team* has as many lanes as a block has rows; it works on one item at a time, one lane per
+row. Each team takes the blocks that begin within its share of the total cost. So all teams share a huge item, an empty
+item costs nothing, and launch size and kernel never change.
 
-On the CPU, teams add to images of their own without atomics (which would take most of the time), and the copies are summed
-at the end, unless they were too large. On the GPU there are many teams, one image and atomic additions.
+On the CPU, each team adds to its own image without atomics (which would take most of the time), and the copies are summed at
+the end, unless they would be too large. On the GPU there are many teams, one image and atomic additions.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger on
 
 @dataclass(frozen=True)
 class Sharing:
-    """Into how many shares work is cut, and how wide the teams are that do one each. The images are the same to rounding.
+    """The number of shares, and the width of the teams that do one share each. Images do not depend on it, but for rounding.
 
-    lanes               of a team: rows that it works on side by side, the rows of a block
-    shares_per_thread   shares for each thread of the CPU: the more, the better they even out, but each has an image of its own
+    lanes               lanes of a team, which is the number of rows of a block
+    shares_per_thread   shares per CPU thread; more shares balance better, but each has its own image
     shares_on_gpu       shares on a GPU
     """
 
@@ -53,12 +53,12 @@ SHARING = Sharing()  # as measured: docs/accuracy.md
 
 @dataclass
 class Share:
-    """What a kernel's lanes know of their work.
+    """The work of a kernel's lanes.
 
-    lane         UInt32, numbers of the lanes; those of a team follow one another
+    lane         UInt32, lane numbers; those of a team are consecutive
     begin, end   of the team's share, as (item, block), UInt32
-    blocks       UInt32 [N] of all items
-    lanes        of a team
+    blocks       UInt32 [N], blocks of each item
+    lanes        lanes per team
     """
 
     lane: Any
@@ -68,13 +68,13 @@ class Share:
     lanes: int
 
     def row(self, block: Any) -> Any:
-        """The row of an item that a lane works on in a block of it, Int32."""
+        """The row of an item that a lane works on, in one of its blocks, Int32."""
         return mi.Int32(block * self.lanes + self.lane % self.lanes)
 
     def each_item(self, visit: Callable[[Any, Any, Any], None]) -> Any:
         """Call visit(g, block, stop) with each item of the share and the range of its blocks in it; the kernel's result.
 
-        Loops carry what they change and no more: Dr.Jit traces others twice, and nested ones four and eight times.
+        Loop states hold only variables that change: otherwise Dr.Jit traces a loop twice, and nested ones 4 or 8 times.
         """
         end = self.end
 
@@ -87,11 +87,11 @@ class Share:
 
 @dataclass
 class Target:
-    """What a kernel adds packets to.
+    """The images that a kernel adds packets to.
 
-    values    Float, the images of all teams, or the one image
+    values    Float, the images of all teams, or one common image
     base      Int32, the first packet of a team's own image
-    private   whether it has one, and needs no atomics
+    private   whether each team has its own image, and needs no atomics
     """
 
     values: Any
@@ -99,17 +99,17 @@ class Target:
     private: bool
 
     def add(self, value: Any, index: Any) -> None:
-        """Add a packet, Vector4f, at an index that counts from the first packet of `values`."""
+        """Add a packet, Vector4f. index: counts packets from the start of `values`."""
         mode = dr.ReduceMode.NoConflicts if self.private else dr.ReduceMode.Auto
         dr.scatter_add(self.values, value, index, mode=mode)
 
 
 class Work:
-    """Items shared out among teams, from arrays that are evaluated:
+    """Items shared out among teams, from evaluated arrays:
 
-    blocks, block_cost   UInt32 [N], costs at least 1
-    ends                 UInt64 [N], the sums of cost up to the end of each item
-    sharing              into how many shares, for teams of how many lanes
+    blocks, block_cost   UInt32 [N], blocks of each item and cost of one block, at least 1
+    ends                 UInt64 [N], prefix sums of the items' costs
+    sharing              number of shares and lanes per team
     """
 
     def __init__(self, blocks: Any, block_cost: Any, ends: Any, sharing: Sharing):
@@ -127,7 +127,7 @@ class Work:
         return cls(blocks, block_cost, ends, sharing)
 
     def shares(self) -> Share:
-        """What a kernel's lanes know of their work."""
+        """The work of a kernel's lanes."""
         lanes = self.sharing.lanes
         total = dr.gather(mi.UInt64, self.ends, dr.opaque(mi.UInt32, self.count - 1))
         lane = dr.arange(mi.UInt32, self.teams * lanes)
@@ -140,10 +140,10 @@ class Work:
         return Share(lane, begin, end, self.blocks, lanes)
 
     def add_up(self, kernel: Callable[..., Any], rows: int, width: int, parts: int = 1, /, **arguments: Any) -> Any:
-        """Run kernel(share, target, **arguments), which adds to rows of so many elements, padded to whole packets.
+        """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole packets.
 
-        Returns the rows, Float [rows * width]. With more than one of the `parts`, items are dealt out to them and each part is
-        added up by itself, their sums in float64.
+        Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts. Each part is
+        summed by itself, and the partial sums are added in float64.
         """
         if parts > 1:
             which = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts)
@@ -173,7 +173,7 @@ class Work:
 
 
 def _cut(position, ends, block_cost, count):
-    """The first block that begins at a position of the costs or behind it, as (item, block)."""
+    """The first block that begins at or after a position in the total cost, as (item, block)."""
 
     def halve(g, size):
         half = size // 2
@@ -182,20 +182,20 @@ def _cut(position, ends, block_cost, count):
 
     g, _ = while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
     start = dr.gather(mi.UInt64, ends, g - 1, g > 0)
-    # A masked lane reads 0, and an integer division by it would kill the process.
+    # A masked lane reads 0, and an integer division by 0 would crash.
     cost = dr.maximum(mi.UInt64(dr.gather(mi.UInt32, block_cost, g, g < count)), 1)
     return g, mi.UInt32((position - start + cost - 1) // cost)
 
 
 def repeat(first: Any, last: Any, body: Callable[..., Any], *state: Any) -> tuple:
-    """Python's `for i in range(first, last): state = body(i, *state)` in a kernel; the last state, if there is any."""
+    """`for i in range(first, last): state = body(i, *state)` in a kernel. Returns the last state."""
     return while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *(body(i, *state) or ())))[
         1:
     ]
 
 
 def packets_of(width: int) -> int:
-    """Packets that a row of so many elements takes."""
+    """Packets of a row of `width` elements."""
     return -(-width // PACKET)
 
 
@@ -211,7 +211,7 @@ def pad(image: Any, rows: int, width: int) -> Any:
 
 
 def crop(padded: Any, rows: int, width: int) -> Any:
-    """The image that `pad` padded."""
+    """The inverse of `pad`."""
     if width % PACKET == 0:
         return padded
     i, columns, pitch = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width), packets_of(width) * PACKET
@@ -219,7 +219,7 @@ def crop(padded: Any, rows: int, width: int) -> Any:
 
 
 def pack(Packet: Any, Element: Any, columns: Sequence) -> Any:
-    """Interleave columns [N] into rows of whole packets, which a lane fetches with few loads."""
+    """Interleave columns [N] into rows of whole packets, so that a lane needs few loads."""
     count, packets = dr.width(columns[0]), len(columns) // PACKET
     target = dr.empty(Element, count * packets * PACKET)
     i = dr.arange(mi.UInt32, count)
@@ -233,11 +233,11 @@ def load(packed: Any, index: Any, packets: int = 3) -> list[Any]:
     return [x for j in range(packets) for x in dr.gather(mi.Vector4f, packed, index * packets + j)]
 
 
-FAR = 3e8  # keeps whole numbers of elements, and sums of a few, within Int32; what exceeds it stays in the fraction
+FAR = 3e8  # keeps whole numbers of elements, and sums of a few, within Int32; the fraction takes the excess
 
 
 def whole(x: Any) -> Any:
-    """The whole number next to x, for Float and Float64."""
+    """The whole number nearest to x, for Float and Float64."""
     return dr.clip(dr.round(x), -FAR, FAR)
 
 
@@ -248,13 +248,13 @@ def high_low(x: Any) -> tuple[Any, Any]:
 
 
 def times(high: Any, low: Any, n: Any) -> tuple[Any, Any]:
-    """The product of a pair of Floats with a whole number, as a pair."""
+    """The product of a `high_low` pair and a whole number, as a pair."""
     product = high * n
     return product, dr.fma(low, n, dr.fma(high, n, -product))
 
 
 def pack_halves(a: Any, b: Any) -> Any:
-    """Two corrections in one number, eight binary digits each; `unpack_halves` gives them back."""
+    """Two corrections in one number, with eight binary digits each; `unpack_halves` is the inverse."""
     a, b = (_bits(x) & 0xFFFF0000 for x in (a, b))
     return dr.reinterpret_array(mi.Float, a | (b >> 16))
 
@@ -272,7 +272,7 @@ def _bits(x: Any) -> Any:
 
 def span(low: Any, high: Any, offset: Any, column: Any, empty: Any, packets: Any) -> tuple[Any, Any]:
     """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
-    far = 1e8  # keeps what lies far outside within Int32
+    far = 1e8  # keeps distant positions within Int32
     first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
     last = mi.Int32(dr.clip(dr.floor(high + offset), -far, far)) + column
     begin = dr.maximum(first, 0) // PACKET
@@ -281,6 +281,6 @@ def span(low: Any, high: Any, offset: Any, column: Any, empty: Any, packets: Any
 
 
 def position(packet: Any, column: Any, offset: Any) -> Any:
-    """t of the elements of a packet: exact to its last digit wherever the whole elements cancel."""
+    """t of the elements of a packet, with full precision near t = 0."""
     whole = mi.Float(packet * PACKET - column)
     return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)

@@ -1,7 +1,7 @@
-"""The exact projector of `grid` and its transpose as a matrix to iterate with: any poses, pixels left out (Dr.Jit).
+"""The exact projector of `grid` and its transpose, for iterative algorithms: any poses, invalid pixels allowed (Dr.Jit).
 
-`joseph` is two to three times as fast (128^3 voxels, 20 views, CPU), where the source moves on a circle before an upright
-panel and all pixels are valid.
+`joseph` is two to three times as fast (128^3 voxels, 20 views, CPU), but needs a source on a circle, an upright panel and
+valid pixels only.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from lingo_mi.projectors.joseph import Stack
 
 
 class ExactPair(Stack):
-    """The matrix A of a scan, with rows of zeros for pixels that are not valid; `adjoint` is its transpose to rounding.
+    """The matrix A of a scan, with zero rows for invalid pixels. `adjoint` is its transpose to rounding.
 
-    A view is a launch; all are of the same kernels.
+    Each view is one launch of the same kernels.
 
-    valid   bool [view, v, u], None for all
+    valid   bool [view, v, u]; None: all
     """
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
@@ -34,7 +34,7 @@ class ExactPair(Stack):
     def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
-        A 1 is the path of the ray through the box, mm, or zero.
+        A 1 is the length of the ray inside the box, mm; zero for invalid pixels.
         """
         out = [dr.empty(mi.Float, len(views) * self.pixels) for _ in range(2)]
         for block, view in enumerate(views):
@@ -53,7 +53,7 @@ class ExactPair(Stack):
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]
-        rule   : what to return instead, a function of (voxel, A^T y, A^T 1): flat indices mi.UInt and the sums
+        rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt and the sums; its result is returned instead
         """
         sums = [dr.zeros(mi.Float, self.voxels) for _ in range(1 if rule is None else 2)]
         for block, view in enumerate(views):
@@ -68,7 +68,7 @@ class ExactPair(Stack):
         return view_walk(self.geometry, self._rays[view], *whole_box(self.size))
 
     def _of(self, images, block):
-        """One of several images; 1 where there are none."""
+        """One of several images; 1 for None."""
         if images is None:
             return mi.Float(1)
         return dr.gather(

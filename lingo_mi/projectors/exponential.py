@@ -1,4 +1,4 @@
-"""Powers of two for numbers that are not positive, in half the operations of Dr.Jit's own on the CPU."""
+"""2^x for x <= 0, on the CPU with half the operations of Dr.Jit's own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import drjit as dr
 
 HALF_LOG2E = 0.7213475204444817  # exp(-x / 2) = 2^(-HALF_LOG2E x)
 
-# 2^f - 1 = f (C[0] + C[1] f + ... + C[5] f^5) for |f| <= 1/2, of least largest relative error: 2e-9.
+# 2^f - 1 = f (C[0] + C[1] f + ... + C[5] f^5) for |f| <= 1/2, minimax: the largest relative error is 2e-9.
 C = (
     0.6931472028550588,
     0.24022647913637582,
@@ -17,11 +17,11 @@ C = (
     0.0013398874407207914,
     0.0001535336216599145,
 )
-ROUNDER = 1.5 * 2**23  # float32 have no fraction near it, and their last bits hold the whole number that was added
+ROUNDER = 1.5 * 2**23  # near it, float32 has no fraction; the last bits hold the added whole number
 
 
 def exp2_of_negative(x: Any) -> Any:
-    """2^x for x <= 0 to a float32's rounding; what is less than 2^-126 is that."""
+    """2^x for x <= 0, to float32's rounding; at least 2^-126."""
     if dr.backend_v(x) == dr.JitBackend.CUDA:  # has an instruction
         return dr.exp2(x)
     x = dr.maximum(x, -126)

@@ -2,14 +2,14 @@
 
 The volume is interpolated trilinearly between voxel centres; in the outer half voxel the edge value is held,
 outside the box the density is zero (the convention of Mitsuba's `gridvolume` inside a cube). Between two
-consecutive planes through voxel centres the interpolant along a ray is a cubic, so walking from plane to
-plane with the two-point Gauss-Legendre rule *is* the integral: no step size, no error but rounding. Both
-points of a segment share the eight corner fetches.
+consecutive planes through voxel centres, the interpolant along a ray is a cubic polynomial. The two-point
+Gauss-Legendre rule from plane to plane is therefore exact: there is no step size, and no error but rounding.
+Both points of a segment share the eight corner fetches.
 
-A transposed pass scatters the same corner weights, so the adjoint matches to rounding. Nothing is stored
-between the two.
+The transpose scatters the same corner weights, so it is the adjoint to rounding. Nothing is stored between
+the two.
 
-`line_integrals` is the differentiable function of rays; `project` and `backproject` run a whole scan.
+`line_integrals` is a differentiable function of the volume; `project` and `backproject` run a whole scan.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Walk:
     """The walks of rays through a grid, in its coordinates.
 
     origin          Vector3f
-    d, inv          Vector3f, the direction, none of whose components is zero, and 1 / d
+    d, inv          Vector3f, the direction (no component is zero) and 1 / d
     t_first, t_last   Float, ends of the walk
     """
 
@@ -65,7 +65,7 @@ class Walk:
 
 def _clip(origin, direction, low, high, t_min, t_max):
     """The walk of a ray through the box [low, high]: (guarded direction, 1 / direction, first and last t)."""
-    # A component of zero becomes 1e-9 of the largest: over a thousand voxels the ray strays by 1e-6 voxel.
+    # A zero component becomes 1e-9 of the largest. Over a thousand voxels this moves the ray by 1e-6 voxel.
     floor = dr.maximum(1e-9 * dr.max(dr.abs(direction)), 1e-30)
     d = dr.select(dr.abs(direction) < floor, dr.copysign(mi.Vector3f(floor), direction), direction)
     inv = dr.rcp(d)
@@ -74,7 +74,7 @@ def _clip(origin, direction, low, high, t_min, t_max):
 
 
 def _first_planes(origin, direction, t):
-    """The planes that a ray at t meets next, the steps to the ones after, the offsets of the cells."""
+    """The next planes that a ray meets after t, the steps to the planes after these, and the cells' offsets."""
     start = dr.fma(direction, t, origin)
     up = direction > 0
     plane = mi.Vector3i(dr.select(up, dr.floor(start) + 1, dr.ceil(start) - 1))
@@ -82,7 +82,7 @@ def _first_planes(origin, direction, t):
 
 
 def _corners(cell, size):
-    """Flat indices of the eight corners of a dual cell, z fastest; clamped, which holds the edge value."""
+    """Flat indices of the eight corners of a dual cell, z fastest. Clamping extends the edge values."""
     x0, y0, z0 = (dr.clip(cell[i], 0, n - 1) for i, n in enumerate(size))
     x1, y1, z1 = (dr.clip(cell[i] + 1, 0, n - 1) for i, n in enumerate(size))
     rows = [x * size[1] + y for x in (x0, x1) for y in (y0, y1)]
@@ -91,7 +91,7 @@ def _corners(cell, size):
 
 @dr.syntax
 def gather(data: Any, size: tuple[int, int, int], walk: Walk) -> Any:
-    """Sum over the segments of a ray, in units of t."""
+    """The integral along a ray, in units of t."""
     origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
     t = mi.Float(walk.t_first)
     total = mi.Float(0)
@@ -120,7 +120,7 @@ def gather(data: Any, size: tuple[int, int, int], walk: Walk) -> Any:
 
 
 def _segment_weights(weight, value, far, d, length, middle):
-    """Adds a segment's share to the eight corner weights, numbered near (0) to far (1) along x, y, z."""
+    """Add a segment to the eight corner weights. Corners are numbered near (0) or far (1) along x, y, z."""
     half = 0.5 * length * value
     for side in (-GAUSS, GAUSS):
         near = dr.fma(-dr.abs(d), dr.fma(side, length, middle), far)
@@ -130,7 +130,7 @@ def _segment_weights(weight, value, far, d, length, middle):
 
 
 def _cell_address(plane, step, size):
-    """Index of a cell's near corner and the offsets to the far ones per axis, clamped like `_corners`."""
+    """Index of a cell's near corner, and offsets to the far corner along each axis, clamped as in `_corners`."""
     far = [dr.clip(plane[i], 0, n - 1) for i, n in enumerate(size)]
     near = [dr.clip(plane[i] - step[i], 0, n - 1) for i, n in enumerate(size)]
     stride = (size[1] * size[2], size[2], 1)
@@ -139,7 +139,7 @@ def _cell_address(plane, step, size):
 
 
 def _leave_cell(target, weight, plane, step, size, on_x, on_y):
-    """Writes the four corners behind the face that the ray leaves by; returns the next cell's weights."""
+    """Write the four corners that do not belong to the ray's exit face. Returns the next cell's weights."""
     index, (x, y, z) = _cell_address(plane, step, size)
     a, b = dr.select(on_x, y, x), dr.select(on_x | on_y, z, y)
     for i in range(4):
@@ -154,8 +154,8 @@ def _leave_cell(target, weight, plane, step, size, on_x, on_y):
 def scatter(target: Any, value: Any, size: tuple[int, int, int], walk: Walk) -> None:
     """The transpose of `gather`: adds `value` times the weight of every corner to `target`.
 
-    The weights of the current cell stay in registers: a step through a face writes the four corners it leaves
-    behind and hands the other four to the next cell, which halves the memory traffic.
+    The weights of the current cell stay in registers. A step through a face writes the four corners left behind
+    and passes the other four on to the next cell, which halves the memory traffic.
     """
     origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
     t = mi.Float(walk.t_first)
@@ -171,8 +171,8 @@ def scatter(target: Any, value: Any, size: tuple[int, int, int], walk: Walk) -> 
         _segment_weights(
             weight, value, (mi.Vector3f(plane) - origin) * mi.Vector3f(step), d, t_next - t, 0.5 * (t_next + t)
         )
-        # One face a step: where two planes coincide, the second crossing is a segment of no length. At the
-        # end of the ray two steps along x, the second of no length, write all eight corners.
+        # One face per step: if a ray crosses two planes at once, the second crossing is a segment of length 0. At
+        # the end of the ray, two steps along x (the second of length 0) write all eight corners.
         on_x = (nearest.x <= leave) | (t_next >= t_last)
         on_y = ~on_x & (nearest.y <= leave)
         weight = _leave_cell(target, weight, plane, step, size, on_x, on_y)
@@ -183,7 +183,7 @@ def scatter(target: Any, value: Any, size: tuple[int, int, int], walk: Walk) -> 
 
 
 class _LineIntegrals(dr.CustomOp):
-    """Linear in `data`, constant in the rest: both derivatives run the walk again and store nothing."""
+    """Linear in `data`, other inputs are constant. Both derivatives repeat the walk; nothing is stored."""
 
     def eval(self, data, size, walk):
         self.size, self.walk, self.width = size, walk, dr.width(data)
@@ -226,11 +226,11 @@ def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, l
     lines              along which, in the volume's unit
 
     Returns mi.Float [lines], density times length: exact for the trilinear interpolant, zero for a ray that
-    misses. Differentiable with respect to `data` in both modes (the derivative is the same operator or its
-    transpose), not with respect to the rays. An origin near the box keeps all digits of float32; `view_rays`
-    chooses it so.
+    misses the box. Differentiable with respect to `data` in both modes (the derivative is the same operator or
+    its transpose), not with respect to the rays. For full float32 precision, origins should be near the box, as
+    those of `view_rays` are.
 
-    Raises InputError where `data` does not hold nx * ny * nz values.
+    Raises InputError if `data` does not hold nx * ny * nz values.
     """
     nx, ny, nz = (int(n) for n in size)
     size = nx, ny, nz
@@ -248,9 +248,9 @@ def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, l
 def view_table(geometry: Geometry) -> np.ndarray:
     """The rays of every view as origin and direction, each affine in the pixel position: float32 [view, 19].
 
-    Lengths in mm, relative to the centre of the volume. The columns are, three by three, the origin and its
-    steps per pixel along u and v, the direction and its steps, then the smallest t. The origins lie on a
-    plane through the volume's centre, computed in float64, so that float32 loses nothing to a distant source.
+    Lengths in mm, relative to the centre of the volume. The columns, in threes: the origin and its steps per
+    pixel along u and v; the direction and its steps; last, the smallest t. The origins lie on a plane through
+    the volume's centre and are computed in float64, so a distant source costs no float32 precision.
     """
     rays, centre = geometry.rays(), np.array(geometry.offOrigin)
     corner, source = rays.corner - centre, rays.source
@@ -271,9 +271,8 @@ def view_table(geometry: Geometry) -> np.ndarray:
 def view_rays(row: Any, n_v: int, n_u: int) -> tuple[Any, Any, Any]:
     """Rays through the pixel centres of a view, v fastest: (origin, direction, t_min).
 
-    row is one row of `view_table` as an evaluated mi.Float [19]. Neighbouring lanes are neighbours along v:
-    they meet the same columns of a volume that is stored z fastest, which is twice as fast as the other
-    order.
+    row is one row of `view_table` as an evaluated mi.Float [19]. Neighbouring lanes are neighbours along v, so
+    they cross the same columns of a volume that is stored z fastest. This is twice as fast as the other order.
     """
     index = dr.arange(mi.UInt, n_v * n_u)
     column = index // n_v
@@ -283,7 +282,7 @@ def view_rays(row: Any, n_v: int, n_u: int) -> tuple[Any, Any, Any]:
 
 
 def _occupied(volume):
-    """The part of the grid where the interpolant is not zero, in grid coordinates; None where all is zero."""
+    """The part of the grid where the interpolant is not zero, in grid coordinates; None if there is none."""
     low, high = [], []
     for axis in range(3):
         used = np.flatnonzero(volume.any(axis=tuple(i for i in range(3) if i != axis)))
@@ -306,14 +305,14 @@ def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, 
 def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Projections of a voxel volume along the rays of all pixel centres, exact for its trilinear interpolant.
 
-    volume     [x, y, z], the shape that `geometry.nVoxel` says; densities per mm
+    volume     [x, y, z], of shape `geometry.nVoxel`; densities per mm
     progress   called as progress(views done, views) after every view
 
-    Returns float32 [view, v, u], density times mm. A cone beam starts at the source; the panel cuts no ray
-    short (a panel through the axis, DSD = DSO, is the usual virtual detector). Empty margins of the volume
-    cost nothing. One compiled kernel serves all views.
+    Returns float32 [view, v, u], density times mm. A cone beam starts at the source. Rays do not end at the
+    panel, because the usual virtual detector is a panel through the axis (DSD = DSO). Empty margins of the
+    volume cost no time. All views use one compiled kernel.
 
-    Raises InputError where the shapes disagree or the volume is not finite.
+    Raises InputError if the shapes disagree or the volume is not finite.
     """
     volume = np.ascontiguousarray(volume, np.float32)
     if volume.shape != geometry.nVoxel:
@@ -340,10 +339,10 @@ def backproject(
 ) -> np.ndarray:
     """The exact transpose of `project`: float32 [x, y, z], in units of the projections times mm.
 
-    projections   [view, v, u], the shape that `geometry` says
+    projections   [view, v, u], of the shape that `geometry` has
     progress      called as progress(views done, views) after every view
 
-    Raises InputError where the shapes disagree.
+    Raises InputError if the shapes disagree.
     """
     projections = np.ascontiguousarray(projections, np.float32)
     expected = (len(geometry), *geometry.nDetector)
@@ -354,7 +353,7 @@ def backproject(
     n_v, n_u = geometry.nDetector
     target = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
     for i, row in enumerate(view_table(geometry)):
-        # A gather, because a plain read of a NumPy buffer bakes the buffer's alignment into the kernel.
+        # A gather, because a direct read of a NumPy buffer compiles the buffer's alignment into the kernel.
         index = dr.arange(mi.UInt, n_v * n_u)
         image = dr.gather(mi.Float, mi.Float(projections[i].ravel()), index % n_v * n_u + index // n_v)
         walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))

@@ -1,18 +1,17 @@
 """Joseph's projector and its exact transpose for circular scans, fast enough to iterate with (Dr.Jit, llvm or cuda).
 
-Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982): a ray is sampled where
-it meets the slices of voxel centres along x or y, whichever it is nearer to; in each slice the volume is interpolated
-bilinearly. The weight of voxel (i, j, k) in the ray of pixel (u, v), whose main axis is x, is
+Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982): a ray's main axis is x or y,
+whichever is nearer to its direction. The ray is sampled where it meets the slices of voxel centres along this axis, by
+bilinear interpolation in each slice. If the main axis is x, the weight of voxel (i, j, k) in the ray of pixel (u, v) is
 
     a = L(u, v) hat(y(u, i) - j) hat(z(u, v, i) - k),    hat(s) = max(0, 1 - |s|)
 
-with L the path per slice. As in `grid`, the edge value is held in the outer half voxel and the box ends there. Because the
-panel's rows are parallel to the axis of rotation, y depends on the column alone: the few pixels whose hats cover a given
-voxel can be listed. So both directions are gathers with the same weights, nothing is scattered, and results do not depend on
-the order of threads.
+with L the path per slice. As in `grid`, the edge value is held in the outer half voxel, where the box ends. The panel's
+columns are parallel to the axis of rotation, so y depends on the column alone, and the few pixels with hats that cover a given
+voxel can be listed. So both directions are gathers with the same weights. Nothing is scattered, and results do not depend
+on the order of threads.
 
-Volumes and images live on the device: volumes mi.Float [nx * ny * nz], z fastest; images mi.Float [block, u, v], v
-fastest.
+Volumes and images are on the device: volumes mi.Float [nx * ny * nz], z fastest; images mi.Float [block, u, v], v fastest.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 
-COLUMN = 8  # floats a detector column
-RUN = 8  # voxels a lane of the transpose
+COLUMN = 8  # floats per detector column
+RUN = 8  # voxels per lane of the transpose
 ROWS = 4  # most rows of the panel that its innermost loop unrolls
 
 
 def column_table(geometry: Geometry) -> np.ndarray:
     """The rays of every detector column, in voxel indices: float32 [view, u, 8].
 
-    With m the index along the main axis: the transverse index is `a + b m`, the share of the way from the source to the
-    panel is `c + e m` (parallel: 1), the path per slice is sqrt(g + h dz^2) mm with dz the height of the pixel
-    over the source in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
+    Let m be the index along the main axis. The transverse index is `a + b m`. The share of the way from the source to the
+    panel is `c + e m` (parallel: 1). The path per slice is sqrt(g + h dz^2) mm, with dz the height of the pixel above the
+    source, in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
     """
     rays, n_u = geometry.rays(), geometry.nDetector[1]
     voxel = np.array(geometry.dVoxel[:2])
@@ -91,11 +90,11 @@ class Stack:
 
 
 class Joseph(Stack):
-    """The matrix A of a circular scan, view by view; `adjoint` is its transpose to rounding.
+    """The matrix A of a circular scan, view by view. `adjoint` is its transpose to rounding.
 
-    The compiled kernels, one forward and two back, serve all blocks of views, whatever their number.
+    The same compiled kernels (one forward, two backward) serve blocks of any number of views.
 
-    Raises InputError where the source of a cone beam is inside the volume, or the volume has 2^32 voxels or more.
+    Raises InputError if the source of a cone beam is inside the volume, or the volume has 2^32 voxels or more.
     """
 
     def __init__(self, geometry: Geometry):
@@ -117,7 +116,7 @@ class Joseph(Stack):
         # Height of the source, of the first row over it, and between rows, in voxels.
         self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
         self._matrix = mi.Float(self._column_matrix().ravel())
-        # Rows whose hats cover a voxel, at most: where it is nearest to the source.
+        # The largest number of rows with hats that cover a voxel; it is reached nearest to the source.
         nearest = 1.0 if rays.parallel else (geometry.DSO - half) / geometry.DSD
         rows = int(np.ceil(2 * voxel / (nearest * abs(rays.v[0, 2])) + 1e-3))
         self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
@@ -129,7 +128,7 @@ class Joseph(Stack):
     def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
-        A 1 is the path of the ray through the box, mm.
+        A 1 is the length of the ray inside the box, mm.
         """
         chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
         column = index // self.panel[0]
@@ -144,8 +143,8 @@ class Joseph(Stack):
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]
-        rule   : what to store instead, a function of (voxel, A^T y, A^T 1): flat indices mi.UInt of some voxels and their
-                 sums. It is traced into the kernel, so it saves volumes in memory
+        rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt of some voxels and their sums; its result is
+                 stored instead. It is traced into the kernel, which saves memory for whole volumes
         """
         chosen, n_views = _numbers(views), dr.opaque(mi.UInt, len(views))
         ones = rule is not None
@@ -162,12 +161,12 @@ class Joseph(Stack):
 
 @dataclass
 class _Tables:
-    """What kernels know of a scan.
+    """A scan's data for the kernels.
 
     size, panel      voxels along x, y and z; rows and columns
     columns, rows    Float, see `column_table`; (source, top, step) of the heights
     matrices         Float, see `_column_matrix`
-    margin           rows of zeros above and below images, at least as many as have hats that cover a voxel
+    margin           rows of zeros above and below images, at least as many as the rows with hats that cover a voxel
     """
 
     size: tuple
@@ -179,7 +178,7 @@ class _Tables:
 
 
 def _numbers(views):
-    """View numbers on the device, and one more: an array of one would make another kernel."""
+    """View numbers on the device, with an extra entry: an array of length one would need another kernel."""
     return mi.UInt(np.append(np.asarray(views, np.uint32), np.uint32(0)))
 
 
@@ -202,7 +201,7 @@ def _span(a, b, n):
 
 @dr.syntax
 def _integrate(data, size, columns, rows, column, row):
-    """(A x, A 1) of rays, one a lane."""
+    """(A x, A 1) of rays, one per lane."""
     nx, ny, nz = size
     a, b, c, e, g, h, along_y = _column(columns, column)
     source, top, step = rows
@@ -237,7 +236,7 @@ def _integrate(data, size, columns, rows, column, row):
 def _weighted(images, chosen, tables: _Tables, ones):
     """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
 
-    With `ones`, mi.Vector2f interleaved: an image of ones, treated alike, stands beside each value.
+    With `ones`, mi.Vector2f interleaved: the second component comes from an image of ones, treated alike.
     """
     (n_v, n_u), columns, rows, margin = tables.panel, tables.columns, tables.rows, tables.margin
     pitch = n_v + 2 * margin
@@ -256,13 +255,13 @@ def _weighted(images, chosen, tables: _Tables, ones):
 
 @dr.syntax
 def _collect(weighted, chosen, n_views, tables: _Tables, ones):
-    """A^T y of voxels: RUN of a line along z a lane, as far apart as they can be, so that lanes and their fetches stay
-    neighbours while all that does not depend on z is shared.
+    """A^T y of voxels. Each lane computes RUN voxels of a line along z, spaced as far apart as possible.
+
+    Neighbouring lanes then fetch neighbouring values, and a lane computes only once what does not depend on z.
 
     weighted : see `_weighted`
 
-    Returns ((voxels, whether they exist), sums), lists of RUN; a sum is a list, with A^T 1 as its second entry where the
-    images have ones.
+    Returns ((voxels, whether they exist), sums), lists of RUN. A sum is a list; with `ones`, its second entry is A^T 1.
     """
     (nx, ny, nz), (n_v, n_u), margin = tables.size, tables.panel, tables.margin
     columns, matrices = tables.columns, tables.matrices
@@ -283,7 +282,7 @@ def _collect(weighted, chosen, n_views, tables: _Tables, ones):
     while block < n_views:
         view = dr.gather(mi.UInt, chosen, block)
         r = [dr.gather(mi.Float, matrices, view * 6 + i) for i in range(6)]
-        # The columns whose rays pass within a voxel along x or along y.
+        # The columns with rays that pass within one voxel along x or y.
         top_u = dr.fma(r[0], x, dr.fma(r[1], y, r[2]))
         bottom = dr.fma(r[3], x, dr.fma(r[4], y, r[5]))
         spots = [(top_u + s * r[i]) * dr.rcp(dr.maximum(bottom + s * r[i + 3], 1e-6)) for i in (0, 1) for s in (-1, 1)]

@@ -1,23 +1,23 @@
 r"""Exact path lengths through closed triangle meshes, by drawing every triangle once.
 
-A ray o + tD spends in a mesh the signed sum of the parameters t at which it crosses the surface, plus where it
-leaves and minus where it enters, times \|D\|. The sum needs no order, so nothing is traced: every triangle adds
-its share to the pixel centres that its projection covers.
+The path of a ray o + tD inside a mesh is \|D\| times the signed sum of the parameters t of its surface crossings: plus
+where it leaves, minus where it enters. The order does not matter, so no ray tracing is needed: each triangle adds its
+term to the pixel centres that its projection covers.
 
-The sum must not notice edges. A row of pixels meets a triangle between two of its edges, from the first pixel
-centre at or behind the left crossing to the last before the right one. The crossings are float64 numbers computed
-from the edge's upper to its lower end, so that both triangles of an edge get the same bits, and a triangle's sign in
-a row follows from which crossing is the left one. The signs at every pixel then sum to zero exactly, whatever
-rounding did to the crossings.
+Neighbouring triangles must not overlap or leave gaps. In a row, a triangle covers the pixels between two of its edges:
+from the first pixel centre at or behind the left crossing to the last one before the right crossing. Crossings are
+float64 and are always computed from an edge's upper to its lower end, so both triangles of an edge get the same bits.
+A triangle's sign in a row depends on which crossing is the left one. The signs at every pixel then sum to exactly zero,
+whatever the rounding errors of the crossings.
 
-Therefore t may be measured from any plane. From one through the mesh's centre, parallel to the panel, at t0, it is
+Therefore t may be measured from any plane. Take the plane through the mesh's centre, parallel to the panel, at t0. Then
 
     t - t0 = t0 q / (1 - q),   q = 1 - t0 / t
 
-for a cone beam, where q is affine in the pixel position on every triangle; for a parallel beam t - t0 = q is affine
-itself. What is left for float32 is a difference of the size of the mesh, not of the distance to the source. q is
-found at the vertices, interpolated along edges in float64, and along a row in float32 from its far end, whence 1 - q
-only grows.
+for a cone beam, where q is affine in the pixel position on every triangle. For a parallel beam, t - t0 = q is itself
+affine. So float32 holds differences of the size of the mesh, not of the distance to the source. q is computed at the
+vertices and interpolated along edges in float64. Along a row it is interpolated in float32, from the end where 1 - q is
+smallest.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lingo_mi.projectors.balance import PACKET, SHARING, Share, Sharing, Target,
 from lingo_mi.projectors.view import View, vector64
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
-NEAR = 1e-9  # depth of the nearest vertex over that of the farthest from which a mesh counts as touching the source
+NEAR = 1e-9  # a mesh touches the source if its nearest vertex has at most this share of the farthest vertex's depth
 
 
 class MeshPaths:
@@ -44,13 +44,13 @@ class MeshPaths:
 
     vertices   [V, 3] numbers, any unit; equal positions are merged, because meshes with a normal or texture
                coordinate per face repeat them
-    faces      [F, 3] indices of vertices, anticlockwise seen from the empty side; a mesh that is inside out as a
-               whole is turned, but all its parts must agree
-    name       what error messages call it
-    sharing    how the work of projecting it is shared out
+    faces      [F, 3] indices of vertices, anticlockwise seen from outside; a mesh that is inside out is flipped as a
+               whole, so all its parts must be oriented alike
+    name       for error messages
+    sharing    how the work is shared out (see `balance`)
 
-    Where parts overlap, lengths add up. Raises InputError where the mesh is empty, not finite, or not closed: every
-    edge must be used as often in one direction as in the other.
+    Where parts overlap, lengths add up. Raises InputError if the mesh is empty, not finite, or not closed: every edge
+    must be used equally often in both directions.
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, name: str, sharing: Sharing = SHARING):
@@ -68,9 +68,9 @@ class MeshPaths:
 
         view   `view.View`; the lengths have its unit
 
-        A mesh behind the source of a cone beam, or behind the panel where there is one, adds nothing. Not
-        differentiable. Raises InputError where the mesh reaches through the plane of a cone beam's source, parallel
-        to the panel, or through the panel.
+        A mesh behind the source of a cone beam, or behind the panel (if integrals end there), adds nothing. Not
+        differentiable. Raises InputError if the mesh crosses the panel, or the plane of a cone beam's source parallel
+        to the panel.
         """
         with dr.suspend_grad():
             vertices, t, scale = self._project(view)
@@ -91,7 +91,7 @@ class MeshPaths:
         """Vertices as Float64 [V * 4], packed (x, y, q, 0); their t, Float64 [V]; the factor from sums to t."""
         Float64 = dr.value_t(mi.Vector3d)
         n = dr.cross(view.u, view.v)
-        offset = dr.dot(n, self._vertices)  # along the panel's normal, from the plane that t is measured from
+        offset = dr.dot(n, self._vertices)  # along the panel's normal, from the plane at t0
         if view.parallel:
             along = dr.dot(n, view.source)
             q = t = offset / along
@@ -116,7 +116,7 @@ class MeshPaths:
         packets = packets_of(view.width)
         height, width = dr.opaque(mi.Int32, view.height), dr.opaque(mi.Int32, view.width)
         triangles, blocks, cost = _plan(vertices, self._faces, height, width, self.sharing)
-        drawn: Any = dr.compress(blocks > 0)  # fine meshes have many triangles that fall between the pixel centres
+        drawn = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
         if dr.width(drawn) == 0:
             return dr.zeros(mi.Float, view.height * view.width)
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
@@ -132,9 +132,9 @@ class _Packed:
     """A mesh as a kernel reads it.
 
     vertices        Float64 [V * 4], packed (x, y, q, 0)
-    triangles       Int32 [4 T]: vertices from the least to the largest y, and the parity of that order
+    triangles       Int32 [4 T]: vertices sorted by y, and the parity of that order
     height, width   Int32, of the image
-    packets         Int32, of a row of it
+    packets         Int32, packets per image row
     bend            Float, 1 for a cone beam, 0 for a parallel one
     """
 
@@ -154,7 +154,7 @@ class _Packed:
 def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """The paths through a Mitsuba mesh (`ply`, `obj`, `cube`, `mi.Mesh` ...), in the scene's unit.
 
-    Raises InputError where the shape is no mesh, or as `MeshPaths` does.
+    Raises InputError if the shape is no mesh, or as `MeshPaths` does.
     """
     name = shape.id()
     if not shape.is_mesh():
@@ -170,7 +170,7 @@ def from_mitsuba(shape: mi.Shape) -> MeshPaths:
 
 
 def _closed(vertices, faces, name):
-    """Merged vertices and the faces that are left, outside out; raises InputError unless they bound a solid."""
+    """Merged vertices and the remaining faces, oriented outwards. Raises InputError if they do not bound a solid."""
     if any(a.ndim != 2 or a.shape[1] != 3 for a in (vertices, faces)) or not len(faces):
         raise InputError(
             f'the mesh {name!r} needs vertices [V, 3] and at least one face [F, 3], not arrays of shape '
@@ -199,7 +199,7 @@ def _closed(vertices, faces, name):
 
 
 def _merge(vertices, faces):
-    """Make vertices at the same position one, and drop those in no face and the faces that this reduces to a line."""
+    """Merge vertices at the same position. Drop unused vertices, and faces that merging reduces to a line."""
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3)
     vertices = vertices[used]
@@ -224,7 +224,7 @@ def _first_centre(position, size):
 
 
 def _plan(vertices, faces, height, width, sharing: Sharing):
-    """Per triangle: vertices from the least to the largest y, parity of that order; blocks of rows; their cost."""
+    """Per triangle: vertices sorted by y, with the parity of that order; blocks of rows; their cost."""
     Float64 = type(vertices)
     i = [mi.UInt32(k) for k in faces]
     x, y = ([dr.gather(Float64, vertices, 4 * k + axis) for k in i] for axis in range(2))
@@ -248,34 +248,34 @@ def _plan(vertices, faces, height, width, sharing: Sharing):
 
 
 def _edge(a, b):
-    """A vertex (x, y, q), and the change of x and q a row towards a second one (unused where no row separates them)."""
+    """A vertex (x, y, q), and the change of x and q per row towards a second vertex (unused if no row lies between)."""
     return a.x, a.y, a.z, (b.x - a.x) / (b.y - a.y), (b.z - a.z) / (b.y - a.y)
 
 
 def _cross(edge, y):
     """x and q where an edge meets row y."""
     ax, ay, aq, dx, dq = edge
-    # The multiply-add is explicit, because a compiler free to fuse could round the same edge in two ways.
+    # An explicit multiply-add: a compiler that chooses when to fuse could round the same edge in two ways.
     return dr.fma(y - ay, dx, ax), dr.fma(y - ay, dq, aq)
 
 
 def _row(long, lower, upper, parity, row, row_end, width):
-    """Pixels [first, last) of a triangle in a row, their sign, and q: a pixel `anchor`, its value there, its slope."""
+    """A triangle in a row: pixels [first, last), the sign, a pixel `anchor`, q there, and the slope of q."""
     y = type(long[0])(row) + 0.5
     x0, q0 = _cross(long, y)
     is_lower = y < upper[1]
     (x1, q1), (x2, q2) = _cross(lower, y), _cross(upper, y)
     x1, q1 = dr.select(is_lower, x1, x2), dr.select(is_lower, q1, q2)
-    # With the vertices in even order the long edge runs against y: on the left it means a positive area.
+    # With an even order of vertices, the long edge runs against y: on the left it means a positive area.
     swap = x0 > x1
     sign = mi.Float(dr.select(swap, -parity, parity))
     first, last = _first_centre(dr.minimum(x0, x1), width), _first_centre(dr.maximum(x0, x1), width)
-    # Not even the packet of `first`, which may be no number there: the row may lie outside the image.
+    # Rows outside the image get no pixels at all: `first` may be invalid there.
     inside = row < row_end
     first, last = dr.select(inside, first, 0), dr.select(inside, last, 0)
     slope = (q1 - q0) / (x1 - x0)
     anchor = dr.select(slope > 0, last - 1, first)
-    # From the nearer crossing: one far outside the image has no digits to spare.
+    # From the nearer crossing: one far outside the image would lose digits.
     x = type(y)(anchor) + 0.5
     near = dr.abs(x - x0) < dr.abs(x - x1)
     q = dr.select(near, dr.fma(x - x0, slope, q0), dr.fma(x - x1, slope, q1))

@@ -1,4 +1,4 @@
-"""What attenuates in a Mitsuba scene: clouds of Gaussians, grids in cubes, closed meshes."""
+"""The attenuating objects of a Mitsuba scene: clouds of Gaussians, grids in cubes, closed meshes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable
 from lingo_mi.projectors.view import View
 
-# Caches by shape, since shapes hold no Python attributes of ours: the edges of a mesh, and that a cloud is usable. Keeping an
-# array alive stops Dr.Jit from reusing its index, which is part of the key.
+# Caches of prepared meshes and of clouds known to be usable; Mitsuba's shapes cannot hold them. An array's index is part of
+# the key, so the array is kept alive: otherwise Dr.Jit could reuse the index.
 _MESHES: dict = {}
 MOST_MESHES = 64
 _USABLE: dict = {}
@@ -26,7 +26,7 @@ MOST_USABLE = 2
 def find_objects(scene: mi.Scene) -> list:
     """The attenuating objects of a scene.
 
-    Raises InputError for an object that `lingo_xray` cannot integrate, and where there is none at all.
+    Raises InputError for an object that `lingo_xray` cannot integrate, and for a scene without objects.
     """
     found = [thing for shape in scene.shapes() if (thing := _object(shape)) is not None]
     if not found:
@@ -73,8 +73,7 @@ class Ellipsoids:
 
     @classmethod
     def of(cls, centre: Any, scale: Any, rotation: Any, density: Any, second: Any, name: str) -> Ellipsoids:
-        """Gaussians without a shape of Mitsuba's, as trusted as they are: Point3f, Vector3f, Vector4f and Float [N]; second may
-        be None."""
+        """Gaussians without a Mitsuba shape, not checked: Point3f, Vector3f, Vector4f and Float [N]. second may be None."""
         self = cls.__new__(cls)
         self.centre, self.scale, self.rotation, self.density = centre, scale, rotation, density
         self.second, self.name, self.rows = second, name, None
@@ -114,7 +113,7 @@ class GridInCube:
 
     @classmethod
     def of(cls, values: np.ndarray, low: Any, high: Any, name: str) -> GridInCube:
-        """Densities [x, y, z] that fill the box from `low` to `high`, without a shape of Mitsuba's."""
+        """Densities [x, y, z] that fill the box from `low` to `high`, without a Mitsuba shape."""
         self = cls.__new__(cls)
         self.name, self.scale, self.size = name, 1.0, values.shape
         self.data = mi.Float(np.ascontiguousarray(values.transpose(2, 1, 0), np.float32).ravel())
@@ -124,7 +123,7 @@ class GridInCube:
     def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
         _no_area(options)
         nx, ny, nz = self.size
-        # The projector wants z fastest, Mitsuba stores x fastest.
+        # The projector needs z fastest; Mitsuba stores x fastest.
         i = dr.arange(mi.UInt32, nx * ny * nz)
         z, rest = i % nz, i // nz
         data = dr.gather(mi.Float, self.data, (z * ny + rest % ny) * nx + rest // ny, mode=dr.ReduceMode.Permute)
@@ -140,11 +139,11 @@ def _no_area(options):
 
 
 def _axis_aligned(cube, volume) -> bool:
-    """Whether neither a cube nor a gridvolume is turned, and the volume not mirrored: boxes alone do not tell."""
+    """Whether cube and gridvolume are axis-aligned and the volume is not mirrored. Bounding boxes do not show this."""
     corners = np.array(mi.traverse(cube)['vertex_positions']).reshape(-1, 3)
     low, high = corners.min(0), corners.max(0)
     off_corner = np.minimum(corners - low, high - corners)
-    # A volume's transform is no parameter; its description begins with the matrix.
+    # A volume's transform is not among its parameters; the matrix is read from its description.
     numbers = re.findall(r'matrix=\[(.*?)\]\]', str(volume), re.DOTALL)[0].replace('[', ' ').replace(']', ' ')
     matrix = np.array([float(x) for x in numbers.replace(',', ' ').split()]).reshape(4, 4)[:3, :3]
     scale = np.diag(matrix)
@@ -169,8 +168,8 @@ class HomogeneousMesh:
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
         )
         self.scale = params.get('scale', 1.0)
-        geometry: Any = mi.traverse(shape)
-        # While an array is kept alive no other one has its index, so a moved mesh is not taken for the one that it was.
+        geometry = mi.traverse(shape)
+        # A kept array's index is unique, so a moved mesh does not match the old entry.
         arrays = geometry['vertex_positions'], geometry['faces']
         key = (id(shape), *(x.index for x in arrays))
         if key not in _MESHES:
@@ -192,7 +191,7 @@ class HomogeneousMesh:
 def _lines(view: View, near: Any) -> grid.Lines:
     """The rays of all pixels, starting on the plane through `near` parallel to the panel.
 
-    Starting near the object keeps the digits that a distant source would cost float32.
+    Starting near the object avoids the loss of float32 digits that a distant source would cause.
     """
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)

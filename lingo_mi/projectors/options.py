@@ -23,11 +23,11 @@ class RenderOptions:
     """The parameters of `lingo_xray`, and how its work is shared out.
 
     extent      cut-off of Gaussians in standard deviations
-    footprint   'exact', or 'affine': the ray's whitened length |d|^2 frozen at a Gaussian's centre (EWA)
-    pixel       n: the mean of n x n rays a pixel, those through the centres of its n x n parts
-    area        the mean over each pixel's area instead of the ray through its centre, for Gaussians: the footprint convolved
-                with a Gaussian of the pixel's variance
-    sharing     how the work of Gaussians is shared out
+    footprint   'exact', or 'affine': the ray's whitened length |d|^2 is constant, as at the Gaussian's centre (EWA)
+    pixel       n: a pixel is the mean of n x n rays, through the centres of its n x n parts
+    area        a pixel is the mean over its area instead of the ray through its centre, for Gaussians only: the footprint is
+                convolved with a Gaussian of the pixel's variance
+    sharing     how the work on Gaussians is shared out (see `balance`)
     """
 
     extent: float = cutoff.RENDER
@@ -40,7 +40,7 @@ class RenderOptions:
     def of(
         accuracy: Any = 'default', extent: Any = None, footprint: Any = 'exact', pixel: Any = 'centre'
     ) -> RenderOptions:
-        """The options from plugin parameters; what is None comes from the preset `accuracy`. Raises InputError."""
+        """The options from plugin parameters. extent=None: that of the preset `accuracy`. Raises InputError."""
         if accuracy not in cutoff.PRESETS:
             raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
         extent = cutoff.PRESETS[accuracy] if extent is None else extent
@@ -51,7 +51,7 @@ class RenderOptions:
         return RenderOptions(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
 
     def subdivided(self, view: View) -> View:
-        """The view with every pixel divided into its n x n parts."""
+        """The view with every pixel divided into n x n parts."""
         n = self.pixel
         return replace(view, u=view.u / n, v=view.v / n, width=view.width * n, height=view.height * n)
 

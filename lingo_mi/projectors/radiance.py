@@ -1,4 +1,4 @@
-"""Radiance of Gaussians as a view sees it: what alpha compositing composites."""
+"""Radiance of Gaussians towards a view, for alpha compositing."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from lingo_mi.projectors.view import View
 
 
 def radiance_towards(centre: Any, view: View, radiance: Any, harmonics: Any = None) -> Any:
-    """Radiance of N Gaussians along the rays of a view, Float [N]; differentiable in everything, the view's pose included.
+    """Radiance of N Gaussians along the rays of a view, Float [N]. Differentiable in all inputs, including the view's pose.
 
     centre      Point3f [N]
     radiance    Float [N], raw
-    harmonics   ArrayXf [3, 8 or 15, N]: coefficients of the spherical harmonics of degrees 1 to 3; None for radiance that is
-                the same in all directions
+    harmonics   ArrayXf [3, 8 or 15, N]: coefficients of the spherical harmonics of degrees 1 to 3; None: the same radiance in
+                all directions
 
-    With harmonics, max(0, 1/2 + sum of coefficient x harmonic) in the direction from source to centre, the harmonic of degree
-    0 for `radiance` (Kerbl et al., ACM TOG 42, 2023, and the released code). Without, a sigmoid (Cai et al., X-Gaussian, ECCV
-    2024, which weighs a vector of features for it: one number does the same for a grey image).
+    With harmonics, the radiance is max(0, 1/2 + sum of coefficient x harmonic) in the direction from source to centre;
+    `radiance` is the coefficient of degree 0 (Kerbl et al., ACM TOG 42, 2023, and the released code). Without, it is a sigmoid
+    of `radiance` (Cai et al., X-Gaussian, ECCV 2024, uses a weighted feature vector; for grey images one number is
+    equivalent).
     """
     if harmonics is None:
         return 1 / (1 + dr.exp(-radiance))

@@ -1,4 +1,4 @@
-"""Rotations of Gaussians, from quaternions to vectors that kernels multiply with."""
+"""Rotations of Gaussians: quaternions to matrix rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects of a scene on a grid: their density at its voxels, and the box that holds them."""
+"""Objects of a scene on a grid: their density at its voxels, and their bounding box."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def on_grid(
     shape: tuple[int, int, int],
     extent: float = cutoff.SAMPLE,
 ) -> np.ndarray:
-    """Density of an object of `objects` on a grid, float32 [x, y, z].
+    """Density of one of a scene's objects (see `objects`) on a grid, float32 [x, y, z].
 
     corner, step   [3] the outer corner of the first voxel, and the voxel size, mm
     shape          voxels along x, y and z
     extent         cut-off of Gaussians in standard deviations
 
-    Gaussians are sampled at the voxel centres, a mesh gives the share of every voxel that it fills, a grid its trilinear
-    interpolation, averaged over voxels where these are larger than its own; on its own voxels it is left as it is.
+    Gaussians are sampled at the voxel centres. A mesh is weighted by the share of each voxel that it fills. A grid is
+    interpolated trilinearly, and averaged over voxels larger than its own; on its own voxels it is returned unchanged.
     """
     nx, ny, nz = shape
     if isinstance(thing, Ellipsoids):
@@ -68,7 +68,7 @@ def grid_values(thing: GridInCube) -> np.ndarray:
 
 
 def bounds(objects: Iterable) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and upper corner, float64 [3], of the box that holds all objects, Gaussians out to 4 standard deviations."""
+    """Lower and upper corner, float64 [3], of the objects' bounding box; Gaussians extend to 4 standard deviations."""
     boxes = [_box(thing) for thing in objects]
     return np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)
 

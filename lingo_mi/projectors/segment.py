@@ -1,13 +1,13 @@
-r"""Line integrals of single Gaussians along ray segments, pixel by pixel, for those that `footprint` cannot express.
+r"""Line integrals of single Gaussians along ray segments, pixel by pixel, for Gaussians without a footprint.
 
-Where the source is inside or near a Gaussian, or the Gaussian straddles the source or the detector plane, its footprint is no
-ellipse and the integral must stop at the ends of the ray o + tD, t in [t0, t1]:
+If the source is inside or near a Gaussian, or the Gaussian straddles the plane of the source or of the detector, its footprint
+is not an ellipse. The integral must then stop at the ends of the ray o + tD, t in [t0, t1]:
 
 .. math::  \rho \frac{|D|}{|d|} \sqrt{\pi/2} \, e^{-\frac12 |w \times d|^2 / |d|^2}
            \left[ \mathrm{erf}((t_1 - m) |d| / \sqrt2) - \mathrm{erf}((t_0 - m) |d| / \sqrt2) \right], \quad m = w \cdot d / |d|^2
 
-A cone beam runs from the source (t0 = 0) to the panel (t1 = 1), or to infinity where there is none. Float64 throughout: these
-Gaussians are few, and each costs a pass over the image.
+A cone beam runs from the source (t0 = 0) to the panel (t1 = 1), or to infinity without a panel. All in float64: these
+Gaussians are few, and each takes a pass over the image anyway.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lingo_mi.projectors.view import View
 
 
 def add_straddling(image: Any, gaussians: tuple, view: View, indices: Any) -> Any:
-    """Add to a cone-beam image, Float [height * width], the Gaussians of some indices, UInt32. Differentiable.
+    """Add the Gaussians at `indices`, UInt32, to a cone-beam image, Float [height * width]. Differentiable.
 
     gaussians   centres, scales, rotations and densities, as for `footprint.project`
     """

@@ -14,7 +14,7 @@ from lingo_mi.projectors.view import View
 def view_of(sensor: Any) -> View:
     """The rays through the pixel centres of the film of a flat `mi.Sensor`.
 
-    `ct_scanner`, `perspective` (with principal point offsets) and `orthographic` are known; pixels are those of the film's
+    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's
     crop window. Raises InputError for any other sensor.
     """
     if hasattr(sensor, 'frame'):

@@ -1,4 +1,4 @@
-"""Which Gaussians can be integrated, and which of them accurately."""
+"""Checks which Gaussians can be integrated, and which of them accurately."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from lingo_mi.errors import AccuracyWarning, InputError
 
-# In the scene's units: float32 runs out of range beyond, the projector's float64 out of digits.
+# In the scene's units. Beyond these, float32 overflows or the projector's float64 has too few digits.
 MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
 SAFE_ASPECT = 1e6
 
@@ -19,10 +19,10 @@ def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: 
     """Whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
 
     centre, scale, rotation, density   as for `footprint.project`
-    where                              what the Gaussians belong to, for the messages
+    where                              name of the cloud, for messages
 
-    Warns with AccuracyWarning and returns False where a Gaussian can be integrated, but not accurately. Raises InputError
-    where one cannot be: it is not finite, its quaternion is zero, or a scale is not positive or out of range.
+    Warns with AccuracyWarning and returns False if a Gaussian can be integrated, but not accurately. Raises InputError if
+    one cannot be integrated: it is not finite, its quaternion is zero, or a scale is not positive or out of range.
     """
     with dr.suspend_grad():
         shortest, longest = dr.min(scale), dr.max(scale)

@@ -1,4 +1,4 @@
-"""One flat-panel view as Dr.Jit values: what the projector kernels know of a sensor."""
+"""One flat-panel view as Dr.Jit values, for the projector kernels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lingo_mi.geometry.rays import Rays
 
 
 def vector64(xyz: Iterable[float]) -> Any:
-    """An opaque Array3f64 of three Python numbers: a literal would be compiled into the kernel."""
+    """An opaque Array3f64 of three Python numbers; literals would be compiled into the kernel."""
     Array3d, Float64 = mi.Vector3d, dr.value_t(mi.Vector3d)
     return Array3d(*(dr.opaque(Float64, float(x)) for x in xyz))
 
@@ -28,8 +28,8 @@ class View:
     source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
     width, height          pixels
     parallel               whether the beam is parallel
-    panel                  whether integrals end at the detector (a scanner) or run on (a camera, whose image plane is
-                           only a chart of directions); those of a parallel beam are never cut
+    panel                  whether integrals end at the detector (a scanner) or continue (a camera, whose image plane
+                           only defines directions); those of a parallel beam never end
     """
 
     source: Any

@@ -1,14 +1,14 @@
-"""A cloud of Gaussians sampled at the voxel centres of a grid, and the gradient of that.
+"""A cloud of Gaussians sampled at the voxel centres of a grid, and its gradient.
 
-sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2), the splat's machinery with one more dimension: a lane works
-on one line of voxels along x, and the whitened distance is a sum of three squares (a Cholesky factor), so that needles
-lose no digits:
+sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2). The method is that of the splat with one more dimension: a
+lane works on one line of voxels along x. The whitened distance is a sum of three squares (a Cholesky factor), so that
+needles lose no digits:
 
     |W delta|^2 = (m1 t)^2 + (m2 r)^2 + (m3 dz)^2,   r = dy + s3 dz,   t = dx + s1 dy + s2 dz
 
-As in the splat, t and r cancel where a needle leans. The kernels know where t = 0 and r = 0 on the lines through the
-centre (`ridge`, in voxels along x, and `spine`, along y) and take both from line to line in twice float32's digits.
-Likewise they sum derivatives by what stays small, t and r, and those by dy and dz follow in float64.
+As in the splat, t and r suffer cancellation for oblique needles. The kernels store where t = 0 and r = 0 on the lines
+through the centre (`ridge`, in voxels along x, and `spine`, along y). They follow both from line to line with twice float32's
+digits. Likewise they sum derivatives by t and r, which stay small; derivatives by dy and dz follow in float64.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s
 
 @dataclass
 class Grid:
-    """Voxels.
+    """A voxel grid.
 
-    corner    Vector3d, opaque: the outer corner of the first one
-    step      Vector3d, opaque: their size
-    shape     their number along x, y and z
-    sharing   how the work on them is shared out
+    corner    Vector3d, opaque: the outer corner of the first voxel
+    step      Vector3d, opaque: the voxel size
+    shape     voxels along x, y and z
+    sharing   how the work is shared out (see `balance`)
     """
 
     corner: Any
@@ -71,10 +71,10 @@ def voxelize(
 ) -> Any:
     """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
 
-    centre, scale, rotation, density   as for `footprint.project`; one that is not finite, has no extent or no rotation leaves
-                                       no finite voxel
+    centre, scale, rotation, density   as for `footprint.project`; if a Gaussian is not finite, or has a zero scale or
+                                       quaternion, all voxels become NaN
     extent                             cut-off in standard deviations
-    deep                               as for `splat.splat`
+    deep                               whether to use partial sums where many Gaussians overlap (see `depth`)
     """
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
@@ -97,7 +97,7 @@ def voxelize(
         size = [dr.maximum(end[i] - begin[i], 0) for i in range(3)]
         lines = dr.select(size[0] > 0, size[1] * size[2], 0)
         rest = (*middle, lines, begin[1], begin[2], size[1])
-        # An ellipsoid's voxels, or those of its box where they are fewer.
+        # Voxels of the ellipsoid or of its box, whichever are fewer.
         covered = mi.Float(dr.minimum(4 / 3 * dr.pi * extent**3 / (m1 * m2 * m3), Float64(lines) * Float64(size[0])))
         sound = dr.isfinite(dr.sum(p) + rho + m1 + m2 + m3)
     values = (
@@ -127,7 +127,9 @@ class _Voxelize(dr.CustomOp):
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
         lanes = grid.sharing.lanes
         blocks, cost = (mi.UInt32(rest[3]) + (lanes - 1)) // lanes, length // PACKET + SETUP
-        dr.eval(packed, places, blocks, cost, rest, covered)  # together: each alone would compute all Gaussians again
+        dr.eval(
+            packed, places, blocks, cost, rest, covered
+        )  # in one kernel: otherwise each would compute all Gaussians again
         self.work = Work.of(blocks, cost, grid.sharing)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(nx))
@@ -140,7 +142,7 @@ class _Voxelize(dr.CustomOp):
         out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
         dr.make_opaque(upstream, out)
         dr.eval(_collect(self.work.shares(), self.packed, upstream, out), out)
-        # The kernel's derivatives by y and z leave ridge and spine where they are; that by s1 leaves t at r = 0.
+        # The kernel's derivatives by y and z are at fixed ridge and spine; the one by s1 is at fixed t where r = 0.
         s1, s2, s3 = self.slopes
         by_s1, by_s2, by_s3, x, y, z = (type(s1)(v) for v in out[4:])
         slopes = by_s1 - s3 * by_s2, by_s2, by_s3
@@ -157,8 +159,8 @@ class _Packed:
     numbers   Float [16 N]
     places    Int32 [8 N]: column of the ridge, row, slice, lines; first row, first slice, rows, row of the spine
     extent2   Float, the cut-off squared
-    packets   Int32, of a line of voxels
-    rows      Int32, of a slice
+    packets   Int32, packets per line of voxels
+    rows      Int32, rows per slice
     """
 
     numbers: Any
@@ -168,18 +170,18 @@ class _Packed:
     rows: Any
 
     def load(self, g):
-        """The numbers and the places of Gaussian g, these in two parts."""
+        """The numbers of Gaussian g, and its places in two parts."""
         c = load(self.numbers, g, 4)
         return c, dr.gather(mi.Vector4i, self.places, 2 * g), dr.gather(mi.Vector4i, self.places, 2 * g + 1)
 
 
 def _line(c, w, v, index, f: _Packed):
-    """A line of voxels of a Gaussian: what is constant along it, where t is 0 (a column and a fraction), its span in
-    packets and its first packet."""
+    """A line of voxels of a Gaussian.
+
+    Returns its constants dz, r and m; where t is 0, as a column and a fraction; its packets [begin, end); its first packet.
+    """
     _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
-    rows_of_slice = dr.maximum(
-        v.z, 1
-    )  # a lane whose team is done reads 0, and an integer division by it kills the process
+    rows_of_slice = dr.maximum(v.z, 1)  # a lane of a finished team reads 0, and an integer division by 0 crashes
     y, z = v.x + index % rows_of_slice, v.y + index // rows_of_slice
     ny, nz = mi.Float(y - w.y), mi.Float(z - w.z)
     dz = nz - fz
@@ -200,7 +202,7 @@ def _line(c, w, v, index, f: _Packed):
 
 
 def _sum(a, b):
-    """a + b and what rounding took from it (Knuth)."""
+    """a + b and its rounding error (Knuth)."""
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
@@ -252,7 +254,7 @@ def _collect(share: Share, f: _Packed, upstream, out):
 
 
 def _add_line(sums, c, dz, r, moments):
-    """Add a line's part to the sums, from its moments in t: d/d(exponent's square) is -rho/2 times a moment."""
+    """Add a line's part to the sums, from its moments in t. A derivative by the squared distance is -rho/2 times a moment."""
     n0, n1, n2 = moments
     rho, m1, m2, m3, *_ = c
     a0, a1, a2 = -rho * n0, -rho * n1, -rho * n2

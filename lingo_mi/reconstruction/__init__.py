@@ -4,9 +4,9 @@
     found = reconstruct(scan, SART(niter=5))
     found.volume, found.residuals, found.seconds
 
-An algorithm is an object of its options, which are checked when it is made, and `run` makes a `Reconstruction` of a scan with
-it. `reconstruct` does the same after it has asked whether the scan sees the volume and the memory suffices. A variant of Mitsuba
-must be active.
+An algorithm is an object with its options, which are checked when it is created. Its `run` reconstructs a scan and returns a
+`Reconstruction`. `reconstruct` does the same, after it has checked that rays meet the volume and that there is enough memory.
+A Mitsuba variant must be active.
 """
 
 from lingo_mi.reconstruction.algorithm import Algorithm, Reconstruction

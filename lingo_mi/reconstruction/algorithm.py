@@ -1,4 +1,4 @@
-"""What every algorithm is, an object of options, and what it returns."""
+"""The interface of all algorithms, and their result."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import ArrayLike
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.scan import Scan
 
-# Called after every step as progress(steps done, steps, |A x - b| / |b| or None where an algorithm does not know it).
+# Called after every step as progress(steps done, all steps, |A x - b| / |b|). The last is None if an algorithm does not know it.
 Progress = Callable[[int, int, float | None], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A volume and how it was reached. `numpy.asarray` of it is the volume.
+    """A reconstructed volume with its convergence. `numpy.asarray` of it is the volume.
 
     volume      float32 [x, y, z], density per mm
     residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|); none for FDK
-    seconds     wall-clock time that it took
-    geometry    of the scan, whose voxels are those of the volume
+    seconds     wall-clock time
+    geometry    of the scan; its voxels are those of the volume
     """
 
     volume: np.ndarray
@@ -37,12 +37,12 @@ class Reconstruction:
 
 
 class Algorithm(ABC):
-    """A method of reconstruction: a frozen dataclass, whose fields are its options.
+    """A reconstruction method: a frozen dataclass with its options as fields.
 
-    What it works on, a scan and a start volume, are arguments of `run`, so that one object serves any number of scans. Options
-    are checked when the object is made.
+    The scan and the start volume are arguments of `run`, so one object serves any number of scans. Options are checked when the
+    object is created.
 
-    name   by which the command line and `ALGORITHMS` know it
+    name   on the command line and in `ALGORITHMS`
     """
 
     name: ClassVar[str]
@@ -51,13 +51,12 @@ class Algorithm(ABC):
     def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
         """Reconstruct the volume of a scan.
 
-        scan       projections, taken for line integrals, and geometry
-        start      volume [x, y, z] to start from, density per mm: an array or what gives one, such as another `Reconstruction`
-                   (default: zero)
+        scan       projections, treated as line integrals, and geometry
+        start      volume [x, y, z] to start from, density per mm: an array or another `Reconstruction` (default: zero)
         progress   called as progress(steps done, `steps`, residual) after every step
 
-        Nothing is asked of the machine or of the projections: `reconstruct` does. Raises InputError for a start that does not
-        fit the geometry, and where the result is not finite.
+        Does not check memory or projections; `reconstruct` does. Raises InputError for a start that does not fit the geometry,
+        and if the result is not finite.
         """
 
     @property
@@ -66,9 +65,9 @@ class Algorithm(ABC):
         return asdict(self)  # type: ignore[call-overload] - of a dataclass, which every algorithm is
 
     def steps(self, scan: Scan) -> int:
-        """How many steps `progress` is told of, at most."""
+        """The largest number of steps, for `progress`."""
         return self.options['niter']
 
     def grid(self, geometry: Geometry) -> Geometry:
-        """The geometry with the voxels that are worked on; those of the result are the geometry's own."""
+        """The geometry with the voxels that the algorithm works on. The result has the geometry's own voxels."""
         return geometry

@@ -1,4 +1,4 @@
-"""How the views of a scan lie around the circle."""
+"""Angular gaps between the views of a scan."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from lingo_mi.geometry.base import Geometry
 
 
 def gaps(geometry: Geometry, turn: float) -> tuple[np.ndarray, np.ndarray, bool]:
-    """The order of the views around the circle, the step after each in that order, and whether the circle is open.
+    """The order of the views around the circle, the gap after each in that order, and whether the arc is open.
 
-    Angles are taken modulo `turn`, radians. An open arc begins with the first view; the views at its ends stand for a typical
-    step.
+    Angles are taken modulo `turn`, radians. An open arc begins with the first view; the views at its ends represent a typical
+    gap.
     """
     angle = np.mod(geometry.angles, turn)
     order = np.argsort(angle, kind='stable')

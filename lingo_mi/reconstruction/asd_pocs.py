@@ -1,4 +1,4 @@
-"""ASD-POCS: SART steps towards the data, then steepest descent on total variation, in balance."""
+"""ASD-POCS: SART steps towards the data, balanced with steepest descent on total variation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lingo_mi.reconstruction.sart import passes, sweep
 from lingo_mi.reconstruction.system import System, dot, evaluated, norm, scalar
 from lingo_mi.scan import Scan
 
-EPSILON = 1e-8  # added to the squared gradient, relative to its largest value before a pass's descent: TV is not smooth at zero
+EPSILON = 1e-8  # added to squared gradients, relative to their largest value before a descent: TV is not smooth at zero
 LMBDA_MIN = 0.005
 
 
@@ -42,13 +42,13 @@ def _differences(volume, before):
 
 
 def tv_floor(volume: mi.Float, size: tuple[int, int, int]) -> mi.Float:
-    """What `tv_gradient` adds to squared gradients, a number on the device: `EPSILON` of the largest in the volume."""
+    """The `floor` for `tv_gradient`, on the device: `EPSILON` times the largest squared gradient of the volume."""
     before, _ = _neighbours(size)
     return evaluated(dr.maximum(EPSILON * dr.max(dr.squared_norm(_differences(volume, before))), 1e-30))
 
 
 def tv_gradient(volume: mi.Float, size: tuple[int, int, int], floor: mi.Float) -> mi.Float:
-    """Derivative of the total variation, mi.Float [voxels], times voxels' own unit.
+    """Derivative of the total variation, mi.Float [voxels], for voxels of side 1.
 
     TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + floor), with backward differences that are zero at the
     border (Sidky and Pan, equation 3). Voxels count as cubes.
@@ -76,35 +76,35 @@ def minimise_tv(volume: mi.Float, size: tuple[int, int, int], step: float, tvite
 
 @dataclass(frozen=True)
 class ASDPOCS(Algorithm):
-    """Adaptive steepest descent, projection onto convex sets: of the volumes that meet the data, one of little total variation.
+    """Adaptive steepest descent, projection onto convex sets: a volume that matches the data and has small total variation.
 
     Each pass P of `OSSART` towards the data is followed by `tviter` steps down the total variation TV,
 
         x  <-  P(x),        x  <-  x - step grad TV(x) / |grad TV(x)|,  tviter times
 
-    The first step is `alpha` times what the first P has changed. It shrinks by `alpha_red` wherever the descent changes the
-    volume by more than `rmax` of what P does, while the data are not met yet.
+    The first step is `alpha` times the change by the first P. As long as the data are not matched, the step shrinks by
+    `alpha_red` whenever the descent changes the volume by more than `rmax` times the change by P.
 
-    niter           passes over all views, from 1 on; fewer where it stops
-    blocksize       views an update of P (1: SART, else OS-SART)
+    niter           passes over all views, at least 1; it may stop earlier
+    blocksize       views per update of P (1: SART, else OS-SART)
     lmbda           relaxation of P, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
     lmbda_red       0 < lmbda_red <= 1
-    tviter          steps of steepest descent a pass, from 1 on
-    alpha           length of the first of them over the change by the first P, above 0
+    tviter          steps of steepest descent per pass, at least 1
+    alpha           length of the first of them, relative to the change by the first P, above 0
     alpha_red       factor on the length, 0 < alpha_red <= 1
-    rmax            change by descent over that by P, above 0
-    maxl2err        |A x - b| at which the data count as met, density times mm, from 0 on. None: 0.2 |A fdk(b) - b|, and 0 for
-                    scans that FDK does not know, so that the step shrinks wherever total variation changes too much
+    rmax            largest change by descent, relative to that by P, above 0
+    maxl2err        |A x - b| at which the data count as matched, density times mm, at least 0. None: 0.2 |A fdk(b) - b|; 0 for
+                    scans that FDK cannot reconstruct, so that the step shrinks whenever total variation changes too much
     noneg           whether P sets negative densities to zero
     OrderStrategy   of the blocks, see `OSSART`
-    exact_every     passes between corrections of the projections for what Joseph's projector is off (`System.correct`), before
-                    the first pass and after every so many; 0 for none
-    seed            of the random order, from 0 on
+    exact_every     passes between corrections for the error of Joseph's projector (`System.correct`), from the first pass on;
+                    0: no corrections
+    seed            of the random order, at least 0
 
-    It stops where the data are met and both parts of a pass undo each other (cosine below -0.99), or lmbda falls below 0.005.
-    The volume is the one after descent, as TIGRE's; the residuals are those before it.
+    It stops when the data are matched and both parts of a pass cancel (cosine below -0.99), or when lmbda falls below 0.005.
+    The volume is that after descent, as in TIGRE; the residuals are those before it.
 
-    Prefer it for few views of objects with large even regions. maxl2err says how well to meet noisy projections.
+    Use it for few views of objects with large uniform regions. For noisy projections, maxl2err sets how closely to match them.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
@@ -154,7 +154,7 @@ class ASDPOCS(Algorithm):
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `Algorithm.run` says; `weights` and `blur` of P are as of `OSSART.run`."""
+        """Reconstruct the volume of a scan, see `Algorithm.run`. `weights` and `blur` of P are as in `OSSART.run`."""
         began = time.perf_counter()
         order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
         system = System(scan, weights, blur)
@@ -187,7 +187,7 @@ class ASDPOCS(Algorithm):
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
 
     def _maxl2err(self, system: System, scan: Scan) -> float:
-        """|A x - b| at which the data count as met."""
+        """|A x - b| at which the data count as matched."""
         if self.maxl2err is not None:
             return self.maxl2err
         if not can_rectify(scan):

@@ -14,22 +14,22 @@ from lingo_mi.reconstruction.parameters import check_bound, check_counts
 from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
 from lingo_mi.scan import Scan
 
-VANISHED = 1e-13  # of the squared gradient over the first one: rounding, in float32
+VANISHED = 1e-13  # squared gradient, relative to the first one, that is rounding error in float32
 
 
 @dataclass(frozen=True)
 class CGLS(Algorithm):
-    """Least squares by conjugate gradients: each iteration makes |A x - b| smallest over one direction more.
+    """Least squares by conjugate gradients: each iteration minimises |A x - b| over one more direction.
 
     With the residual r = b - A x, its gradient s = A^T r and the direction p, s at first,
 
         x <- x + a p,  r <- r - a A p,  a = |s|^2 / |A p|^2,        p <- s + (|s|^2 / |s before|^2) p
 
-    niter   iterations, from 1 on: one projection and one backprojection of all views each
-    tol     stop when |A x - b| / |b| is no larger, from 0 on
+    niter   iterations, at least 1; each takes one projection and one backprojection of all views
+    tol     stop when |A x - b| / |b| <= tol; at least 0
 
-    It stops early where the gradient has vanished to rounding. Prefer it for many views, or where a plain least-squares solution
-    is wanted: no constraint holds it, so that densities may be negative, and late iterations fit the noise.
+    It stops early when the gradient is zero to rounding. Use it for many views, or for a plain least-squares solution. It has
+    no constraints: densities may be negative, and late iterations fit the noise.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train

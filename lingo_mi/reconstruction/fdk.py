@@ -46,7 +46,7 @@ BATCH = 4  # views a launch: shares the index arithmetic and the volume's memory
 
 
 def window_of(filter: str) -> Callable[[np.ndarray], np.ndarray]:
-    """One of `WINDOWS`, by its name or TIGRE's, which has _ for -. Raises InputError for an unknown one."""
+    """One of `WINDOWS`, by its name or TIGRE's (with _ in place of -). Raises InputError for an unknown one."""
     shape = WINDOWS.get(filter.replace('_', '-'))
     if shape is None:
         raise InputError(f'filter {filter!r} is unknown: use one of {", ".join(WINDOWS)}')
@@ -57,7 +57,7 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
     """Frequency response [size // 2 + 1] of the ramp for n pixels of size tau, zero-padded to twice as many.
 
     It is the transform of the sampled band-limited kernel h(0) = 1 / (4 tau^2), h(odd k) = -1 / (pi k tau)^2,
-    times tau: unlike a ramp sampled in frequency, it keeps the mean right.
+    times tau. Unlike a ramp sampled in frequency, it gives the right mean.
 
     Raises InputError for an unknown window.
     """
@@ -71,12 +71,12 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
 
 
 def view_weights(geometry: Geometry) -> np.ndarray:
-    """The angle that every view stands for, [view] radians: half the gaps to its neighbours on the circle.
+    """The angle that each view represents, [view] radians: half of both gaps to its neighbours on the circle.
 
-    Repeated views share their angle. A closed circle is seen twice by a cone beam, so its weights are halved and sum to
-    pi, as they do for half a turn. An open arc above half a turn is scaled to pi as a whole; `ray_weights` then tells rays
-    that were measured twice from those measured once. An arc below half a turn keeps its own angle (a limited-angle
-    scan lacks density).
+    Repeated views share their angle. On a closed circle, a cone beam measures every ray twice, so weights are halved and
+    sum to pi, as for half a turn. The weights of an open arc above half a turn are scaled to sum to pi; `ray_weights` then
+    separates rays that were measured twice from those measured once. An arc below half a turn keeps its own angle (a
+    limited-angle scan lacks density).
     """
     n = len(geometry)
     if n == 1:
@@ -89,7 +89,7 @@ def view_weights(geometry: Geometry) -> np.ndarray:
 
 
 def ray_weights(geometry: CircularGeometry) -> np.ndarray:
-    """Share of every ray among its repetitions, times their usual number: [view, u], or [1, u] where views agree.
+    """Weight of every ray among its repetitions, times their usual number: [view, u], or [1, u] if all views agree.
 
     short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
                        short scan convolution reconstruction for fanbeam CT", Med. Phys. 9 (1982), with the excess in
@@ -104,7 +104,7 @@ def ray_weights(geometry: CircularGeometry) -> np.ndarray:
     fan = np.arctan(u / geometry.DSD) if cone else u
     if _lacking(geometry):
         edge = n_u / 2 * d_u - abs(offset)
-        if edge <= 0:  # the axis is not seen: nothing is measured twice
+        if edge <= 0:  # the axis is outside the panel: no ray is measured twice
             return np.full((1, n_u), 2.0)
         overlap = np.arctan(edge / geometry.DSD) if cone else edge
         return 1 + np.sin(np.pi / 2 * np.clip(np.sign(offset) * fan / overlap, -1, 1))[None]
@@ -122,16 +122,16 @@ def ray_weights(geometry: CircularGeometry) -> np.ndarray:
 
 
 def _lacking(geometry: CircularGeometry) -> int:
-    """Columns that a panel lacks on its shorter side, where the other side is seen from behind: on a closed circle."""
+    """Columns missing on a panel's shorter side. Only on a closed circle, where opposite views measure those rays."""
     if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
         return 0
     return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
 
 
 def extended(scan: Scan) -> Scan:
-    """A scan of a closed circle with columns of zeros on the panel's shorter side, so that it reaches as far on both.
+    """A scan on a closed circle, padded with columns of zeros on the panel's shorter side, so that the panel is symmetric.
 
-    Filtering spreads what was measured there. Any other scan is returned as it is.
+    Filtering spreads measured values into these columns. Any other scan is returned unchanged.
     """
     geometry = require_circle(scan, NAME)
     lacking = _lacking(geometry)
@@ -163,7 +163,7 @@ def filtered(projections: np.ndarray, geometry: CircularGeometry, window: str = 
 
 
 def _add_views(volume, views, geometry):
-    """Adds views, each (image, matrix, weight), to the volume: bilinear, nothing outside the panel."""
+    """Add views, each (image, matrix, weight), to the volume: bilinear, zero outside the panel."""
     (n_v, n_u), (_, ny, nz) = geometry.nDetector, geometry.nVoxel
     index = dr.arange(mi.UInt, int(np.prod(geometry.nVoxel)))
     row = index // nz
@@ -188,9 +188,9 @@ def _add_views(volume, views, geometry):
 
 @dataclass(frozen=True)
 class FDK(Algorithm):
-    """Filtered backprojection, in one go: FDK for cone beams, its fan-beam form for one detector row, FBP for parallel beams.
+    """Filtered backprojection: FDK for cone beams, its fan-beam form for one detector row, FBP for parallel beams.
 
-    Each view is weighted by the cosine of its rays, convolved along its rows with the band-limited ramp h, and smeared back,
+    Each view is weighted by the cosine of its rays, convolved along its rows with the band-limited ramp h, and backprojected,
 
         f(x) = sum over views  dbeta / w^2  tau (h * [cosine p])(u(x), v(x))
 
@@ -199,12 +199,12 @@ class FDK(Algorithm):
     filter   apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth;
              TIGRE's 'ram_lak' and 'shepp_logan' are known too
 
-    Short scans (Parker) and panels beside the axis (Wang) are weighted, see `ray_weights`. What a panel that is turned or tilted
-    has measured is brought to an upright one first (`rectified`). The views together must see the whole width of the object;
-    truncated rows are filtered as they are. A voxel outside a view's panel gets nothing from that view, and with one detector
-    row only the slice in the plane of the fan is meaningful.
+    Short scans (Parker) and offset panels (Wang) are weighted, see `ray_weights`. Projections of a turned or tilted panel are
+    first resampled to an upright one (`rectified`). The views together must cover the whole width of the object; truncated
+    rows are filtered as they are. A view adds nothing to voxels outside its panel. With one detector row, only the slice in
+    the plane of the fan is meaningful.
 
-    Prefer it for hundreds of views, and where seconds count: few views leave streaks, and noise passes through the ramp.
+    Use it for hundreds of views, or if time is short. Few views cause streaks, and the ramp amplifies noise.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=90, pixels=48).train
@@ -226,10 +226,10 @@ class FDK(Algorithm):
         return len(scan)
 
     def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `Algorithm.run` says; `progress` is told of views, without residuals.
+        """Reconstruct the volume of a scan, see `Algorithm.run`. `progress` counts views; there are no residuals.
 
-        Raises InputError for a start, for a source that moves on no circle about z, a panel that moves against it, and pixels
-        that are not valid.
+        Raises InputError for a start volume, for a source that is not on a circle about z, for a panel that moves relative to
+        the source, and for invalid pixels.
         """
         if start is not None:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Memory that each algorithm takes at its peak, as tests/reconstruction/test_recon_memory.py measures it."""
+"""Peak memory of each algorithm, as measured by tests/reconstruction/test_recon_memory.py."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ NEEDS = {  # by the algorithms' names
 
 
 def needed(algorithm: str, geometry: Geometry, views: int) -> float:
-    """Bytes that an algorithm, one of `NEEDS`, takes at its peak: the larger of what works on volumes, beside two sets of
-    projections, and of what works on projections, beside a volume."""
+    """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus two sets of projections)
+    and of work on projections (plus one volume)."""
     volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes

@@ -6,7 +6,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 
-LARGE = 1e18  # of parameters without a bound of their own: what is above has no square in float32
+LARGE = 1e18  # upper bound of parameters without their own; float32 cannot hold the square of larger ones
 ORDERS = ('ordered', 'random', 'angularDistance')
 
 
@@ -30,6 +30,6 @@ def check_bound(name: str, value: float, high: float = LARGE) -> None:
 
 
 def check_order(order: str) -> None:
-    """Raises InputError for an OrderStrategy that is none of `ORDERS`."""
+    """Raises InputError for an OrderStrategy that is not in `ORDERS`."""
     if order not in ORDERS:
         raise InputError(f'OrderStrategy {order!r} is unknown: use one of {", ".join(ORDERS)}')

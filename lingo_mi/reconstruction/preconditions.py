@@ -1,4 +1,4 @@
-"""What reconstruction on voxels asks of a scan."""
+"""Requirements of voxel reconstruction on a scan."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lingo_mi.scan import Scan
 def is_circular(scan: Scan) -> bool:
     """Whether the source moves on a circle about z before an upright panel, and every pixel is valid.
 
-    `rectify.can_rectify` asks the same of a panel that is turned or tilted.
+    `rectify.can_rectify` also allows turned and tilted panels.
     """
     return isinstance(scan.geometry, CircularGeometry) and scan.valid is None
 
 
 def require_circle(scan: Scan, what: str) -> CircularGeometry:
-    """The geometry of a scan. Raises InputError, naming what needs it, for one that is not `is_circular`."""
+    """Raises InputError for a scan that is not `is_circular`. what: the method that needs it, for the message."""
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)
@@ -28,27 +28,27 @@ def require_circle(scan: Scan, what: str) -> CircularGeometry:
 
 
 def require_pixels(scan: Scan, what: str) -> None:
-    """Raises InputError, naming what needs them, where not all pixels are valid."""
+    """Raises InputError if a pixel is invalid. what: the method that needs valid pixels, for the message."""
     if scan.valid is not None:
         raise InputError(f'{what} needs every pixel, and some of this scan are not valid: fill them first')
 
 
 def require_rays(geometry: Geometry) -> None:
-    """Raises InputError where a source is in the volume, and where no view's rays meet it."""
+    """Raises InputError if a source is inside the volume, or if no ray of any view meets the volume."""
     rays, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
     if not rays.parallel and (np.abs(rays.source - centre) < half).all(1).any():
         raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
     corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector
     for view in range(len(geometry)):
         x, y = rays.project(corners, view)
-        # NaN are corners behind the source, which hide how far the others' shadow goes.
+        # NaN: corners behind the source. The extent of the shadow is then unknown.
         if 0 < np.isnan(x).sum() < len(x) or x.max() > 0 and x.min() < columns and y.max() > 0 and y.min() < rows:
             return
     raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')
 
 
 def require_signal(scan: Scan, purpose: str = 'reconstruct') -> None:
-    """Raises InputError for projections of nothing, which leave nothing to do for that purpose."""
+    """Raises InputError for empty projections. purpose: a verb, for the message."""
     if not scan.projections.any():
         raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')
     if scan.projections.max() <= 0:

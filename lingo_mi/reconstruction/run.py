@@ -1,4 +1,4 @@
-"""Algorithms run with what goes around them: checks before, a bar of progress during."""
+"""Runs algorithms, with checks before and a progress bar."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from lingo_mi.scene.checks import check_memory
 def reconstruct(
     scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs: Any
 ) -> Reconstruction:
-    """The volume of a scan by an algorithm, if this machine can hold it and the scan can give one.
+    """Reconstruct a scan with an algorithm, after checks of the memory and of the scan.
 
         found = reconstruct(scan, ASDPOCS(niter=20))
         better = reconstruct(scan, SART(niter=5), start=found)
 
-    scan       projections and geometry. Projections are taken for line integrals: take the effects of a detector out before
+    scan       projections and geometry. Projections must be line integrals: remove a detector's effects before
                (`effects_correction.linearised`)
     algorithm  with its options
     start      volume [x, y, z] to start from, density per mm (default: zero)
     progress   called as progress(steps done, steps, residual or None) after every step
     inputs     further arguments of this algorithm's `run`, such as `weights`, or `sample` and `completed` of `Refined`
 
-    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and where the result
+    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and if the result
     is not finite.
     """
     check_scan(scan.geometry, algorithm, max(len(scan), len(inputs.get('completed') or ())))
@@ -41,10 +41,10 @@ def reconstruct(
 
 
 def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
-    """Raises InputError where no ray meets the volume, where the source is in it, and where memory is too small.
+    """Raises InputError if no ray meets the volume, if the source is inside it, or if memory is too small.
 
-    algorithm   whose memory is asked for (None: the least that any needs)
-    views       that it works on (None: the geometry's own)
+    algorithm   to check memory for (None: the least that any algorithm needs)
+    views       number of views to reconstruct from (None: the geometry's own)
     """
     require_rays(geometry)
     views = views or len(geometry)
@@ -57,7 +57,7 @@ def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: in
 
 @contextmanager
 def progress_bar(algorithm: Algorithm, scan: Scan, label: str | None = None) -> Iterator[Progress]:
-    """A `progress` that is shown on standard error.
+    """A `progress` function that shows a bar on standard error.
 
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress)

@@ -45,11 +45,11 @@ from lingo_mi.scan import Scan
 
 
 def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Generator) -> list[np.ndarray]:
-    """The views [block][views of it] of one pass: blocks of consecutive views, in one of three orders.
+    """The view numbers [block][view] of one pass: blocks of consecutive views, in one of three orders.
 
-    order   'ordered'; 'random'; or 'angularDistance', which takes next the block that is farthest from all before (the most
-            distant on the circle, by the blocks' middle views)
-    rng     of the random order
+    order   'ordered'; 'random'; or 'angularDistance': next is the block farthest on the circle from all previous ones (by
+            the blocks' middle views)
+    rng     for the random order
 
     Raises InputError for an unknown order.
     """
@@ -69,7 +69,7 @@ def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Genera
 
 
 def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterator[list[np.ndarray]]:
-    """The `blocks` of one pass after another, without end."""
+    """The `blocks` of pass after pass, an endless iterator."""
     rng = np.random.default_rng(seed)
     blocks(
         angles, blocksize, order, rng
@@ -110,14 +110,14 @@ def sweep(
 
 @dataclass(frozen=True)
 class OSSART(Algorithm):
-    """Ordered-subset SART: an update of the volume after every block of views.
+    """Ordered-subset SART: the volume is updated after every block of views.
 
-    For the rows A_b of a block, with division by pixel and by voxel,
+    For the rows A_b of a block, with element-wise divisions,
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
-    niter           passes over all views, from 1 on
-    blocksize       views an update, from 1 on; the last block of a pass may have fewer
+    niter           passes over all views, at least 1
+    blocksize       views per update, at least 1; the last block of a pass may have fewer
     lmbda           relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
     lmbda_red       0 < lmbda_red <= 1
     noneg           whether negative densities are set to zero after every update
@@ -125,7 +125,7 @@ class OSSART(Algorithm):
     tol             stop when |A x - b| / |b| is no larger, from 0 on
     seed            of the random order, from 0 on
 
-    Prefer it to `SART` where there are many views: a pass takes fewer updates, and each averages over the noise of its views.
+    Use it instead of `SART` for many views: a pass has fewer updates, and each averages the noise of its views.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
@@ -165,10 +165,10 @@ class OSSART(Algorithm):
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `Algorithm.run` says.
+        """Reconstruct the volume of a scan, see `Algorithm.run`.
 
-        weights   of the voxels [x, y, z], from zero on: how readily each changes beside the others (default: all alike)
-        blur      of what a pass changes: standard deviations in voxels along x, y, z (default: none)
+        weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
+        blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
         """
         began = time.perf_counter()
         order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
@@ -187,13 +187,13 @@ class OSSART(Algorithm):
 
 @dataclass(frozen=True)
 class SART(Algorithm):
-    """Simultaneous algebraic reconstruction: an update of the volume after every view.
+    """Simultaneous algebraic reconstruction: the volume is updated after every view.
 
     The rule is that of `OSSART`, with the rows A_b of one view,
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
-    niter           passes over all views, from 1 on
+    niter           passes over all views, at least 1
     lmbda           relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
     lmbda_red       0 < lmbda_red <= 1
     noneg           whether negative densities are set to zero after every update
@@ -201,7 +201,7 @@ class SART(Algorithm):
     tol             stop when |A x - b| / |b| is no larger, from 0 on
     seed            of the random order, from 0 on
 
-    Prefer it for few clean views, to which few passes bring it close. With noise, take fewer passes or a smaller lmbda.
+    Use it for few clean views, which few passes match closely. With noise, use fewer passes or a smaller lmbda.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
@@ -245,20 +245,20 @@ class SART(Algorithm):
 
 @dataclass(frozen=True)
 class SIRT(Algorithm):
-    """Simultaneous iterative reconstruction: one update of the volume from all views at a time.
+    """Simultaneous iterative reconstruction: each update of the volume uses all views.
 
     The rule is that of `OSSART`, with all rows A,
 
         x  <-  max(x + lmbda (A^T W (b - A x)) / (A^T 1), 0),    W = 1 / (A 1)
 
-    niter       updates, from 1 on
+    niter       updates, at least 1
     lmbda       relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every update
     lmbda_red   0 < lmbda_red <= 1
     noneg       whether negative densities are set to zero after every update
     tol         stop when |A x - b| / |b| is no larger, from 0 on
 
-    Prefer it for noisy views: what it approaches is a least-squares solution, smoothly, at many times the passes of `SART`.
-    lmbda=1.9 with lmbda_red=1 goes fastest.
+    Use it for noisy views: it approaches a least-squares solution smoothly, with many times the passes of `SART`.
+    lmbda=1.9 with lmbda_red=1 is fastest.
 
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train

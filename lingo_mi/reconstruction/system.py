@@ -1,4 +1,4 @@
-"""The linear system A x = b of a scan on the device, which the iterative algorithms share."""
+"""The linear system A x = b of a scan on the device, used by all iterative algorithms."""
 
 from __future__ import annotations
 
@@ -19,17 +19,22 @@ from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.wide_pixels import Between
 from lingo_mi.scan import Scan
 
-PARTIAL = 4096  # terms of a sum that are added in float32
+PARTIAL = 4096  # terms of the partial sums in float32
 DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the projections'
 
 
 class System:
-    """A x = b of a scan: the projector `A`, the projections `b` (mi.Float [view, u, v]), density times mm: `measured`, or as
-    `correct` has shifted them. `weights` [x, y, z] of the voxels, where there are any, and `weighed` (mi.Float [view, u, v]), the
-    rays' integrals of them, and `blur` are for `sart.sweep`; `between` are the voxels that rays leave out (or None).
+    """A x = b of a scan. Images are mi.Float [view, u, v]; projections are density times mm.
 
-    The projector is Joseph's where the source moves on a circle before an upright panel; with other poses, and with pixels that
-    are not valid, which count for nothing, it is the exact one, two to three times slower (128^3 voxels, 20 views, CPU).
+    A          the projector
+    measured   the projections
+    b          the projections, `measured` or as corrected by `correct`
+    weights    of the voxels [x, y, z], for `sart.sweep`; `weighed`: their line integrals. None: no weights
+    blur       for `sart.sweep`
+    between    voxels that no ray crosses (`wide_pixels.Between`), or None
+
+    The projector is Joseph's if the source is on a circle, the panel upright and every pixel valid. Otherwise it is the exact
+    one, which is two to three times slower (128^3 voxels, 20 views, CPU) and ignores invalid pixels.
     """
 
     def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
@@ -57,7 +62,7 @@ class System:
     def start(self, volume: ArrayLike | None) -> mi.Float:
         """The start volume on the device: zero, or `volume` [x, y, z], density per mm.
 
-        Raises InputError where it does not fit the geometry or is not finite.
+        Raises InputError if it does not fit the geometry or is not finite.
         """
         if volume is None:
             x = dr.zeros(mi.Float, self.A.voxels)
@@ -67,33 +72,33 @@ class System:
 
     def _device(self, volume, name: str):
         volume = on_voxels(volume, self.geometry, name)
-        return evaluated(mi.Float(volume.ravel()) + scalar(0))  # a copy: the algorithms write into theirs
+        return evaluated(mi.Float(volume.ravel()) + scalar(0))  # a copy, because the algorithms write into it
 
     def residual(self, x: mi.Float) -> tuple[mi.Float, float]:
-        """b - A x of all views, and its norm over that of b."""
+        """b - A x of all views, and |b - A x| / |b|."""
         r = evaluated(self.b - self.A.forward(x, self.views)[0])
         return r, self.relative(r)
 
     def relative(self, r: mi.Float) -> float:
-        """The norm of a residual over that of b. Raises InputError where it is not finite."""
+        """The norm of a residual over that of b. Raises InputError if it is not finite."""
         value = norm(r) / self.size_b
         if not np.isfinite(value):
             raise InputError(DIVERGED)
         return value
 
     def correct(self, x: mi.Float) -> None:
-        """Shift b so that, at x, b - A x is what the *exact* line integrals of the trilinear interpolant lack.
+        """Shift b so that, at x, b - A x equals the residual of the *exact* line integrals of the trilinear interpolant.
 
-        Defect correction (Stetter, Numer. Math. 29, 1978): Joseph's projector is off by some .45 % (docs/benchmarks), which an
-        algorithm that meets the projections to less would otherwise turn into streaks. Costs two projections; nothing where
-        the projector is the exact one.
+        Defect correction (Stetter, Numer. Math. 29, 1978). Joseph's projector has an error of about 0.45 %
+        (docs/benchmarks/volumes.md), which causes streaks if an algorithm matches the projections more closely. Costs two
+        projections; does nothing for the exact projector.
         """
         if isinstance(self.A, Joseph):
             joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, ExactPair(self.geometry)))
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x: mi.Float) -> np.ndarray:
-        """A device volume as float32 [x, y, z]. Raises InputError where it is not finite."""
+        """A device volume as float32 [x, y, z]. Raises InputError if it is not finite."""
         volume = x.numpy().reshape(self.geometry.nVoxel)
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
@@ -101,18 +106,18 @@ class System:
 
 
 def evaluated(x: Any) -> mi.Float:
-    """An array of the device itself, computed now."""
+    """The array, evaluated on the device."""
     dr.eval(x)
     return x
 
 
 def scalar(x: float) -> mi.Float:
-    """A number that changes between iterations: a literal would be compiled into the kernel."""
+    """An opaque number, for values that change between iterations; a literal would be compiled into the kernel."""
     return dr.opaque(mi.Float, float(x))
 
 
 def dot(a: mi.Float, b: mi.Float) -> float:
-    """Inner product: sums of 4096 terms in float32, these in float64."""
+    """Inner product: partial sums of 4096 terms in float32, their sum in float64."""
     return float(dr.block_sum(a * b, min(PARTIAL, dr.width(a))).numpy().sum(dtype=np.float64))
 
 
@@ -122,7 +127,7 @@ def norm(a: mi.Float) -> float:
 
 
 def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
-    """A volume as float32 [x, y, z]. Raises InputError where it does not fit the geometry or is not finite."""
+    """A volume as float32 [x, y, z]. Raises InputError if it does not fit the geometry or is not finite."""
     volume = np.ascontiguousarray(volume, np.float32)
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')

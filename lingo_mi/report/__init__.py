@@ -1,1 +1,1 @@
-"""The report of a result: figures, and the page that holds them."""
+"""The report of a result: figures and an HTML page."""

@@ -1,10 +1,10 @@
 """Figures of a reconstruction, drawn with matplotlib's objects (no pyplot, no display, no global state).
 
-A section is a function draw(figure, data) with a height for a given width; `sections` lists those for which a
-`lingo_mi.report.page.ReportData` has something to show, and `overview` puts them on one sheet.
+A section is a function draw(figure, data) with a height for a given width. `sections` lists those for which a
+`lingo_mi.report.page.ReportData` has content, and `overview` puts them on one sheet.
 
-Orientation. Slices are seen as on paper: x to the right and y up (axial), x to the right and z up (coronal),
-y to the right and z up (sagittal). Views are seen as on the detector: u to the right, v down.
+Orientation of slices: x to the right and y up (axial), x to the right and z up (coronal), y to the right and z up
+(sagittal). Orientation of views: u to the right, v down.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PLANES = {2: ('Axial', 'x', 'y', 'z'), 1: ('Coronal', 'x', 'z', 'y'), 0: ('Sagit
 DIFFERENCE = 'RdBu_r'
 COLOURS = {'loss': '#444444', 'psnr_2d': '#1f77b4', 'psnr_3d': '#d6641e', 'gaussians': '#2a7f4f'}
 PADS = {'w_pad': 0.1, 'h_pad': 0.06}  # inches around everything
-MOST_POINTS = 30_000  # more than a scatter plot can show
+MOST_POINTS = 30_000  # of a scatter plot; more cannot be distinguished
 STYLE: dict = {
     'font.size': 10,
     'axes.titlesize': 10.5,
@@ -62,19 +62,19 @@ def bounds(shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike) -> Any:
 
 
 def richest(volume: np.ndarray, axis: int) -> int:
-    """The index along `axis` of the slice with the largest energy (sum of squares), amid its plateau."""
+    """The index along `axis` of the slice with the largest energy (sum of squares); the middle of a plateau."""
     energy = np.array([np.square(s, dtype=np.float64).sum() for s in np.moveaxis(volume, axis, 0)])
     best = np.flatnonzero(energy >= 0.999 * energy.max())
     return int(best[len(best) // 2])
 
 
 def planes(shape: Sequence[int]) -> list[int]:
-    """The axes whose slices are images, not lines: in a single-slice volume its thin side alone."""
+    """The axes across which slices are images, not lines. For a single-slice volume, only its thin axis."""
     return [axis for axis in (2, 1, 0) if min(n for i, n in enumerate(shape) if i != axis) > 1] or [2]
 
 
 def series(history: list[dict], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a curve: the entries of `history` in which both quantities are finite numbers."""
+    """The points of a curve: the entries of `history` with finite numbers for both quantities."""
     points = [(float(h[x]), float(h[y])) for h in history if h.get(x) is not None and h.get(y) is not None]
     points = np.array(points, float).reshape(-1, 2)
     points = points[np.isfinite(points).all(1)]
@@ -82,7 +82,7 @@ def series(history: list[dict], x: str, y: str) -> tuple[np.ndarray, np.ndarray]
 
 
 def grey_range(*arrays: Any) -> tuple[float, float]:
-    """One grey scale for all: from 0 (or lower) to the 99.9th percentile, both by the last array."""
+    """A common grey scale: from 0 (or lower) to the 99.9th percentile, both of the last array."""
     reference = arrays[-1]
     low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))
     return low, high if high > low else max(low + 1e-6, *(float(a.max()) for a in arrays))
@@ -99,7 +99,7 @@ class Section:
     draw: Callable
     height: Callable[[float], float]
     caption: str
-    wide: bool = False  # takes a row of the overview for itself
+    wide: bool = False  # takes a whole row of the overview
 
 
 def sections(data: Any) -> list[Section]:
@@ -155,7 +155,7 @@ def sections(data: Any) -> list[Section]:
 
 
 def draw_slices(fig: Any, data: Any) -> None:
-    """Orthogonal slices: rows reconstruction, truth, difference; a single-slice volume in one row."""
+    """Orthogonal slices, in rows: reconstruction, truth, difference. A single-slice volume takes one row."""
     shape, axes = data.shape, planes(data.shape)
     reference = data.volume if data.truth is None else data.truth
     index = {axis: richest(reference, axis) for axis in axes}
@@ -206,7 +206,7 @@ def draw_slices(fig: Any, data: Any) -> None:
 
 
 def draw_views(fig: Any, data: Any) -> None:
-    """Held-out views: columns of rendered, measured, difference; line plots where the detector is one row."""
+    """Held-out views, in columns: rendered, measured, difference. Line plots for a detector of one row."""
     chosen = _spread(len(data.views), 3)
     titles = [f'View at {data.views_angles[i]:.4g}°' for i in chosen]
     (nv, nu), (dv, du) = data.views.shape[1:], data.pixel
@@ -277,7 +277,7 @@ def _draw_lines(fig, data, chosen, titles):
 
 
 def draw_cloud(fig: Any, data: Any) -> None:
-    """The Gaussians' centres, seen along z and along y (along z alone for a single-slice volume)."""
+    """The Gaussians' centres, seen along z and along y (only along z for a single-slice volume)."""
     centres, density = data.cloud_centres, data.cloud_density
     if len(centres) > MOST_POINTS:
         keep = np.random.default_rng(0).choice(len(centres), MOST_POINTS, replace=False)
@@ -286,7 +286,7 @@ def draw_cloud(fig: Any, data: Any) -> None:
     centres, density = centres[order], density[order]
     axes = _cloud_planes(data)
     grid = fig.subplots(1, len(axes), squeeze=False)[0]
-    # A few very dense Gaussians would leave the rest one colour.
+    # Otherwise a few very dense Gaussians would give all others one colour.
     top = float(np.percentile(density, 99)) or None
     for ax, axis in zip(grid, axes):
         extent = plane_extent(data.shape, data.spacing, data.centre, axis)
@@ -319,7 +319,7 @@ def draw_cloud(fig: Any, data: Any) -> None:
 
 
 def draw_curves(fig: Any, data: Any) -> None:
-    """Loss, PSNR and Gaussian count against iterations and against seconds, as far as they are known."""
+    """Loss, PSNR and number of Gaussians against iterations and against seconds, if known."""
     rows = [('Loss', ['loss']), ('PSNR [dB]', ['psnr_2d', 'psnr_3d']), ('Gaussians', ['gaussians'])]
     names = {'psnr_2d': '2D, held-out views', 'psnr_3d': '3D, volume'}
     columns = [('iteration', 'iteration'), ('seconds', 'time [s]')]
@@ -391,7 +391,7 @@ def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> b
         parts[0].text(0.5, 0.2, headline, ha='center', va='center', fontsize=13, color='#333333')
         for part, row, own, height in zip(parts[1:], rows, heights, tallest):
             for sub, section, h in zip(np.ravel(part.subfigures(1, len(row), wspace=0.03)), row, own):
-                if h < 0.9 * height:  # keep to the top what is less tall than its neighbour
+                if h < 0.9 * height:  # align a lower section with the top of its neighbour
                     sub = sub.subfigures(2, 1, height_ratios=[h, height - h])[0]
                 sub.suptitle(section.name, fontsize=13, weight='bold')
                 section.draw(sub, data)

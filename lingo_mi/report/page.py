@@ -1,4 +1,4 @@
-"""The report of a reconstruction: a picture (report.png) and a page that needs nothing else (report.html)."""
+"""The report of a reconstruction: a picture (report.png) and a self-contained page (report.html)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.report import figures
 
-# Key of `ReportData.metrics`: what a reader calls it, unit, format.
+# Key of `ReportData.metrics`: label, unit, format.
 QUALITY = {
     'psnr_3d': ('PSNR 3D, peak 1', 'dB', '.2f'),
     'ssim_3d': ('SSIM 3D, mean over the slices of the three axes', '', '.4f'),
@@ -56,13 +56,13 @@ HEADLINE = {
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """What a report shows. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
+    """The contents of a report. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
 
     title           of the report
-    metrics         the numbers, by the keys of QUALITY and SETTINGS; None and NaN read as 'n/a', other scalar
-                    entries join the settings. `history` is a list of dicts with `iteration`, `seconds`,
-                    `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
-    volume          [x, y, z] density, 1/mm; None where the cloud makes none
+    metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are shown as 'n/a'; other scalar
+                    entries are listed with the settings. `history` is a list of dicts with `iteration`,
+                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
+    volume          [x, y, z] density, 1/mm; None for a cloud without densities
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
@@ -72,10 +72,10 @@ class ReportData:
     views_angles    [n] degrees
     pixel           size of a detector pixel, (v, u), mm
     cloud_centres   [N, 3] centres of the Gaussians, mm
-    cloud_density   [N] density at their centres, 1/mm, or what `cloud_unit` names instead
-    command         the command line that makes this result again
+    cloud_density   [N] density at their centres, 1/mm, or the quantity that `cloud_unit` names
+    command         the command line that reproduces this result
 
-    Raises InputError where shapes do not fit or an image holds NaN or infinity.
+    Raises InputError if shapes do not fit or an image holds NaN or infinity.
     """
 
     title: str
@@ -134,9 +134,9 @@ class ReportData:
 
 
 def write_report(folder: PathLike | str, data: ReportData) -> Path:
-    """Write report.png and report.html into `folder`, made where missing. Returns the path of report.html.
+    """Write report.png and report.html into `folder`, which is created if missing. Returns the path of report.html.
 
-    The page embeds its pictures and loads nothing: it can be mailed or opened without a network.
+    The page embeds its pictures and loads nothing, so it can be mailed or opened without a network.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +147,7 @@ def write_report(folder: PathLike | str, data: ReportData) -> Path:
 
 
 def headline(metrics: dict) -> str:
-    """The main numbers with their units on one line; those that are missing or NaN are left out."""
+    """The main numbers with units on one line, without missing ones and NaN."""
     shown = [(text, _value(key, metrics.get(key))) for key, text in HEADLINE.items()]
     return '   ·   '.join(text.format(value) for text, value in shown if value != 'n/a')
 

@@ -1,1 +1,1 @@
-"""What a fit leaves behind: its numbers (`measure`), its files (`save`), its scene (`scene_file`)."""
+"""Results of a fit: its numbers (`measure`), its files (`save`), its scene (`scene_file`)."""

@@ -35,11 +35,11 @@ def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
 class Measured:
     """A finished fit, measured.
 
-    numbers   by name; None where there is no truth to compare with
-    volume    float32 [x, y, z], density per mm; None where the fit makes none
-    truth     what it should be; None where that is not known
-    test      views that were held out; None where there are none
-    views     the same as the fit renders them, float32 [view, v, u]
+    numbers   by name; None if there is no truth to compare with
+    volume    float32 [x, y, z], density per mm; None for alpha compositing
+    truth     the true volume; None if unknown
+    test      held-out views; None if there are none
+    views     the same views, rendered from the fit, float32 [view, v, u]
     """
 
     numbers: dict
@@ -50,9 +50,9 @@ class Measured:
 
 
 def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None = None) -> Measured:
-    """The volume and the held-out views of a finished fit, and its numbers.
+    """Measure a finished fit: its volume, its held-out views and its numbers.
 
-    test    views that were held out
+    test    held-out views
     truth   the true density in 1/mm, [x, y, z], on the grid of the fit's geometry
     """
     born = fitted.state.values['centre'][fitted.state.born]
@@ -84,7 +84,7 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
 
 
 def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:
-    """PSNR and SSIM of a volume, in both of their forms; None where there is nothing to compare, or no number."""
+    """PSNR and SSIM of a volume, each in both forms; None if there is nothing to compare or the value is not finite."""
     names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
     if volume is None or truth is None:
         return dict.fromkeys(names)
@@ -105,7 +105,7 @@ def summary(result: dict) -> str:
 
 
 def volume_quality(result: dict) -> str:
-    """The lines of a volume's numbers (`compared`): for densities in any unit first, then R2-Gaussian's, for those up to 1."""
+    """A volume's numbers (`compared`) as lines: first for densities in any unit, then R2-Gaussian's, for densities up to 1."""
     return (
         f'volume          {_shown(result, "psnr_3d_absolute", "ssim_3d_absolute")} (full scale: the largest true density)\n'
         f'                {_shown(result, "psnr_3d", "ssim_3d")} (full scale: 1, as in R2-Gaussian)'
@@ -113,12 +113,12 @@ def volume_quality(result: dict) -> str:
 
 
 def comparable(rendered: np.ndarray, test: Scan) -> np.ndarray:
-    """Rendered views [view, v, u] with the pixels that were not measured at zero, as in the scan."""
+    """Rendered views [view, v, u] with invalid pixels at zero, as in the scan."""
     return rendered if test.valid is None else np.where(test.valid, rendered, np.float32(0))
 
 
 def _number(x: float):
-    """A number for JSON, which has neither NaN nor infinity, or None."""
+    """A number for JSON, or None for NaN and infinity, which JSON does not have."""
     return x if np.isfinite(x) else None
 
 

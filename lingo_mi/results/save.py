@@ -1,4 +1,4 @@
-"""What a fit leaves behind: volume, cloud, scene, views, measurements, report."""
+"""The files of a fit: volume, cloud, scene, views, measurements, report."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ from lingo_mi.results.scene_file import write_scene
 def save(
     folder: Path, fitted: Fitted, measured: Measured, *, title: str = 'fit', method: str = '', command: str = ''
 ) -> dict:
-    """Write everything into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
-    `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it tells a complete result.
+    """Write all files into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
+    `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it marks a complete result.
 
-    folder     which is there already
-    measured   of the fit
+    folder     an existing folder
+    measured   the measured fit
     title      of the report
-    method     the recipe's name, and command: what makes the result again; both for metrics.json and the report
+    method     the recipe's name, for metrics.json and the report
+    command    the command line that reproduces the result, for the same
 
-    A fit by alpha compositing has no volume, and no integrator renders a scene of its cloud: it leaves neither.
-    Raises InputError where a file cannot be written.
+    For alpha compositing there is no volume, and no scene, because no integrator renders it.
+    Raises InputError if a file cannot be written.
     """
     geometry, cloud = fitted.geometry, fitted.world_gaussians()
     if measured.volume is None:
@@ -71,7 +72,7 @@ def save(
 
 
 def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
-    """What the report of a measured fit shows."""
+    """The contents of a measured fit's report."""
     geometry, test = fitted.geometry, measured.test
     held_out = {}
     if test is not None:
@@ -96,7 +97,7 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
 
 
 def _write_views(folder: Path, rendered: np.ndarray):
-    """One image a view, in place of those of an earlier result."""
+    """Write one image per view; those of an earlier result are removed."""
     folder.mkdir(exist_ok=True)
     for stale in folder.glob('*.exr'):
         stale.unlink()
@@ -105,7 +106,7 @@ def _write_views(folder: Path, rendered: np.ndarray):
 
 
 def _corrections(fitted: Fitted) -> dict:
-    """How the fit moved the views about the volume's centre, if it did: rotation vectors and shifts of every view."""
+    """Corrections of the views' poses, if the fit has any: rotation vectors and shifts about the volume's centre."""
     poses = fitted.poses
     if poses is None:
         return {}
@@ -116,7 +117,7 @@ def _corrections(fitted: Fitted) -> dict:
 
 
 def versions() -> dict:
-    """Versions of what computed a result."""
+    """Versions of the software that computed a result."""
     return dict(
         python=platform.python_version(),
         **{name: version(name) for name in ('lingo_mi', 'mitsuba', 'drjit', 'numpy', 'scipy', 'scikit-image')},

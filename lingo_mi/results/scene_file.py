@@ -12,10 +12,10 @@ from lingo_mi.scene.description import describe
 
 
 def write_scene(path: Path, geometry: Geometry, extent: float, effects: Effects | None = None) -> None:
-    """A scene that renders the fitted cloud with the scan's own scanner; needs only `import lingo_mi`.
+    """Write a scene that renders the fitted cloud with the scan's own scanner. It needs only `import lingo_mi`.
 
-    effects   of the scan that the fit has modelled: the scene then has their tube, and a detector without noise, so that it
-              renders what the fit compared with the scan
+    effects   the scan's effects that the fit has modelled. The scene then has their tube and a noise-free detector, so that
+              it renders the images that the fit compared with the scan
     """
     lines = [
         '<scene version="3.0.0">',

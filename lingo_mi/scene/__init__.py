@@ -1,1 +1,1 @@
-"""From a Mitsuba scene to a scan: load, check, simulate, and the truth on voxels."""
+"""From a Mitsuba scene to a scan: load, check, simulate, and sample the true volume."""

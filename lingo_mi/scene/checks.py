@@ -1,4 +1,4 @@
-"""What is refused, or warned of, before a scan is made or read."""
+"""Checks before a scan is simulated or read."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from lingo_mi.memory import room
 
 
 def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0) -> None:
-    """Refuse, before anything is allocated, a scan that this process cannot hold.
+    """Raises InputError, before anything is allocated, for a scan that does not fit into this process's memory.
 
-    views    of all geometries together (0: as many as they have)
-    needed   bytes that an algorithm takes at its peak (0: the least there is, the voxels as read, fitted and compared, and the
+    views    of all geometries together (0: the views that they have)
+    needed   peak memory of an algorithm, bytes (0: the least, which is the volume as read, fitted and compared, and the
              projections as measured and rendered)
     """
     known = [g for g in geometries if g is not None]
@@ -32,7 +32,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
 
 
 def warn_if_truncated(geometry: Geometry) -> None:
-    """Say so where the volume's midplane is wider than what the panels see of it."""
+    """Warn if the volume's midplane is wider than the panels' field of view."""
     rays, centre = geometry.rays(), np.array(geometry.offOrigin)
     widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]
     cut = 0

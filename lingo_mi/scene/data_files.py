@@ -1,4 +1,4 @@
-"""Where the data files lie that a scene names."""
+"""Locations of the data files that a scene names."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from lingo_mi.errors import InputError
 
 
 def data_file(name: str, parameter: str) -> str:
-    """The path of a file that a scene names: beside the scene or here, else in the folder that LINGO_MI_DATA names.
+    """The path of a file that a scene names: next to the scene or in the working folder, else in the folder LINGO_MI_DATA.
 
-    parameter   the scene's `<default>` by which a user can name another file, for the message
+    parameter   the scene's `<default>` that sets the file, for the message
 
-    Raises InputError, in one line, where there is no such file.
+    Raises InputError, in one line, if there is no such file.
     """
     resolver: Any = mi.file_resolver  # declared as an object
     found = Path(str(resolver().resolve(name)))

@@ -79,7 +79,7 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
 
 
 def parameter(props: Any, name: str, default: T) -> T:
-    """A property of the kind of its default: a string, a whole number or a finite number."""
+    """A property with the type of its default: a string, a whole number or a finite number."""
     value = props.get(name, default)
     kind, wanted = {str: (str, 'text'), int: (int, 'a whole number'), float: ((int, float), 'a number')}[type(default)]
     if not isinstance(value, kind) or isinstance(value, bool) or (wanted == 'a number' and not np.isfinite(value)):

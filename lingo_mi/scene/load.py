@@ -1,4 +1,4 @@
-"""From a scene to a scan: load it, find its scanner, render or read every view, sample the true volume."""
+"""Loads a scene and finds its scanner."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lingo_mi.scene.checks import check_memory
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A scene (`mi.Scene`), its scanner (the plugin `ct_scanner`) and where they came from."""
+    """A scene, its scanner and their origin."""
 
     scene: Any
     scanner: Any
@@ -44,7 +44,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
             f'it has {", ".join(sorted(defaults(path))) or "none"}'
         )
     try:
-        # By one thread: with several, Mitsuba has failed to make a plugin (bad_alloc in a gridvolume) once in thousands.
+        # With one thread: with several, Mitsuba rarely fails to create a plugin (bad_alloc in a gridvolume, 1 in thousands).
         scene = mi.load_file(str(path), parallel=False, **(parameters or {}))
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
         raise InputError(f'{path}: {plain(error)}') from None
@@ -62,7 +62,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
 
 
 def defaults(path: PathLike | str) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError where the file is missing or no XML."""
+    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no XML."""
     if not Path(path).is_file():
         raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')
     try:
@@ -72,14 +72,14 @@ def defaults(path: PathLike | str) -> set[str]:
 
 
 def plain(error: Exception) -> str:
-    """The one line of an error that a user needs: ours if a plugin raised it, with the element's line, else the gist of
-    Mitsuba's."""
+    """The one line of an error that helps the user: a plugin's own message with the element's line, else the core of
+    Mitsuba's message."""
     text = str(error)
     ours = re.findall(r'InputError: (.*)', text)
     if ours:
         lines = re.findall(r'\(line (\d+), col \d+\)', text)
         return (f'line {lines[-1]}: ' if lines else '') + ours[-1].strip()
-    if '"ellipsoids"' in text and '(sizes: 0, 1)' in text:  # what becomes of no Gaussians in Mitsuba
+    if '"ellipsoids"' in text and '(sizes: 0, 1)' in text:  # Mitsuba's message for an empty cloud
         return 'the shape ellipsoids holds no Gaussian: give it a file or data of at least one'
     text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]

@@ -16,11 +16,11 @@ def scenes() -> dict[str, Path]:
 
 
 def scene_path(scene: PathLike | str) -> Path:
-    """The file of a scene: `scene` itself if there is such a file, else the shipped scene of that name.
+    """The file of a scene: `scene` itself if it is a file, else the shipped scene of that name.
 
-    A folder is no file: results in a folder `x3d_foot` do not hide the scene of that name.
+    Folders do not count: a result folder `x3d_foot` does not hide the scene of that name.
 
-    Raises InputError where there is neither; a folder of another name is left to whoever reads it to refuse.
+    Raises InputError if there is neither; a folder of another name is left to whoever reads it to refuse.
     """
     path = Path(scene)
     if path.is_file():

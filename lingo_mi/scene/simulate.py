@@ -1,4 +1,4 @@
-"""From a scene to a scan: every view of its objects rendered, or its measured projections, chosen."""
+"""From a scene to a scan: renders all views of its objects, or takes its measured projections, and chooses views."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from lingo_mi.scene.truth import ScannedVolume, fills_grid, true_volume
 
 
 def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None, seed: int = 0) -> Dataset:
-    """The scan of a scene: measured projections if the scanner has them, else every view rendered, with a progress bar.
+    """The scan of a scene: its measured projections if the scanner has any; otherwise all views are rendered.
 
-    views    how many to fit, evenly spaced among the scanner's (0: all of them)
+    views    number of views to fit, evenly spaced among the scanner's (0: all)
     volume   `files.volumes.Volume` to scan instead of the scene's objects
-    seed     of the detector's noise, where the scene has one with noise
+    seed     of the detector's noise, if it has any
 
-    The views held out are the scanner's test views, or, if it has none, those left over. The true volume is given
-    where it is known on the scanner's grid.
+    Held-out views are the scanner's test views, or the remaining views if it has none. The data set has the true volume if
+    that is known on the scanner's grid.
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:
@@ -40,7 +40,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None,
         warn_if_truncated(dataset.train.geometry)
         return dataset
     geometry, test = scanner.geometry, scanner.test_geometry
-    if views:  # before the work, not after
+    if views:  # fails early
         spread(len(geometry), views)
     effects = find_effects(loaded.scene, scanner)
     if volume is not None:
@@ -55,7 +55,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None,
             raise InputError(f'{loaded.path}: {error}') from None
     warn_if_truncated(geometry)
     keys = np.arange(len(geometry) + (len(test) if test is not None else 0))
-    if views and test is not None:  # unused views are needed only where nothing else is held out
+    if views and test is not None:  # unused views are needed only if there are no test views
         chosen = spread(len(geometry), views)
         keys = np.concatenate([chosen, keys[len(geometry) :]])
         geometry = geometry.subset(chosen)
@@ -73,7 +73,7 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None,
 
 
 def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
-    """Measured projections as the tube and the detector of a scene saw them."""
+    """The data set with the effects of the scene's tube and detector."""
     effects = find_effects(loaded.scene, loaded.scanner)
     return replace(
         dataset,
@@ -83,7 +83,7 @@ def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
 
 
 def choose_views(dataset: Dataset, views: int) -> Dataset:
-    """A data set with `views` evenly spaced views to fit (0: all); those left over are held out if none were before."""
+    """A data set with `views` evenly spaced views to fit (0: all). The others are held out if there are no held-out views."""
     train, test, volume = dataset.train, dataset.test, dataset.volume
     if not views or views == len(train):
         return dataset
@@ -123,7 +123,7 @@ def render_with(
     seed: int,
     extent: float = cutoff.SIMULATE,
 ) -> np.ndarray:
-    """`render_objects` as a detector measures it; keys are those of the views' noise."""
+    """`render_objects` as measured by a detector. keys: keys of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
     rays = geometry.rays()

@@ -1,4 +1,4 @@
-"""The density of objects on the voxels of a scanner's grid: the truth that volumes are compared with."""
+"""The true density of objects on the voxels of a scanner's grid, the reference for volumes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lingo_mi.projectors.sampling import on_grid
 
 
 def true_volume(objects: Iterable, geometry: Geometry) -> np.ndarray | None:
-    """The true density on the scanner's grid [x, y, z], where every object can be sampled on it."""
+    """The true density on the scanner's grid [x, y, z]; None if an object cannot be sampled on it."""
     total = np.zeros(geometry.nVoxel, np.float32)
     corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
     for thing in objects:
@@ -27,7 +27,7 @@ def true_volume(objects: Iterable, geometry: Geometry) -> np.ndarray | None:
 
 
 def fills_grid(thing: GridInCube, geometry: Geometry) -> bool:
-    """Whether a grid is the scanner's own."""
+    """Whether an object's grid is the scanner's own."""
     centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
     return (
         tuple(thing.size) == geometry.nVoxel

@@ -1,6 +1,6 @@
-"""What accuracy costs: error, time and memory of every way to compute the same projections, and of fits.
+"""The cost of accuracy: error, time and memory of all ways to compute the same projections, and of fits.
 
-`measure` runs it all on fixed seeds in this process and gives plain numbers; `report.write` makes tables and plots of them.
+`measure` runs everything with fixed seeds in this process and returns plain numbers. `report.write` makes tables and plots.
 
     report.write(measure(QUICK), Path('out/accuracy'), figures=Path('out/accuracy'))
 """

@@ -1,4 +1,4 @@
-"""Ways to compute an image and its derivatives: one function a table."""
+"""Ways to compute an image and its derivatives: one function per table."""
 
 from __future__ import annotations
 

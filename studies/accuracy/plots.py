@@ -1,4 +1,4 @@
-"""The plots of what `accuracy.measure` found."""
+"""Plots of the results of `accuracy.measure`."""
 
 from __future__ import annotations
 

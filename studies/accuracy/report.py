@@ -1,4 +1,4 @@
-"""What `accuracy.measure` found, written down: numbers, tables, plots, and how they were made."""
+"""The report of `accuracy.measure`: numbers, tables, plots and their provenance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much the measurements measure."""
+"""Sizes of the measurements."""
 
 from __future__ import annotations
 

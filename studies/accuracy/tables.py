@@ -1,4 +1,4 @@
-"""The Markdown tables of what `accuracy.measure` found."""
+"""Markdown tables of the results of `accuracy.measure`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cloud that images are measured on."""
+"""The cloud for measurements of images."""
 
 from __future__ import annotations
 

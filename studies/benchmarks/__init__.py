@@ -1,1 +1,1 @@
-"""Times against others: the integrator against a hand-written kernel and Mitsuba's tree, voxels against RTK and diffct."""
+"""Comparisons of time: the integrator with a hand-written kernel and Mitsuba's tree, voxel methods with RTK and diffct."""

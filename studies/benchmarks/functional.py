@@ -1,10 +1,10 @@
-"""What the way through PyTorch costs: `functional.project` and its derivatives over the same in Dr.Jit, in turns.
+"""Overhead of PyTorch: time of `functional.project` and its derivatives, relative to the same in Dr.Jit.
 
     python -m lingo_mi.studies.benchmarks.functional
     python -m lingo_mi.studies.benchmarks.functional --gaussians 50000 --pixels 512 --variant cuda_ad_mono
 
-Both project one view of a random cloud and take an image of random derivatives back to the four parameters. The ratio is that of
-the medians over all turns.
+Both project one view of a random cloud and backpropagate an image of random derivatives to the four parameters. They run in
+turns; the ratio is that of the medians over all turns.
 """
 
 from __future__ import annotations

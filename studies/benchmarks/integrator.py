@@ -1,8 +1,8 @@
 """The integrator's time, forward and backward, against a kernel written by hand for this job and against Mitsuba's tree.
 
 A random cloud is rendered through `mi.render` and differentiated through `dr.backward`, Python and set-up included. The hand-
-written kernel, limit.cpp, does nothing but the arithmetic of as many pairs of a pixel and a Gaussian. A pair is a pixel in the
-bounding box of a Gaussian's footprint.
+written kernel, limit.cpp, does only the arithmetic for the same number of pairs. A pair is a Gaussian and a pixel in the
+bounding box of its footprint.
 
     bench = Bench(Work(gaussians=10_000, size=256))
     result = bench.times()

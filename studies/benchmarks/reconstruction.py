@@ -1,10 +1,10 @@
 """Reconstruction on voxels timed against RTK and diffct on the CPU: projector, transpose, FDK, one SART iteration.
 
-The Shepp-Logan phantom on size^3 voxels, views of size x size pixels over a full turn. In every repeat each operation is run by
-each package in turn, on the same cores, from arrays in memory to an array in memory. The deviation is the relative RMS
-difference from our result, without the outermost voxels, whose outer halves RTK leaves out. It is not small where methods
-differ: diffct projects voxels that are constant (Siddon), ours and RTK's interpolate (Joseph); RTK's SART backprojects by
-interpolating the panel, ours by the matched transpose.
+The Shepp-Logan phantom on size^3 voxels, views of size x size pixels over a full turn. In every repeat, the packages run each
+operation in turn, on the same cores, from arrays in memory to an array in memory. The deviation is the relative RMS difference
+from our result, without the outermost voxels (RTK leaves out their outer halves). It is large where methods differ: diffct
+projects constant voxels (Siddon), ours and RTK's projectors interpolate (Joseph); RTK's SART backprojects by interpolation on
+the panel, ours by the matched transpose.
 
     result = measure(size=64, views=50, repeats=3)
     result['operations']['FDK']['RTK']['ratio']

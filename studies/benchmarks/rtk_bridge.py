@@ -1,6 +1,6 @@
-"""RTK on scans of this package. Needs the extra `reference`, of which every function takes the module `itk`.
+"""RTK on scans of this package. Needs the extra `reference`; every function takes its module `itk`.
 
-RTK rotates about y: (x, y, z) there is (y, z, x) here, its gantry angle is ours. ITK arrays are indexed backwards.
+RTK rotates about y: its (x, y, z) is (y, z, x) here. Gantry angles are the same. ITK arrays have reversed indices.
 
     import itk
     volume = reconstruct('FDK', scan, itk)

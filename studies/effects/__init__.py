@@ -1,4 +1,4 @@
-"""What modelling an effect of real projections is worth: `experiments.measure` finds it, `report.write` writes it down.
+"""The gain from modelling an effect of real projections, measured by `experiments.measure`, reported by `report.write`.
 
 numbers = write({'psf': measure('psf')}, Path('out/effects'), figures=Path('out/effects'))
 """

@@ -1,4 +1,4 @@
-"""What the experiments of effects found, written down: numbers, a table, a picture of each, and how they were made."""
+"""The report of the experiments on effects: numbers, a table, a picture of each, and their provenance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Hard cases: clouds, views, grids and scans where float32 is pressed, with the error that each may show.
+"""Hard cases: clouds, views, grids and scans at the limits of float32, each with its permitted error.
 
-`cases.all_cases` lists them, `measuring.measure` compares one with float64 or tells how it was refused or warned of, and
-`table.markdown` makes a page of the results.
+`cases.all_cases` lists them. `measuring.measure` compares a case with float64, or reports how it was refused or which warning it
+caused. `table.markdown` makes a page of the results.
 
     results = [(case, measure(case)) for case in all_cases()]
     page = markdown(results)

@@ -1,4 +1,4 @@
-"""Clouds in views where float32 is pressed: needles, tiny and huge Gaussians, ends of rays, piles, extreme geometries."""
+"""Clouds in views at the limits of float32: needles, tiny and huge Gaussians, ends of rays, piles, extreme geometries."""
 
 from __future__ import annotations
 

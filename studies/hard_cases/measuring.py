@@ -1,13 +1,17 @@
 """Measure a hard case: its image and derivatives on the device against float64 on the same float32 input.
 
-Errors are relative. That of the image is the root mean square deviation over that of the image. Those of derivatives are
-taken Gaussian by Gaussian, and the worst counts. For that each is made a number of the loss's unit: that by a scale is
-multiplied by the scale, so that a needle's length counts as much as its width; that by the centre by the smallest standard
-deviation, over which the Gaussian may move; that by the quaternion by its length and the ratio of the smallest to the largest
-standard deviation, over which it may turn; that by the density by the density. The loss is a sum of the image with normal
-weights. What counts is the error of each kind over the length of all of the Gaussian's derivatives, since one kind alone may
-cancel by chance. Where these, or a whole image, are below FLOOR of the integral through a Gaussian's thinnest part (only its far
-tail reaches into the view, say) they are compared with that.
+Errors are relative. The image's error is its root mean square deviation over its root mean square. The loss is a sum of the
+image with normal weights. The errors of derivatives are taken Gaussian by Gaussian, and the largest counts. Each derivative is
+first converted to the loss's unit, by a factor:
+
+    scale        the scale, so that a needle's length counts as much as its width
+    centre       the smallest standard deviation, a natural distance to move
+    quaternion   its length times the smallest over the largest standard deviation, a natural angle to turn
+    density      the density
+
+The error of each kind is divided by the norm of all of the Gaussian's derivatives, since one kind alone may cancel by chance. If
+these derivatives, or a whole image, are below FLOOR times the integral through a Gaussian's thinnest part (for example, if only
+its far tail reaches into the view), that is the reference instead.
 """
 
 from __future__ import annotations

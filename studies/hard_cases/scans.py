@@ -1,4 +1,4 @@
-"""Fits to bad data: views that are empty, saturated, noisy or there twice, and Gaussians all at one place."""
+"""Fits to bad data: empty, saturated, noisy or repeated views, and Gaussians all at one place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians that no projector can use, and that a scene must refuse by name."""
+"""Unusable Gaussians, which a scene must refuse by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds on voxels where float32 is pressed."""
+"""Clouds on voxels at the limits of float32."""
 
 from __future__ import annotations
 

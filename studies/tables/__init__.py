@@ -1,1 +1,1 @@
-"""The paper's tables: cells, computed once and stored (`cells`), and how they are shown (`report`)."""
+"""The paper's tables: cells, computed once and stored (`cells`), and their presentation (`report`)."""

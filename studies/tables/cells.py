@@ -1,12 +1,12 @@
-"""The paper's tables as cells: fits of sparse scans and reconstructions from completed ones, each stored when it is done.
+"""The paper's tables as cells: fits of sparse scans, and reconstructions from completed scans, each stored when it is done.
 
-A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written in one piece, below a
-folder that names its recipe and a hash of every setting: a cell that is whole is not computed again, one of other settings is
-another cell. A fit keeps its checkpoint beside it, from which it goes on after an interruption, from which the next longer fit
-of the same recipe begins, and from which the views missing to a CT volume are rendered.
+A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written atomically, in a folder
+named after its recipe and a hash of all settings. A stored cell is not computed again; other settings make another cell. A fit
+stores its checkpoint next to it. The checkpoint has three uses: to continue after an interruption, to start the next longer fit
+of the same recipe, and to render the missing views for a CT volume.
 
-Every object is scanned as in X3D's scenes (`phantoms.x3d_scan`): 50 views over half a turn, of which a fit sees a few evenly
-spaced ones, and 50 others held out. For a CT volume, the fitted views are completed to 100.
+Every object is scanned as in X3D's scenes (`phantoms.x3d_scan`): 50 views over half a turn and 50 held-out views. A fit uses a
+few evenly spaced ones of the former. For a CT volume, the fitted views are completed to 100.
 """
 
 from __future__ import annotations

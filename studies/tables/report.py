@@ -1,7 +1,7 @@
-"""Which cells the paper's tables are made of, and the tables as Markdown and JSON, with the paper's numbers beside ours.
+"""The cells of the paper's tables, and the tables as Markdown and JSON, with the paper's numbers next to ours.
 
-The paper's numbers are means over the 15 scenes of X3D, of which the objects here are a part at most: they are to be compared
-with the means, and rather in their order than in their size.
+The paper's numbers are means over the 15 scenes of X3D. The objects here are at most some of these, so compare the means, and
+their order rather than their values.
 """
 
 from __future__ import annotations
