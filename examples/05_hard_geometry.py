@@ -55,7 +55,7 @@ for axis, (name, volume) in zip(axes.flat, volumes.items()):
 fig.colorbar(shown, ax=axes, label='density [1/mm]')
 
 # %%
-# Correction wins back more than half of what the wrong poses cost here. The misfit in the measured views says so without the truth:
+# Correction wins back more than half of what the wrong poses cost. The misfit in the measured views says so without the truth:
 # `result.render()` renders the views of `result.geometry`, which holds the poses as the fit has corrected them.
 
 for name, result in fits.items():
