@@ -62,6 +62,7 @@ sphinx_gallery_conf = {
     'capture_repr': (),
     'download_all_examples': False,
     'show_memory': False,
+    'write_computation_times': False,
     'show_signature': False,
     'remove_config_comments': True,
     'within_subsection_order': 'FileNameSortKey',

@@ -19,15 +19,15 @@ import lingo_mi as lm
 
 chest = lm.phantom('chest', size=64)
 volume = 0.02 * chest.data
-voxel = chest.spacing[0]
 
 # %%
-# The scanner: source 1 m from the axis, panel 1.5 m from the source, 96 x 96 pixels that see the whole volume.
+# The scanner: source 1 m from the axis, panel 1.5 m from the source, 96 x 96 pixels of 7.5 mm.
 
 angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(7.5, 7.5), nVoxel=volume.shape, dVoxel=(voxel,) * 3)
-geometry = lm.Geometry.cone(**scanner, angles=angles)
-between = lm.Geometry.cone(**scanner, angles=angles[:4] + np.pi / 20)
+scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(7.5, 7.5))
+grid = dict(nVoxel=volume.shape, dVoxel=chest.spacing)
+geometry = lm.Geometry.cone(**scanner, **grid, angles=angles)
+between = lm.Geometry.cone(**scanner, **grid, angles=angles[:4] + np.pi / 20)
 data = lm.simulate(volume, geometry, held_out=between)
 
 # %%
@@ -36,7 +36,7 @@ data = lm.simulate(volume, geometry, held_out=between)
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 fitted = result.volume()
 numbers = result.metrics()
-print(f'held-out views {numbers["psnr_2d"]:.1f} dB, volume {numbers["psnr_3d_absolute"]:.1f} dB below its maximum')
+print(f'PSNR of held-out views {numbers["psnr_2d"]:.1f} dB, of the volume {numbers["psnr_3d_absolute"]:.1f} dB')
 
 # %%
 # Coronal slices of both. Ribs and vessels of a voxel's width are more than 20 views tell.
@@ -51,10 +51,10 @@ fig.colorbar(shown, ax=axes, label='attenuation [1/mm]')
 # `save` writes the volume as NIfTI with its voxel size and position, the Gaussians as PLY, and a report.
 
 folder = result.save(Path(tempfile.mkdtemp()) / 'chest')
-print(sorted(path.name for path in folder.iterdir()))
+print(*sorted(path.name for path in folder.iterdir()), sep='\n')
 
 # %%
-# On the command line the same is
+# On the command line, a CT is scanned by the scanner of the scene `chest` and fitted with
 #
 # .. code-block:: bash
 #

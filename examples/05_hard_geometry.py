@@ -7,7 +7,7 @@ of which the fit is told nothing. It corrects the poses while it fits.
 """
 
 # %%
-# The true scanner: two turns that climb 60 mm each.
+# The scanner that the fit is told: two turns that climb 60 mm each.
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -18,10 +18,9 @@ import lingo_mi as lm
 foot = lm.phantom('foot', size=64)
 count = 24
 angles = np.linspace(-2 * np.pi, 2 * np.pi, count, endpoint=False)
-scanner = dict(
-    DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(6, 6), nVoxel=foot.data.shape, dVoxel=foot.spacing, angles=angles
-)
-told = lm.Geometry.helix(pitch=60, **scanner)
+scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(6, 6))
+grid = dict(nVoxel=foot.data.shape, dVoxel=foot.spacing)
+told = lm.Geometry.helix(**scanner, **grid, angles=angles, pitch=60)
 
 # %%
 # What it really does: every view is turned and shifted a little. What all views have in common is taken off, for that is a
@@ -31,7 +30,7 @@ rng = np.random.default_rng(1)
 turns, shifts = rng.normal(0, 1, (count, 3)), rng.normal(0, 2, (count, 3))  # degrees, mm
 turns, shifts = turns - turns.mean(0), shifts - shifts.mean(0)
 moved = told.rays().moved(Rotation.from_rotvec(np.radians(turns)).as_matrix(), shifts)
-real = lm.Geometry.from_poses(moved, told.nDetector, nVoxel=told.nVoxel, dVoxel=told.dVoxel)
+real = lm.Geometry.from_poses(moved, told.nDetector, **grid)
 measured = lm.simulate(foot, real)
 misled = lm.Dataset(lm.Scan(told, measured.train.projections), volume=foot.data)
 
@@ -55,8 +54,7 @@ for axis, (name, volume) in zip(axes.flat, volumes.items()):
 fig.colorbar(shown, ax=axes, label='density [1/mm]')
 
 # %%
-# Correction wins back more than half of what the wrong poses cost here. The misfit in the measured views says so without the
-# truth:
+# Correction wins back more than half of what the wrong poses cost. The misfit in the measured views says so without the truth:
 # `result.render()` renders the views of `result.geometry`, which holds the poses as the fit has corrected them.
 
 for name, result in fits.items():

@@ -31,7 +31,7 @@ for axis, (title, volume) in zip(axes.flat, volumes.items()):
     axis.set(title=title, xticks=[], yticks=[])
     axes[1, 1].plot(volume[:, 24, 24], label=title)
 axes[1, 1].set(title='middle row', xlabel='x [voxels]', ylabel='density [1/mm]')
-axes[1, 1].legend(loc='upper center')
+axes[1, 1].legend(loc='center right', fontsize='small')
 
 # %%
 # Where the spectrum is ignored, metal comes out too thin, in its middle most ("cupping"), and the hole is not empty.

@@ -108,6 +108,12 @@ def process(app, what, name, thing, options, lines):
     lines[:] = [*to_rst('\n'.join(lines)).splitlines(), '']
 
 
+def process_signature(app, what, name, obj, options, signature, returned):
+    """Sphinx's stand-in for an alias of `autodoc_type_aliases`, which it leaves in unions, becomes the alias's name."""
+    return tuple(text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r'\1', text) for text in (signature, returned))
+
+
 def setup(app):
+    app.connect('autodoc-process-signature', process_signature)
     app.connect('autodoc-process-docstring', process)
     return {'parallel_read_safe': True}
