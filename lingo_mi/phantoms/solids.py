@@ -301,7 +301,7 @@ class Texture:
     """
 
     def __init__(self, rng: np.random.Generator, period: float, step: float, scales: ArrayLike):
-        n = int(round(period / step))
+        n = round(period / step)
         self.step = step
         noise = rng.standard_normal((n, n, n), dtype=np.float32)
         sigma = np.array(scales) / step

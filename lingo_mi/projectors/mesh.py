@@ -116,7 +116,7 @@ class MeshPaths:
         packets = packets_of(view.width)
         height, width = dr.opaque(mi.Int32, view.height), dr.opaque(mi.Int32, view.width)
         triangles, blocks, cost = _plan(vertices, self._faces, height, width, self.sharing)
-        drawn = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
+        drawn: Any = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
         if dr.width(drawn) == 0:
             return dr.zeros(mi.Float, view.height * view.width)
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))

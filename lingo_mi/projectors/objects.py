@@ -168,7 +168,7 @@ class HomogeneousMesh:
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
         )
         self.scale = params.get('scale', 1.0)
-        geometry = mi.traverse(shape)
+        geometry: Any = mi.traverse(shape)
         # A kept array's index is unique, so a moved mesh does not match the old entry.
         arrays = geometry['vertex_positions'], geometry['faces']
         key = (id(shape), *(x.index for x in arrays))
