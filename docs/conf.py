@@ -1,6 +1,7 @@
 """Sphinx's settings: `python -m sphinx -W -b html docs build/site` builds the site, warnings being errors."""
 
 import importlib.metadata
+import importlib.util
 import os
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ sys.path[:0] = [str(DOCS / '_ext'), str(DOCS.parent)]
 os.environ.setdefault('COLUMNS', '100')  # width of the command line's help
 
 import lingo_mi  # noqa: E402 - from the folder above
+from lingo_mi.progress import Progress  # noqa: E402
 
 project = 'lingo_mi'
 author = 'the lingo_mi developers'
@@ -42,11 +44,22 @@ autodoc_type_aliases = {'ArrayLike': 'ArrayLike'}  # whose definition is many li
 add_module_names = False
 python_maximum_signature_line_length = 100
 
+Progress._draw = lambda self, now: None  # pages show what examples print, not how far they are
+
+# What examples need besides the package. Where it is missing, they are shown without what they print and draw.
+NEEDS = {'06_spectrum_and_detector': ('spekpy', 'xraylib'), '07_pytorch': ('torch',)}
+skipped = []
+for example, modules in NEEDS.items():
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        skipped.append(example)
+        print(f'examples/{example}.py is shown without its output: install {", ".join(missing)}', file=sys.stderr)
+
 sphinx_gallery_conf = {
     'examples_dirs': '../examples',
     'gallery_dirs': 'gallery',
-    'filename_pattern': r'[/\\]\d\d_',
-    'ignore_pattern': r'__init__\.py|conftest\.py',
+    'filename_pattern': r'[/\\]' + ''.join(f'(?!{example})' for example in skipped) + r'\d\d_',
+    'capture_repr': (),
     'download_all_examples': False,
     'show_memory': False,
     'show_signature': False,

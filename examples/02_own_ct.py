@@ -33,14 +33,15 @@ data = lm.simulate(volume, geometry, held_out=between)
 # %%
 # The fit, from the 20 views alone. Densities keep their unit.
 
-result = lm.fit(data, 'fast', iterations=300, n_points=5000)
+result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 fitted = result.volume()
-print({name: round(result.metrics()[name], 2) for name in ('psnr_2d', 'psnr_3d_absolute')})
+numbers = result.metrics()
+print(f'held-out views {numbers["psnr_2d"]:.1f} dB, volume {numbers["psnr_3d_absolute"]:.1f} dB below its maximum')
 
 # %%
-# Coronal slices of both.
+# Coronal slices of both. Ribs and vessels of a voxel's width are more than 20 views tell.
 
-fig, axes = plt.subplots(1, 2, figsize=(8, 4), layout='constrained')
+fig, axes = plt.subplots(1, 2, figsize=(8.6, 4), layout='constrained')
 for axis, image, title in zip(axes, (volume, fitted), ('the volume', 'from 20 views')):
     shown = axis.imshow(image[:, 32].T, origin='lower', cmap='gray', vmin=0, vmax=volume.max())
     axis.set(title=title, xticks=[], yticks=[])

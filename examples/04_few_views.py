@@ -2,20 +2,31 @@
 Few views: completion and refinement
 ====================================
 
-From ten views, voxel methods leave streaks. A fitted cloud fills the gaps: iterative algorithms start from its volume, and
-`Refined` goes on from it where the cloud is wrong.
+Ten views say little about most voxels. A fitted cloud says what is likely there: iterative algorithms start from its volume,
+and `Refined` mends it where it is wrong.
 """
 
 # %%
-# Ten of fifty views of a foot.
+# Ten views of a foot, and a cloud fitted to them.
 
 import matplotlib.pyplot as plt
+import numpy as np
 
 import lingo_mi as lm
 from lingo_mi.metrics import psnr_3d
 
-data = lm.simulate(lm.phantom('foot', size=64), views=10)
-result = lm.fit(data, 'fast', iterations=400, n_points=4000)
+foot = lm.phantom('foot', size=64)
+geometry = lm.Geometry.cone(
+    DSO=1000,
+    DSD=1500,
+    nDetector=(128, 128),
+    dDetector=(4, 4),
+    nVoxel=foot.data.shape,
+    dVoxel=foot.spacing,
+    angles=np.linspace(0, np.pi, 10, endpoint=False),
+)
+data = lm.simulate(foot, geometry)
+result = lm.fit(data, 'fast', iterations=300, n_points=3000)
 
 # %%
 # Five volumes of the same ten views. `start=result` hands the cloud's own volume over.
@@ -27,15 +38,15 @@ volumes = {
     'cloud': result.volume(),
     'refined': lm.reconstruct(data.train, lm.Refined(niter=10, completed_niter=0), start=result),
 }
-volumes = {name: getattr(volume, 'volume', volume) for name, volume in volumes.items()}
+volumes = {'truth': foot.data, **{name: np.asarray(volume) for name, volume in volumes.items()}}
 
-fig, axes = plt.subplots(1, 6, figsize=(15, 3), layout='constrained')
-for axis, (name, volume) in zip(axes, {'truth': data.volume, **volumes}.items()):
-    axis.imshow(volume[:, :, 20].T, origin='lower', cmap='gray', vmin=0, vmax=data.volume.max())
-    title = name if name == 'truth' else f'{name}\n{psnr_3d(volume, data.volume):.1f} dB'
-    axis.set(title=title, xticks=[], yticks=[])
+fig, axes = plt.subplots(2, 3, figsize=(9, 6.6), layout='constrained')
+for axis, (name, volume) in zip(axes.flat, volumes.items()):
+    axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
+    quality = '' if name == 'truth' else f', {psnr_3d(volume, foot.data):.1f} dB'
+    axis.set(title=name + quality, xticks=[], yticks=[])
 
 # %%
-# These projections were simulated from the voxels themselves, without noise, which favours all iterative methods. Where an
-# object is finer than the voxels, as outside simulations it always is, plain ASD-POCS comes close to the cloud: the
-# benchmarks show by how much.
+# FDK has streaks. On these clean projections 20 passes of SART or ASD-POCS are about as good as the cloud, and what starts from
+# the cloud is 3 dB better. The projections were simulated from the voxels themselves, without noise, which favours whatever
+# works on voxels. The benchmarks have noise, other objects, and objects finer than the voxels.

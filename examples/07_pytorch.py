@@ -3,7 +3,7 @@ In a PyTorch training loop
 ==========================
 
 `lm.project` is differentiable for PyTorch tensors: the exact X-ray counterpart of a Gaussian rasteriser, without a CUDA
-toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else.
+toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else. It needs ``pip install 'lingo_mi[torch]'``.
 """
 
 # %%
@@ -15,27 +15,22 @@ import torch
 
 import lingo_mi as lm
 
-foot = lm.phantom('foot', size=32)
+foot = lm.phantom('foot', size=48)
 angles = np.linspace(0, np.pi, 12, endpoint=False)
 geometry = lm.Geometry.cone(
-    DSO=1000,
-    DSD=1500,
-    nDetector=(48, 48),
-    dDetector=(12, 12),
-    nVoxel=foot.data.shape,
-    dVoxel=foot.spacing,
-    angles=angles,
+    DSO=1000, DSD=1500, nDetector=(72, 72), dDetector=(8, 8), nVoxel=foot.data.shape, dVoxel=foot.spacing, angles=angles
 )
 target = torch.as_tensor(lm.simulate(foot, geometry).train.projections)
 
 # %%
-# 800 Gaussians at random voxels of the foot's box, as leaves.
+# 1500 Gaussians at random places in the middle of the foot's box, as leaves.
 
 rng = torch.Generator().manual_seed(0)
-means = ((torch.rand(800, 3, generator=rng) - 0.5) * 200).requires_grad_()
-scales = torch.full((800, 3), np.log(10.0)).requires_grad_()  # logarithms: scales stay positive
-quaternions = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).repeat(800, 1).requires_grad_()
-density = torch.full((800,), -5.0).requires_grad_()
+count = 1500
+means = ((torch.rand(count, 3, generator=rng) - 0.5) * 200).requires_grad_()
+scales = torch.full((count, 3), np.log(8.0)).requires_grad_()  # logarithms: scales stay positive
+quaternions = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).repeat(count, 1).requires_grad_()
+density = torch.full((count,), -5.0).requires_grad_()
 optimizer = torch.optim.Adam(
     [{'params': [means], 'lr': 1.0}, {'params': [scales, quaternions], 'lr': 0.02}, {'params': [density], 'lr': 0.1}]
 )
@@ -54,7 +49,8 @@ for _ in range(120):
 print(f'mean squared error {losses[0]:.1f} -> {losses[-1]:.2f}')
 
 # %%
-# The volume, by `lm.voxelize`, which is differentiable, too.
+# The volume, by `lm.voxelize`, which is differentiable, too. It is soft: `lm.fit` adds Gaussians where they lack, and starts
+# from a better place.
 
 with torch.no_grad():
     volume = lm.voxelize(means, scales.exp(), quaternions, torch.nn.functional.softplus(density), geometry)
@@ -62,5 +58,5 @@ fig, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout='constrained')
 axes[0].semilogy(losses)
 axes[0].set(xlabel='step', ylabel='mean squared error')
 for axis, image, title in ((axes[1], foot.data, 'truth'), (axes[2], volume.numpy(), 'cloud')):
-    axis.imshow(image[:, :, 12].T, origin='lower', cmap='gray', vmin=0, vmax=1)
+    axis.imshow(image[24].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
     axis.set(title=title, xticks=[], yticks=[])

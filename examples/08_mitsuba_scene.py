@@ -17,7 +17,7 @@ import lingo_mi as lm
 
 lm.use_variant()
 
-import mitsuba as mi  # noqa: E402
+import mitsuba as mi
 
 # %%
 # A cloud of 200 Gaussians beside a steel cube, before a scanner of 60 views.
@@ -58,13 +58,15 @@ scanner = scene.sensors()[0]
 # %%
 # One view of the scanner is a sensor.
 
-fig, axes = plt.subplots(1, 3, figsize=(10, 3.6), layout='constrained')
-for axis, view in zip(axes, (0, 10, 20)):
-    axis.imshow(mi.render(scene, sensor=scanner.view(view)).numpy()[:, :, 0], cmap='gray')
+images = {view: mi.render(scene, sensor=scanner.view(view)).numpy()[:, :, 0] for view in (0, 10, 20)}
+fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout='constrained')
+for axis, (view, image) in zip(axes, images.items()):
+    shown = axis.imshow(image, cmap='gray', vmin=0, vmax=max(image.max() for image in images.values()))
     axis.set(title=f'view {view}', xticks=[], yticks=[])
+fig.colorbar(shown, ax=axes, label='line integral')
 
 # %%
-# Derivatives: which way to move the Gaussians to make the image brighter inside a small window?
+# Derivatives: which Gaussians would change the image inside a small window, if they moved?
 
 params = mi.traverse(scene)
 dr.enable_grad(params['cloud.data'])

@@ -16,7 +16,7 @@ import lingo_mi as lm
 
 lm.use_variant()
 
-import mitsuba as mi  # noqa: E402
+import mitsuba as mi
 
 rng = np.random.default_rng(0)
 count = 6
@@ -38,7 +38,7 @@ exact = [dr.grad(x).numpy() for x in leaves]
 # %%
 # Then by differences of a plain NumPy evaluation in float64: every Gaussian on every ray.
 
-from scipy.spatial.transform import Rotation  # noqa: E402
+from scipy.spatial.transform import Rotation
 
 
 def loss(means, scales, quaternions, density):

@@ -7,7 +7,7 @@ A Gaussian has no end; its footprint is cut off at some standard deviations. Tha
 """
 
 # %%
-# An image of 4000 Gaussians at cut-offs from 2 to 8, and the time it takes.
+# An image of 30,000 Gaussians at cut-offs from 2 to 8, how far it is from that at 9, and the time it takes.
 
 import time
 
@@ -17,15 +17,15 @@ import numpy as np
 import lingo_mi as lm
 
 rng = np.random.default_rng(0)
-count = 4000
+count = 30_000
 cloud = (
     rng.uniform(-60, 60, (count, 3)),
-    np.exp(rng.normal(0.7, 0.3, (count, 3))),
+    np.exp(rng.normal(0.7, 0.3, (count, 3))),  # 2 mm
     rng.normal(size=(count, 4)),
     rng.uniform(0.1, 1, count),
 )
 geometry = lm.Geometry.cone(
-    DSO=1000, DSD=1500, nDetector=(256, 256), dDetector=(1.2, 1.2), nVoxel=(64,) * 3, dVoxel=(3,) * 3, angles=[0.0]
+    DSO=1000, DSD=1500, nDetector=(512, 512), dDetector=(0.6, 0.6), nVoxel=(64,) * 3, dVoxel=(3,) * 3, angles=[0.0]
 )
 reference = lm.project(*cloud, geometry, extent=9.0)
 
@@ -37,15 +37,17 @@ for extent in cutoffs:
         begun = time.perf_counter()
         image = lm.project(*cloud, geometry, extent=extent)
         times.append(time.perf_counter() - begun)
-    seconds.append(np.median(times))
+    seconds.append(min(times))
     errors.append(np.linalg.norm(image - reference) / np.linalg.norm(reference))
 
 # %%
-# Error against time. The full price list, with other methods and with derivatives, is in the accuracy page.
+# The error falls by the tail of a Gaussian, down to rounding; the time grows by the area of the footprints. The full price
+# list, with other methods and with derivatives, is in the accuracy page.
 
-fig, axis = plt.subplots(figsize=(6, 4), layout='constrained')
-axis.loglog(1e3 * np.array(seconds), errors, 'o-')
-for extent, x, y in zip(cutoffs, seconds, errors):
-    axis.annotate(f'{extent} σ', (1e3 * x, y), textcoords='offset points', xytext=(6, 4))
-axis.set(xlabel='time of an image [ms]', ylabel='relative error of the image')
-axis.grid(alpha=0.3)
+fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')
+axes[0].semilogy(cutoffs, errors, 'o-')
+axes[0].set(xlabel='cut-off [standard deviations]', ylabel='relative error of the image')
+axes[1].plot(cutoffs, 1e3 * np.array(seconds), 'o-')
+axes[1].set(xlabel='cut-off [standard deviations]', ylabel='time of an image [ms]', ylim=(0, None))
+for axis in axes:
+    axis.grid(alpha=0.3)

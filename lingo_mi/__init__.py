@@ -29,7 +29,7 @@ watch_variants()
 
 __version__ = '0.1.0'
 
-__all__ = [
+__all__ = [  # noqa: RUF022 - in the order of their use
     'simulate',
     'load',
     'phantom',

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import DTypeLike
 
 from lingo_mi.errors import InputError
 
 
-def as_numpy(values: object, name: str, dtype: np.typing.DTypeLike = None) -> np.ndarray:
+def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarray:
     """`values` as an array, without a copy where that is possible.
 
     values   numbers, nested lists of them, or an array of any library that has `__array__` or `__dlpack__`: NumPy, PyTorch,

@@ -10,8 +10,8 @@ from pathlib import Path
 from lingo_mi.errors import InputError
 
 
-def one_line(error: BaseException) -> str:
-    """The message of an exception on one line, without its trailing full stop."""
+def one_line(error: BaseException | str) -> str:
+    """The message of an exception, or a text, on one line, without its trailing full stop."""
     return ' '.join(str(error).split()).rstrip('.') or type(error).__name__
 
 

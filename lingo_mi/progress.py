@@ -9,7 +9,8 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
+from typing import Any
 
 LABELS = {
     'psnr': 'PSNR {:.2f} dB',
@@ -36,9 +37,11 @@ class Progress:
     def __init__(self, description: str, total: int, start: int = 0, shown: bool = True):
         """total: steps in all; start: steps done before the loop begins (a resumed fit); shown: False draws nothing."""
         self.description, self.total, self.start = description, int(total), int(start)
-        self._done, self._fields = self.start, {}
+        self._done = self.start
+        self._fields: dict[str, Any] = {}
         self._file, self._quiet = sys.stderr, not shown
-        self._bar = self._task = None
+        self._bar: Any = None
+        self._task: Any = None
 
     def __enter__(self) -> Progress:
         self._began = self._drawn = time.monotonic()
@@ -55,7 +58,7 @@ class Progress:
         if self._bar:
             self._bar.stop()
 
-    def update(self, iteration: int, **fields):
+    def update(self, iteration: int, **fields: Any) -> None:
         """Say that `iteration` steps are done.
 
         fields : what to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or
@@ -92,7 +95,10 @@ class Progress:
 
 def track(iterable: Iterable, description: str, total: int | None = None) -> Iterator:
     """The items of `iterable`, with progress shown. `total` is needed where `iterable` has no length."""
-    with Progress(description, len(iterable) if total is None else total) as progress:
+    steps = len(iterable) if total is None and isinstance(iterable, Sized) else total
+    if steps is None:
+        raise TypeError('an iterable without a length needs a total')
+    with Progress(description, steps) as progress:
         for done, item in enumerate(iterable, 1):
             yield item
             progress.update(done)

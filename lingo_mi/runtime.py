@@ -86,7 +86,7 @@ def use_variant(name: str | None = None) -> str:
 
     usable = [v for v in mi.variants() if v.endswith(('_ad_mono', '_ad_rgb'))]
     if name is not None and name not in usable:
-        raise InputError(f'--variant {name}: not one of {", ".join(usable)}')
+        raise InputError(f'variant {name!r} is not one of {", ".join(usable)}')
     mi.set_log_level(mi.LogLevel.Error)  # its warnings are about films and files that a scan does not depend on
     library = os.environ.get('DRJIT_LIBLLVM_PATH', '')
     for variant in [name] if name else ['cuda_ad_mono', 'llvm_ad_mono']:
@@ -101,7 +101,7 @@ def use_variant(name: str | None = None) -> str:
         except (ImportError, RuntimeError) as error:  # what Mitsuba raises for a missing driver or library
             reason = str(error).strip().splitlines()[0] if str(error).strip() else repr(error)
     if variant.startswith('cuda'):
-        raise InputError(f'--variant {name}: no NVIDIA GPU can be used; leave it out to run on the CPU')
+        raise InputError(f'variant {name}: no NVIDIA GPU can be used; take llvm_ad_mono to run on the CPU')
     raise InputError(f'no usable backend ({reason}). {LLVM_HELP}')
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from lingo_mi.arrays import as_numpy
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.rays import Index
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scan:
     """Measured or simulated projections.
 
@@ -31,7 +33,7 @@ class Scan:
     geometry: Geometry
     projections: np.ndarray
     valid: np.ndarray | None = None
-    effects: object = None  # `Effects` is in a package above this one
+    effects: Any = None  # `Effects` is in a package above this one
 
     def __post_init__(self):
         p = as_numpy(self.projections, 'the projections', np.float32)
@@ -61,7 +63,7 @@ class Scan:
     def __len__(self) -> int:
         return len(self.geometry)
 
-    def subset(self, index) -> Scan:
+    def subset(self, index: Index) -> Scan:
         """The views `index` only: a slice, or integers [m]."""
         return replace(
             self,
@@ -91,7 +93,7 @@ class Scan:
         return self.projections * np.float32(self.geometry.scale)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataset:
     """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
 

@@ -20,7 +20,7 @@ PLUGINS = {
 }
 
 
-def register():
+def register() -> None:
     """Register all plugins with the active variant."""
     for name, (module, registrar) in PLUGINS.items():
         path = f'{__name__}.{module}'
@@ -28,13 +28,13 @@ def register():
         getattr(mi, registrar)(name, loaded.create)
 
 
-def watch_variants():
+def watch_variants() -> None:
     """Register the plugins with the active variant, and again with whichever is set later."""
 
     def on_variant(*_):
-        if 'ad' in mi.variant().split('_'):
+        variant = mi.variant()
+        if variant is not None and 'ad' in variant.split('_'):
             register()
 
     mi.detail.add_variant_callback(on_variant)
-    if mi.variant() is not None:
-        on_variant()
+    on_variant()

@@ -1,7 +1,11 @@
 """The emitter `ct_beam`: the X-rays of one view as light for Mitsuba's own integrators."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
+
+from lingo_mi.projectors.view import View
 
 
 class CTBeam(mi.Emitter):
@@ -21,7 +25,7 @@ class CTBeam(mi.Emitter):
         super().__init__(props)
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
-    def aim(self, view):
+    def aim(self, view: View) -> None:
         """Shine at the panel of a `lingo_mi.projectors.view.View`."""
         across = dr.cross(view.u, view.v)
         self.parallel, self.size = view.parallel, dr.opaque(mi.Vector2f, (view.width, view.height))
@@ -39,7 +43,7 @@ class CTBeam(mi.Emitter):
         at = p + behind * along - self.corner
         x, y = dr.dot(self.x, at), dr.dot(self.y, at)
         lit = active & (behind >= 0) & (x >= 0) & (x <= self.size.x) & (y >= 0) & (y <= self.size.y)
-        ds = dr.zeros(mi.DirectionSample3f)
+        ds: Any = dr.zeros(mi.DirectionSample3f)
         distance = dr.norm(along)
         ds.dist = dr.norm(p - self.corner) + 2 * dr.norm(self.corner) if self.parallel else distance
         ds.d = -along / distance

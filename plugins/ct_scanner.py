@@ -1,5 +1,7 @@
 """The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -76,13 +78,13 @@ class CTScanner(mi.Sensor):
 
     The source runs on a circle in the plane z = 0 unless told otherwise; `lingo_mi.geometry.base` states the frame, and
     `lingo_mi.geometry.trajectories.scanner_rays` what moves it. One view of a scanner is a
-    sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scene.load.scan` renders them all.
+    sensor like any other: `mi.render(scene, sensor=scanner.view(7))`; `lingo_mi.scene.simulate.take_scan` renders them all.
     """
 
     def __init__(self, props):
         self.dataset = None
         try:
-            films = {name: thing for name, thing in props.objects() if isinstance(thing, mi.Film)}
+            films: dict[str, Any] = {name: thing for name, thing in props.objects() if isinstance(thing, mi.Film)}
             self.detector = next((f.detector for f in films.values() if hasattr(f, 'detector')), None)
             if len(films) > (self.detector is not None):
                 raise InputError(
@@ -122,7 +124,7 @@ class CTScanner(mi.Sensor):
         sensor.detector = self.detector
         return sensor
 
-    def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active=True):
+    def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active: Any = True):
         f = self.frame
         Vector3f = mi.Vector3f
         point = (
@@ -137,7 +139,7 @@ class CTScanner(mi.Sensor):
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active)
         return mi.Ray3f(mi.Point3f(start), direction, time, wavelengths), weight
 
-    def sample_ray_differential(self, time, wavelength_sample, position_sample, aperture_sample, active=True):
+    def sample_ray_differential(self, time, wavelength_sample, position_sample, aperture_sample, active: Any = True):
         ray, weight = self.sample_ray(time, wavelength_sample, position_sample, aperture_sample, active)
         return mi.RayDifferential3f(ray), weight
 

@@ -1,6 +1,7 @@
 """The emitter `xray_tube`: the photons of a scan, by energy, the focal spot that they come from, and how they scatter."""
 
 from dataclasses import fields
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -90,9 +91,13 @@ class XRayTube(mi.Emitter):
         try:
             spot = FocalSpot.of(props.get('focal_spot', '0'), props.get('focal_order', 3))
             names = props.keys()
-            materials = {k.removeprefix('material_'): props[k] for k in names if k.startswith('material_')}
+            materials: dict[str, Any] = {
+                k.removeprefix('material_'): props[k] for k in names if k.startswith('material_')
+            }
             scatter = Scatter.of(*(props.get(k, d) for k, d in _SCATTER.items()))
-            given = {f.name: props.get(f.name, f.default) for f in fields(TubeParameters) if f.name != 'materials'}
+            given: dict[str, Any] = {
+                f.name: props.get(f.name, f.default) for f in fields(TubeParameters) if f.name != 'materials'
+            }
             tube = Tube.of(TubeParameters(**given, materials=materials))
         except InputError as error:
             raise InputError(f'xray_tube {props.id()!r}: {error}') from None

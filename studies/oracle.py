@@ -11,8 +11,8 @@ are needed. Only this module has rays that end at a source or a panel, densities
 is tested against the other.
 
     rng = np.random.default_rng(0)
-    frames = geometry.rays()                       # of a lingo_mi.geometry.base.Geometry
-    pose = Pose.of(frames, 0, *geometry.nDetector)
+    rays = geometry.rays()                       # of a lingo_mi.geometry.base.Geometry
+    pose = Pose.of(rays, 0, *geometry.nDetector)
     image = line_integrals(random_cloud(rng, 5), pose, *pose.ends())
 """
 
@@ -81,10 +81,10 @@ class Pose:
     parallel: bool = False
 
     @staticmethod
-    def of(frames, index, height, width) -> Pose:
+    def of(rays, index, height, width) -> Pose:
         """View `index` of a `lingo_mi.geometry.rays.Rays`, for an image of height x width pixels."""
-        source, corner, u, v = (np.array(a[index], float) for a in (frames.source, frames.corner, frames.u, frames.v))
-        return Pose(source, corner, u, v, height, width, frames.parallel)
+        source, corner, u, v = (np.array(a[index], float) for a in (rays.source, rays.corner, rays.u, rays.v))
+        return Pose(source, corner, u, v, height, width, rays.parallel)
 
     @staticmethod
     def of_view(view) -> Pose:

@@ -1,4 +1,4 @@
-"""Every example runs, at its own small size, as the gallery runs it."""
+"""Every example runs, with short fits: the gallery of the documentation runs them in full."""
 
 import runpy
 import warnings
@@ -7,8 +7,10 @@ from pathlib import Path
 import matplotlib
 import pytest
 
+import lingo_mi as lm
+
 EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('[0-9]*.py'))
-NEEDS = {'07_pytorch': 'torch'}
+NEEDS = {'06_spectrum_and_detector': ('spekpy', 'xraylib'), '07_pytorch': ('torch',)}
 
 
 def test_there_are_examples():
@@ -18,11 +20,13 @@ def test_there_are_examples():
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
 def test_example(path, monkeypatch, tmp_path):
     """Without an error, with a picture, and without a warning of matplotlib or NumPy."""
-    if path.stem in NEEDS:
-        pytest.importorskip(NEEDS[path.stem])
+    for module in NEEDS.get(path.stem, ()):
+        pytest.importorskip(module)
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
+    fit = lm.fit
+    monkeypatch.setattr(lm, 'fit', lambda *scan, **settings: fit(*scan, **settings | {'iterations': 20}))
     monkeypatch.chdir(tmp_path)
     pyplot.close('all')
     with warnings.catch_warnings():

@@ -31,6 +31,7 @@ def simulate(
     held_out: Geometry | None = None,
     seed: int = 0,
     parameters: dict | None = None,
+    progress: bool = True,
 ) -> Dataset:
     """Simulate a scan: exact line integrals of an object, as the scanner would see it.
 
@@ -38,10 +39,12 @@ def simulate(
                 `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
     geometry    for a phantom or a volume: the scanner. A volume must have `geometry.nVoxel` voxels. Without it, a phantom
                 is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out
-    views       how many of the views to fit, evenly spaced; the rest are held out (default: all)
+    views       how many of the views to fit, evenly spaced; the rest are held out (default: all). Of a phantom without a
+                geometry: how many to scan
     held_out    with `geometry`: further views, to measure new views on
     seed        of random angles and of the noise of a scene's detector
     parameters  values for the `<default>` names of a scene file
+    progress    whether to show a progress bar on standard error; scenes always do
 
     Returns a `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume`
     [x, y, z] is the true density, where it is known.
@@ -52,6 +55,8 @@ def simulate(
         data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
     """
     ensure_variant()
+    if seed < 0:
+        raise InputError(f'seed must not be negative, but is {seed}')
     if isinstance(source, (str, PathLike)):
         if geometry is not None or held_out is not None:
             raise InputError(f'{source}: a scene has its own scanner; leave out geometry and held_out')
@@ -62,7 +67,7 @@ def simulate(
     if isinstance(source, Phantom) and geometry is None:
         if held_out is not None:
             raise InputError('held_out needs a geometry: give the scanner of the views to fit, too')
-        with Progress('Scan', 2 * (views or 50)) as bar:
+        with Progress('Scan', 2 * (views or 50), shown=progress) as bar:
             return x3d_scan(source, views or 50, seed, lambda done, _: bar.update(done))
     if geometry is None:
         raise InputError('a volume needs a scanner: give a geometry, such as lm.Geometry.cone(...)')
@@ -72,7 +77,7 @@ def simulate(
     check_memory(geometry, held_out)
     warn_if_truncated(geometry)
     every = geometry if held_out is None else geometry.joined(held_out)
-    with Progress('Scan', len(every)) as bar:
+    with Progress('Scan', len(every), shown=progress) as bar:
 
         def report(done, _):
             bar.update(done)

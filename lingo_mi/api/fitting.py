@@ -50,6 +50,10 @@ def fit(
         result = lm.fit(data, 'fast', iterations=800, checkpoint='out/foot.npz')
     """
     ensure_variant()
+    if not isinstance(scan, (Scan, Dataset)):
+        raise InputError(f'scan must be a Scan or a Dataset, not {type(scan).__name__}')
+    if seed < 0:
+        raise InputError(f'seed must not be negative, but is {seed}')
     dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
     if isinstance(recipe, Settings):
         name, chosen = 'settings', recipe.changed(**settings)

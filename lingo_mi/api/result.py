@@ -80,8 +80,14 @@ class Result:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The cloud, for `lm.project(*result.gaussians, geometry)`."""
+        """The cloud, for `lm.project(*result.gaussians, geometry)`.
+
+        With `extent=result.settings.model.extent` images are those of `render`.
+        """
         return Gaussians(*self.fitted.world_gaussians())
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return np.asarray(self.volume(), dtype)
 
     def __len__(self) -> int:
         return len(self.fitted.state)
@@ -94,7 +100,8 @@ class Result:
         volume = self.fitted.volume(geometry)
         if volume is None:
             raise InputError(
-                f'{self.recipe}: opacities and radiances make no volume; complete the views and reconstruct'
+                f'{self.recipe} fits opacities, not densities, and has no volume: take '
+                'lm.reconstruct(scan, algorithm, start=result, views=N)'
             )
         return volume
 

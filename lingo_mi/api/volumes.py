@@ -19,7 +19,7 @@ from lingo_mi.scan import Dataset, Scan
 
 
 def reconstruct(
-    scan: Scan,
+    scan: Scan | Dataset,
     algorithm: Algorithm,
     *,
     start: Result | ArrayLike | None = None,
@@ -28,7 +28,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a volume on the voxels of a scan's geometry.
 
-    scan        projections and geometry. Effects of a detector that it knows (beam hardening, scatter, blur) are taken out first
+    scan        projections and geometry; of a `Dataset` its `train`. Effects of a detector that it knows (beam
+                hardening, scatter, blur) are taken out first
     algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, with its parameters
     start       the `Result` of a fit to this scan, or a volume [x, y, z] in 1/mm, to start from; `Refined` needs a result
     views       with a result: how many views to reconstruct from. Those that were not measured are rendered from the cloud (the
@@ -44,6 +45,11 @@ def reconstruct(
         found.volume, found.residuals[-1]
     """
     ensure_variant()
+    scan = scan.train if isinstance(scan, Dataset) else scan
+    if not isinstance(scan, Scan):
+        raise InputError(f'scan must be a Scan or a Dataset, not {type(scan).__name__}')
+    if not isinstance(algorithm, Algorithm):
+        raise InputError(f'algorithm must be an object such as lm.SART(niter=20), not {algorithm!r}')
     inputs = {}
     if isinstance(start, Result):
         cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)

@@ -1,9 +1,9 @@
 """Fit a cloud of 3D Gaussians to a CT scan, and make a volume and new views of it.
 
-    python scripts/fit.py scenes/x3d_foot.xml
-    python scripts/fit.py scenes/x3d_foot.xml --method lingo --views 25 --iterations 5000
-    python scripts/fit.py scenes/chest.xml --volume my_ct.nii.gz --views 25
-    python scripts/fit.py scenes/x3d_foot.xml --projections foot_50.pickle
+    lingo-mi fit x3d_foot
+    lingo-mi fit x3d_foot --method lingo --views 25 --iterations 5000
+    lingo-mi fit chest --volume my_ct.nii.gz --views 25
+    lingo-mi fit x3d_foot --projections foot_50.pickle
 
 The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
 measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a

@@ -1,13 +1,13 @@
 """Reconstruct a CT volume from projections, measured or simulated, or completed from a fitted cloud.
 
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm fdk
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm asd-pocs --views 25 -D niter=20 --out foot.nii.gz
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm sart --complete out/x3d_foot/result.xml --views 100
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm voxelize --complete out/x3d_foot/result.xml
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm refined --complete out/x3d_foot/result.xml --views 100
-    python scripts/reconstruct.py scenes/x3d_foot.xml --algorithm refined --start out/x3d_foot/result.xml
+    lingo-mi reconstruct x3d_foot --algorithm fdk
+    lingo-mi reconstruct x3d_foot --algorithm asd-pocs --views 25 -D niter=20 --out foot.nii.gz
+    lingo-mi reconstruct x3d_foot --algorithm sart --complete out/x3d_foot/result.xml --views 100
+    lingo-mi reconstruct x3d_foot --algorithm voxelize --complete out/x3d_foot/result.xml
+    lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot/result.xml --views 100
+    lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot/result.xml
 
-The input is what fit.py takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
+The input is what `lingo-mi fit` takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
 pixel. refined, which is the best for few clean views, starts from the cloud's own volume, meets all views first and the
 measured ones then; for objects finer than the voxels add -D finer=2. With --start, the volume is made of the views that the
@@ -150,15 +150,16 @@ def main():
     scan, inputs = dataset.train, {}
     check_scan(scan.geometry, algorithm, views)
     if algorithm is None:
+        assert cloud is not None  # as `check_arguments` has made sure
         began = time.perf_counter()
         volume = sampled(cloud)(scan.geometry)
         found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
         of = f'a cloud fitted to {views}'
     else:
         require_signal(scan)
-        if args.complete:
+        if cloud and args.complete:
             scan, inputs = prepare_completed(dataset, cloud, args.views, algorithm)
-        elif args.start:
+        elif cloud:
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -63,7 +64,7 @@ def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
     return replace(scan, geometry=replace(cloud.corrected, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin))
 
 
-def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
+def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.ndarray:
     """Angles (radians) of the views to add, so that `views` in all are spread as evenly as the given ones allow.
 
     The widest gap is divided first, until there are enough views. An open arc is not extended.
@@ -78,7 +79,9 @@ def missing_angles(angles, views: int, geometry: Geometry) -> np.ndarray:
 def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
     """Line integrals of measured views: `corrected`, with the cloud, for the effects that its fit has modelled. Without such
     effects, the scan itself."""
-    return scan if cloud.effects is None else corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
+    if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing models none
+        return scan
+    return corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
 
 
 def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
@@ -95,7 +98,9 @@ def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
     return insert_views(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
 
 
-def insert_views(scan: Scan, views: int, render, circle: Geometry | None = None) -> Scan:
+def insert_views(
+    scan: Scan, views: int, render: Callable[[Geometry], np.ndarray], circle: Geometry | None = None
+) -> Scan:
     """A scan of `views` views: the given ones, and views between them from `render(geometry)`.
 
     circle   nominal geometry of the views, if a fit has corrected the poses (default: the scan's own)

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.special import logsumexp, softmax
 from scipy.stats import qmc
@@ -38,11 +40,11 @@ class Bands:
     ratios: np.ndarray
     error: float = 0.0
 
-    def hardened(self, *integrals) -> np.ndarray:
+    def hardened(self, *integrals: ArrayLike) -> np.ndarray:
         """h, float64: the measured signal for line integrals at the reference energy, M arrays of one shape."""
         return _hardened(np.stack([np.asarray(p, float) for p in integrals], -1), self.weights, self.ratios)
 
-    def precorrected(self, measured) -> np.ndarray:
+    def precorrected(self, measured: ArrayLike) -> np.ndarray:
         """The inverse of h: line integrals at the reference energy from `measured`, float64 (water precorrection, M = 1).
 
         measured   an array of any shape; h is continued linearly to negative values, which occur with noise
@@ -57,7 +59,8 @@ class Bands:
         for _ in range(100):
             exponent = np.log(self.weights) - np.maximum(p, 0)[..., None] * ratios
             share = softmax(exponent, -1)
-            value = -logsumexp(exponent, axis=-1) + slope * np.minimum(p, 0)
+            total: Any = logsumexp(exponent, axis=-1)
+            value = -total + slope * np.minimum(p, 0)
             step = (target - value) / (share @ ratios)
             p = p + step
             if not np.any(np.abs(step) > 1e-12 * (1 + np.abs(p))):
@@ -65,7 +68,7 @@ class Bands:
         return p
 
 
-def band(signal, ratios, count: int, largest: float) -> Bands:
+def band(signal: ArrayLike, ratios: ArrayLike, count: int, largest: float) -> Bands:
     """The `count` bands that fit a spectrum best.
 
     signal    [E] shares of the detected signal; they sum to 1
@@ -111,7 +114,7 @@ def _band(signal, ratios, materials, count, largest):
     x = least_squares(
         error,
         np.concatenate([np.log(weights), np.log(start).ravel()]),
-        jacobian,
+        jac=jacobian,  # pyright: ignore[reportArgumentType] - a function too, which SciPy's declaration leaves out
         xtol=1e-10,
         ftol=1e-10,
         gtol=1e-14,
@@ -125,7 +128,8 @@ def _band(signal, ratios, materials, count, largest):
 
 def _hardened(points, weights, ratios):
     """h at points [..., M]."""
-    return -logsumexp(-points @ ratios, b=weights, axis=-1)
+    total: Any = logsumexp(-points @ ratios, b=weights, axis=-1)
+    return -total
 
 
 def _points(materials, largest, power):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +16,7 @@ from lingo_mi.effects.hardening import Tube, by_material, hardened
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
 
 
@@ -57,7 +60,7 @@ class Effects:
     def response(self) -> str:
         return self.detector.response if self.detector else 'energy'
 
-    def views(self, view) -> list:
+    def views(self, view: View) -> list[tuple[float, View]]:
         """(weight, View) of all ray bundles; a view's pixels measure their mean intensity."""
         views = self.spot.views(view) if self.spot else [(1.0, view)]
         if self.detector:
@@ -67,7 +70,7 @@ class Effects:
             ]
         return views
 
-    def line_integrals(self, objects, view, options: RenderOptions):
+    def line_integrals(self, objects: list, view: View, options: RenderOptions) -> Any:
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
         objects   of `projectors.objects.find_objects`
@@ -88,18 +91,20 @@ class Effects:
                 integrals.append(total)
             return hardened(integrals, bands) if bands else integrals[0]
 
-        scattered = self.scatter and self.scatter.light(objects, self.tube, self.response, view, self.index)
+        scattered = None
+        if self.scatter and self.tube:
+            scattered = self.scatter.light(objects, self.tube, self.response, view, self.index)
         return self.averaged(along, view, options, scattered)
 
-    def averaged(self, along, view, options: RenderOptions, scattered=None):
+    def averaged(self, along: Callable[[View], Any], view: View, options: RenderOptions, scattered: Any = None) -> Any:
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
 
         along       function of a View: -ln of the intensity along its rays, Float
         scattered   scattered intensity to add, relative to the open beam's, Float [height * width]
         """
         views = self.views(view)
-        psf = self.detector.psf if self.detector else 0
-        if len(views) == 1 and options.pixel == 1 and not psf and scattered is None:
+        blurring = self.detector if self.detector and self.detector.psf else None
+        if len(views) == 1 and options.pixel == 1 and blurring is None and scattered is None:
             return along(view)
         light = mi.Float(0)
         for weight, one in views:
@@ -108,11 +113,11 @@ class Effects:
                 dr.eval(light)
         if scattered is not None:
             light += scattered
-        if psf:
-            light = self.detector.blurred(light, view)
+        if blurring is not None:
+            light = blurring.blurred(light, view)
         return -dr.log(dr.maximum(light, DARKEST))
 
-    def saturated(self, integrals, view):
+    def saturated(self, integrals: Any, view: View) -> Any:
         """Expected -ln(I / I0) with saturation, Float [height * width]. The derivative of saturated pixels is zero."""
         if not (self.detector and self.detector.saturation):
             return integrals
@@ -138,7 +143,7 @@ class Effects:
             projections = np.stack([bands.precorrected(view) for view in projections])  # one by one, for memory
         return replace(scan, projections=projections, effects=None)
 
-    def measured(self, integrals, view, seed: int):
+    def measured(self, integrals: Any, view: View, seed: int):
         """Line integrals as the detector reports them, with noise, from expected ones. Not differentiable."""
         if not (self.detector and self.detector.measures):
             return integrals

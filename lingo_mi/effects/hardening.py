@@ -8,7 +8,9 @@ measured signal.
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -71,11 +73,14 @@ class Tube:
         for name, value in dict(energy=energy, kvp=kvp, angle=p.angle, reference=reference).items():
             if not (value is None or isinstance(value, (int, float)) and not isinstance(value, bool)):
                 raise InputError(f'{name} must be a number, not {value!r}')
-        if (energy is None) == (kvp is None):
+        if energy is not None and kvp is None:
+            spectrum, usual = monochromatic(energy), energy
+        elif kvp is not None and energy is None:
+            spectrum, usual = tube_spectrum(kvp, p.angle, p.filtration), REFERENCE
+        else:
             raise InputError('a tube needs either an energy or a kvp')
-        spectrum = monochromatic(energy) if kvp is None else tube_spectrum(kvp, p.angle, p.filtration)
         if reference is None:
-            reference = REFERENCE if energy is None else energy
+            reference = usual
         if not 1 <= reference <= 1000:
             raise InputError(f'reference must be from 1 to 1000 keV, not {reference:g}')
         if isinstance(bands, bool) or not isinstance(bands, int) or not 1 <= bands <= energy_bands.MOST_BANDS:
@@ -131,7 +136,7 @@ class Tube:
             )
         return names
 
-    def signal(self, names, response: str = 'energy') -> energy_bands.Bands:
+    def signal(self, names: Iterable[str], response: str = 'energy') -> energy_bands.Bands:
         """The bands for materials (names). response: the detector integrates 'energy' or counts photons ('count')."""
         ratios = [attenuation(n, self.spectrum.energies) / attenuation(n, [self.reference]) for n in names]
         return energy_bands.band(self.spectrum.detected(response), ratios, self.bands, LARGEST)
@@ -142,23 +147,23 @@ class Tube:
         return f'{light}, reference = {self.reference:g} keV, material = {" + ".join(self.material) or "none"}'
 
 
-def hardened(integrals, bands: energy_bands.Bands):
+def hardened(integrals: Sequence, bands: energy_bands.Bands) -> Any:
     """The measured signal for line integrals at the reference energy, one Float [pixels] per material.
 
     Differentiable. The error in float32 is 1e-6 for any integrals.
     """
-    exponents = [sum(float(r) * p for r, p in zip(ratios, integrals)) for ratios in bands.ratios.T]
+    exponents: list[Any] = [sum(float(r) * p for r, p in zip(ratios, integrals)) for ratios in bands.ratios.T]
     if len(exponents) == 1:
         return exponents[0]
     least = exponents[0]
     for e in exponents[1:]:
         least = dr.minimum(least, e)
     least = dr.detach(least)  # any constant is valid; this one avoids underflow of the largest term
-    total = sum(float(w) * dr.exp(least - e) for w, e in zip(bands.weights, exponents))
+    total: Any = sum(float(w) * dr.exp(least - e) for w, e in zip(bands.weights, exponents))
     return least - dr.log(total)
 
 
-def by_material(objects, tube: Tube) -> dict:
+def by_material(objects: Iterable, tube: Tube) -> dict[str, list]:
     """For each material, the objects of a scene (`projectors.objects`), or parts of objects, made of it."""
     out = {}
     for thing in objects:
@@ -169,7 +174,7 @@ def by_material(objects, tube: Tube) -> dict:
     return out
 
 
-def second_share(density, split):
+def second_share(density: Any, split: tuple[float, float]) -> Any:
     """The share of the second of two materials at a density (Dr.Jit or NumPy array)."""
     low, high = split
     share = (density - low) * (1 / (high - low))

@@ -16,6 +16,7 @@ Scattered photons are attenuated at their initial energy.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,11 +25,13 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import uniform_filter
 
 from lingo_mi.effects.compton import scattering
-from lingo_mi.effects.hardening import by_material
+from lingo_mi.effects.hardening import Tube, by_material
 from lingo_mi.effects.spectrum import attenuation
 from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import GridInCube
 from lingo_mi.projectors.sampling import bounds, on_grid
+from lingo_mi.projectors.view import View
 
 BATCHES = 16
 MOST_LANES = 2**22  # paths per launch: a few hundred megabytes
@@ -50,7 +53,7 @@ class Scatter:
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     @staticmethod
-    def of(paths, grid, orders, voxels, energies, seed, box) -> Scatter | None:
+    def of(paths: Any, grid: Any, orders: Any, voxels: Any, energies: Any, seed: Any, box: Any) -> Scatter | None:
         """From plugin parameters; None without paths. Raises InputError."""
         for name, value, least, most in (
             ('scatter', paths, 0, MOST_PATHS),
@@ -76,7 +79,7 @@ class Scatter:
             Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed, _corners(box)) if paths else None
         )
 
-    def within(self, geometry) -> Scatter:
+    def within(self, geometry: Geometry) -> Scatter:
         """The same, but nothing scatters outside a geometry's volume."""
         centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
         return replace(self, box=(tuple((centre - half).tolist()), tuple((centre + half).tolist())))
@@ -97,7 +100,7 @@ class Scatter:
             | box
         )
 
-    def light(self, objects, tube, response: str, view, index: int):
+    def light(self, objects: list, tube: Tube, response: str, view: View, index: int) -> Any:
         """Scattered signal, relative to the open beam's, at a view's pixel centres, Float [height * width]. Not differentiable.
 
         objects    of `projectors.objects.find_objects`
@@ -110,7 +113,9 @@ class Scatter:
         means, errors = self.estimate(objects, tube, response, view, index)
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
 
-    def estimate(self, objects, tube, response: str, view, index: int):
+    def estimate(
+        self, objects: list, tube: Tube, response: str, view: View, index: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """`light` on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
             key, made_of = (response, self.voxels, self.energies, self.box), (tube, *objects)
@@ -149,14 +154,15 @@ def _corners(text):
     return tuple(numbers[:3]), tuple(numbers[3:])
 
 
-def smoothed(means, errors, height: int, width: int) -> np.ndarray:
+def smoothed(means: np.ndarray, errors: np.ndarray, height: int, width: int) -> np.ndarray:
     """A bicubic smoothing spline at the pixel centres, [height, width], not negative.
 
     means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's squared residuals sum to
                     the squared errors (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
     """
     rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
-    spline = RectBivariateSpline(rows, columns, means, s=float((errors**2).sum()))
+    residual: Any = float((errors**2).sum())  # SciPy declares a whole number
+    spline = RectBivariateSpline(rows, columns, means, s=residual)
     return np.maximum(spline(np.arange(height) + 0.5, np.arange(width) + 0.5), 0)
 
 
@@ -211,7 +217,8 @@ def _energies(energies, shares, count):
 
 def _medium(densities, reference, energy, response, low, high):
     """The medium of materials whose densities, float32 [x, y, z], are attenuation at the reference energy."""
-    attenuating, scattered = 0.0, []
+    attenuating: Any = 0.0
+    scattered = []
     for name, density in densities.items():
         amount = density / attenuation(name, [reference])[0]
         attenuating = attenuating + amount * attenuation(name, [energy])[0]
@@ -268,22 +275,25 @@ def _box(low, high, medium):
 class _Rays:
     """Rays from a coarse grid of points on the panel to points in a box, in batches that fit into memory."""
 
-    def __init__(self, view, grid, count, low, high):
+    def __init__(self, view: View, grid: tuple[int, int], count: int, low: np.ndarray, high: np.ndarray):
         self.grid, self.count, self.batches = grid, count, BATCHES
         while self.batches > 1 and grid[0] * grid[1] * self.batches * count > MOST_LANES:
             self.batches //= 2
         columns = dr.opaque(mi.UInt32, grid[1])
         self.shifted = dr.arange(mi.UInt32, grid[0] * grid[1] * self.batches * count) // dr.opaque(mi.UInt32, count)
         point = self.shifted // dr.opaque(mi.UInt32, self.batches)
-        self.low, self.extent = dr.opaque(mi.Point3f, low.tolist()), dr.opaque(mi.Vector3f, (high - low).tolist())
-        source, corner, u, v = (mi.Vector3f(a) for a in (view.source, view.corner, view.u, view.v))
+        self.low: Any = dr.opaque(mi.Point3f, low.tolist())
+        self.extent: Any = dr.opaque(mi.Vector3f, (high - low).tolist())
+        Vector3f: Any = mi.Vector3f
+        source, corner, u, v = (Vector3f(a) for a in (view.source, view.corner, view.u, view.v))
         x = mi.Float(point % columns) * dr.opaque(mi.Float, view.width / (grid[1] - 1))
         y = mi.Float(point // columns) * dr.opaque(mi.Float, view.height / (grid[0] - 1))
-        self.origin = mi.Point3f(corner + x * u + y * v)
+        self.origin: Any = mi.Point3f(corner + x * u + y * v)
         beam = source if view.parallel else self.origin - source
-        across = dr.normalize(dr.cross(u, v))
-        self.normal = dr.select(dr.dot(across, beam) < 0, across, -across)  # towards the source
-        self.open = dr.abs(dr.dot(self.normal, beam)) / (1 if view.parallel else dr.norm(beam) ** 3)
+        across: Any = dr.normalize(dr.cross(u, v))
+        self.normal: Any = dr.select(dr.dot(across, beam) < 0, across, -across)  # towards the source
+        along: Any = dr.abs(dr.dot(self.normal, beam))
+        self.open = along / (1 if view.parallel else dr.norm(beam) ** 3)
         corners = (mi.Point3f(self.low + self.extent * mi.Vector3f(i & 1, i >> 1 & 1, i >> 2)) for i in range(8))
         height = [dr.dot(self.normal, p - self.origin) for p in corners]
         nearest = height[0]
@@ -295,7 +305,7 @@ class _Rays:
             )
         dr.eval(self.shifted, self.origin, self.normal, self.open)
 
-    def means(self, integrator, scene, rng) -> np.ndarray:
+    def means(self, integrator: Any, scene: Any, rng: np.random.Generator) -> np.ndarray:
         """Scattered signal, relative to the open beam's, float64 [rows, columns, batches]."""
         shape = *self.grid, self.batches
         sampler = mi.load_dict(dict(type='independent'))

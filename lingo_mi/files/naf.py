@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from typing import Literal
 
 import numpy as np
 
@@ -39,13 +40,16 @@ class _DType:
 
     __slots__ = ('value',)
 
+    value: np.dtype
+
     def __init__(self, name):
         try:
-            self.value = np.dtype(name) if isinstance(name, str) else None
+            value = np.dtype(name) if isinstance(name, str) else None
         except TypeError:
-            self.value = None
-        if self.value is None or self.value.kind not in 'biufc':
+            value = None
+        if value is None or value.kind not in 'biufc':
             raise _Refused(f'the array type {name!r}')
+        self.value = value
 
     def __setstate__(self, state):
         if not (
@@ -59,7 +63,7 @@ class _DType:
             self.value = self.value.newbyteorder(state[1])
 
 
-def _array(shape, dtype, data, order='C') -> np.ndarray:
+def _array(shape, dtype, data, order: Literal['C', 'F'] = 'C') -> np.ndarray:
     if not (
         isinstance(dtype, _DType)
         and isinstance(data, (bytes, bytearray))

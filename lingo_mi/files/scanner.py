@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from os import PathLike
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix
 from lingo_mi.scan import Dataset, Scan
 
@@ -20,7 +26,7 @@ def _floats(value) -> np.ndarray:
     return np.asarray(value, float)
 
 
-def _numbers(values: dict, name: str, where, length: int):
+def _numbers(values: dict, name: str, where: PathLike | str, length: int) -> np.ndarray:
     try:
         array = _floats(values[name]).ravel()
     except (TypeError, ValueError):
@@ -30,7 +36,7 @@ def _numbers(values: dict, name: str, where, length: int):
     return np.broadcast_to(array, length)
 
 
-def _counts(values, name, where, length):
+def _counts(values: dict, name: str, where: PathLike | str, length: int) -> np.ndarray:
     if values.get(name) is None:
         raise InputError(f'{where}: {name} is missing; add it')
     array = _numbers(values, name, where, length)
@@ -39,16 +45,17 @@ def _counts(values, name, where, length):
     return array
 
 
-def _steps(values, kind, counts, where):
+def _steps(values: dict, kind: str, counts: np.ndarray, where: PathLike | str) -> np.ndarray:
     """d = s / n: either may be given; both must agree."""
-    step, side = (values.get(p + kind) is not None for p in 'ds')
-    if not step and not side:
-        raise InputError(f'{where}: neither d{kind} nor s{kind} is given; add one of them')
-    from_side = _numbers(values, 's' + kind, where, len(counts)) / np.maximum(counts, 1) if side else None
-    if not step:
+    from_side = None
+    if values.get('s' + kind) is not None:
+        from_side = _numbers(values, 's' + kind, where, len(counts)) / np.maximum(counts, 1)
+    if values.get('d' + kind) is None:
+        if from_side is None:
+            raise InputError(f'{where}: neither d{kind} nor s{kind} is given; add one of them')
         return from_side
     d = _numbers(values, 'd' + kind, where, len(counts))
-    if side and not np.allclose(d, from_side, rtol=1e-3, atol=0):
+    if from_side is not None and not np.allclose(d, from_side, rtol=1e-3, atol=0):
         raise InputError(f'{where}: d{kind} and s{kind} disagree (s{kind} = n{kind} * d{kind}); remove one of them')
     return d
 
@@ -76,14 +83,15 @@ def moves(values: dict, n: int) -> bool:
     """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
     lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
     several = any(
-        np.ndim(values.get(k)) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
+        np.ndim(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
         for k, length in lengths.items()
+        if values.get(k) is not None
     )
     return several or any(values.get(k) is not None for k in MOTION)
 
 
-def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mode) -> Geometry:
-    """`to_geometry` for a scanner that leaves the circle."""
+def _moving(values: dict, angles, where: PathLike | str, mode: str, sizes: dict[str, Any]) -> Geometry:
+    """`to_geometry` for a scanner that leaves the circle, with the panel and the grid of `sizes`."""
     n = len(angles)
 
     def each(name, length=1):
@@ -99,10 +107,6 @@ def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mod
     return Geometry.per_view(
         DSO=each('DSO'),
         DSD=each('DSD'),
-        nDetector=n_detector,
-        dDetector=d_detector,
-        nVoxel=n_voxel,
-        dVoxel=d_voxel,
         angles=angles,
         mode=mode,
         offOrigin=each('offOrigin', 3),
@@ -111,10 +115,18 @@ def _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mod
         COR=each('COR'),
         tilt=np.radians(each('tilt')),
         height=height,
+        **sizes,
     )
 
 
-def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_order: str = 'vu') -> Geometry:
+def to_geometry(
+    values: dict,
+    angles: ArrayLike,
+    where: PathLike | str,
+    *,
+    detector_shape: tuple[int, ...] | None = None,
+    offset_order: str = 'vu',
+) -> Geometry:
     """A Geometry from TIGRE's names.
 
     values           DSO, DSD, nDetector, dDetector or sDetector in (v, u), nVoxel, dVoxel or sVoxel in (x, y,
@@ -130,7 +142,7 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
 
     Raises InputError if a value is missing, contradictory or out of range.
     """
-    values = dict(values)
+    values, angles = dict(values), np.asarray(angles)
     n_detector = _counts(values, 'nDetector', where, 2)
     d_detector = _steps(values, 'Detector', n_detector, where)
     if detector_shape is not None and tuple(n_detector) != tuple(detector_shape):
@@ -149,33 +161,30 @@ def to_geometry(values: dict, angles, where, *, detector_shape=None, offset_orde
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
             values[name] = 0.0  # puts the panel on the axis, which does not matter for a parallel beam
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
+    sizes: dict[str, Any] = dict(nDetector=n_detector, dDetector=d_detector, nVoxel=n_voxel, dVoxel=d_voxel)
     try:
         if offset_order == 'vu' and (np.ndim(angles) == 2 or moves(values, len(angles))):
-            return _moving(values, angles, where, n_detector, d_detector, n_voxel, d_voxel, mode)
+            return _moving(values, angles, where, mode, sizes)
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
     origin, offset = (
         np.zeros(length) if values.get(name) is None else _numbers(values, name, where, length)
         for name, length in (('offOrigin', 3), ('offDetector', 2))
     )
+    sizes |= dict(offOrigin=origin, offDetector=offset[::-1] if offset_order == 'uv' else offset)
     try:
         return CircularGeometry(
             DSO=float(_numbers(values, 'DSO', where, 1)[0]),
             DSD=float(_numbers(values, 'DSD', where, 1)[0]),
-            nDetector=n_detector,
-            dDetector=d_detector,
-            nVoxel=n_voxel,
-            dVoxel=d_voxel,
             angles=angles,
             mode=mode,
-            offOrigin=origin,
-            offDetector=offset[::-1] if offset_order == 'uv' else offset,
+            **sizes,
         )
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
 
-def to_posed(values: dict, views, where) -> Geometry:
+def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) -> Geometry:
     """A Geometry of given poses: views(nDetector, dDetector or None, parallel, offOrigin) gives them.
 
     values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
@@ -229,7 +238,9 @@ def angle_range(angles: np.ndarray) -> tuple[float, float]:
     return float(low), float((high - low) * n / (n - 1)) if n > 1 else 360.0
 
 
-def make_scan(geometry: Geometry, projections, where, valid=None) -> Scan:
+def make_scan(
+    geometry: Geometry, projections: np.ndarray, where: PathLike | str, valid: np.ndarray | None = None
+) -> Scan:
     """A Scan whose InputError names the file."""
     try:
         return Scan(geometry, projections, valid)
@@ -237,7 +248,7 @@ def make_scan(geometry: Geometry, projections, where, valid=None) -> Scan:
         raise InputError(f'{where}: {error}') from None
 
 
-def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
+def make_dataset(train: Scan, test: Scan | None, volume: np.ndarray | None, where: PathLike | str) -> Dataset:
     """A Dataset with a float32 volume, after a check that the volume [x, y, z] has nVoxel voxels."""
     if volume is not None:
         if volume.shape != train.geometry.nVoxel:
@@ -249,7 +260,7 @@ def make_dataset(train: Scan, test: Scan | None, volume, where) -> Dataset:
     return Dataset(train, test, volume)
 
 
-def one_circle(dataset: Dataset, where) -> CircularGeometry:
+def one_circle(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
     """The geometry of the training views, for formats of circular scans.
 
     Raises InputError if a view is not on the circle, or the test views differ in more than their angles.
@@ -266,7 +277,7 @@ def one_circle(dataset: Dataset, where) -> CircularGeometry:
     return geometry
 
 
-def check_one_scanner(dataset: Dataset, where) -> None:
+def check_one_scanner(dataset: Dataset, where: PathLike | str) -> None:
     """Raises InputError unless the test views differ from the training views in their angles or poses only."""
     geometries = [scan.geometry for scan in (dataset.train, dataset.test) if scan is not None]
     circles = [g for g in geometries if isinstance(g, CircularGeometry)]

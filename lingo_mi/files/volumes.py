@@ -21,6 +21,7 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -111,13 +112,13 @@ def _nifti(path):
     description, to_mm = '', 1.0
     try:
         with reading(path):
-            image = nibabel.load(path)
+            image: Any = nibabel.load(path)
             data = np.asanyarray(image.dataobj)
             if path.name.endswith('.gz'):
                 _check_sum(path)
             if isinstance(image, nibabel.Nifti1Image):
                 description = bytes(image.header['descrip'].item()).decode('utf-8', 'replace')
-                to_mm = _TO_MM.get(image.header.get_xyzt_units()[0], 1.0)
+                to_mm = _TO_MM.get(str(image.header.get_xyzt_units()[0]), 1.0)
     except InputError:
         raise
     except Exception as error:  # a damaged header fails inside nibabel in many ways
@@ -363,7 +364,8 @@ def read_volume(
         density, unit = data.astype(np.float32), description[len(_OURS) :]
     else:
         density, unit = _density(data, path, hu, mu_water)
-    return Volume(np.ascontiguousarray(density, np.float32), tuple(float(s) for s in sides), affine, unit)
+    x, y, z = (float(s) for s in sides)
+    return Volume(np.ascontiguousarray(density, np.float32), (x, y, z), affine, unit)
 
 
 def write_volume(path, data, spacing, origin=None, description: str = 'normalised') -> None:

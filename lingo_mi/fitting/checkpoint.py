@@ -6,6 +6,7 @@ import json
 import os
 import zipfile
 import zlib
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from lingo_mi.fitting.state import State
 METRICS, CHECKPOINT = 'metrics.json', 'checkpoint.npz'  # files of a result
 
 
-def save(path, state: State, extra: dict, arrays: dict | None = None):
+def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = None) -> None:
     """Write a state and plain values (`extra`, as JSON) atomically: after a crash, the previous checkpoint is intact.
 
     arrays   further NumPy arrays to store, by name
@@ -47,7 +48,7 @@ def save(path, state: State, extra: dict, arrays: dict | None = None):
         ) from None
 
 
-def load(path) -> tuple[State, dict, dict]:
+def load(path: PathLike | str) -> tuple[State, dict, dict]:
     """The state, the plain values and the further arrays of a checkpoint.
 
     Raises InputError if the file is missing or is not a checkpoint. Loading never runs code from the file.
@@ -58,9 +59,9 @@ def load(path) -> tuple[State, dict, dict]:
         names = [k[7:] for k in data if k.startswith('values.')]
         state = State(
             *({k: data[f'{group}.{k}'] for k in names} for group in ('values', 'first', 'second')),
-            data['gradient'],
-            data['seen'],
-            data['born'],
+            gradient=data['gradient'],
+            visits=data['seen'],
+            born=data['born'],
         )
         extra = json.loads(str(data['extra']))
     except FileNotFoundError:

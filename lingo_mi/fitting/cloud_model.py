@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -34,7 +38,9 @@ class CloudModel:
         self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
         self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
 
-    def render(self, state: DeviceState, geometry: Geometry, progress=None) -> np.ndarray:
+    def render(
+        self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
+    ) -> np.ndarray:
         """Noise-free projections in the views of a geometry, float32 [view, v, u].
 
         They are line integrals (density times mm), or -ln of the expected signal if the fit models effects. For alpha
@@ -42,13 +48,15 @@ class CloudModel:
 
         progress   called as progress(views done, all views)
         """
-        every, (height, width) = geometry.normalised_rays(), geometry.nDetector
+        g, (height, width) = self.geometry, geometry.nDetector
+        # In the frame of the fit's own volume, whatever the voxels of this geometry.
+        every = replace(geometry, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin).normalised_rays()
         forward = forward_model(self.settings)
         gaussians, share = forward.gaussians(state.values), self.shares(state)
 
-        scattered = [None] * len(geometry)
-        if self.signal is not None and self.signal.scattered:
-            found = self.signal.scattered.estimate(self.cloud(state), geometry)
+        scattered: list[Any] = [None] * len(geometry)
+        found = self.scattered_light(state, geometry)
+        if found is not None:
             scattered = [uploaded(image.ravel()) for image in light_at_pixels(found, geometry)]
 
         def along(rays):
@@ -61,27 +69,40 @@ class CloudModel:
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
-        return out * np.float32(self.unit / geometry.scale)
+        return out * np.float32(self.unit / g.scale)
 
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
         """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
 
-        The grid must have the size of the scan's volume, but may have other voxels.
         None for alpha compositing, whose opacities are not densities.
         """
         if not self.settings.volumetric:
             return None
-        g = geometry or self.geometry
-        grid = Grid(vector64(-g.half), vector64(2 * g.half / g.nVoxel), g.nVoxel)
-        values = voxelize(*state.gaussians(self.settings), grid, self.settings.model.extent, deep=True)
+        own = self.geometry
+        if geometry is None:
+            grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+        else:
+            low = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 - own.offOrigin
+            step = np.array(geometry.dVoxel)
+            grid = Grid(vector64(low * own.scale), vector64(step * own.scale), geometry.nVoxel)
+        gaussians, extent = state.gaussians(self.settings), self.settings.model.extent
+        values = voxelize(*gaussians, grid=grid, extent=extent, deep=True)
         return grid.volume(values) * np.float32(self.unit)
 
-    def shares(self, state: DeviceState):
+    def shares(self, state: DeviceState) -> Any:
         """The second material's share in every Gaussian's density, Float [N]; None for one material."""
-        if self.signal is None or self.signal.split is None:
+        volume = None if self.signal is None or self.signal.split is None else self.volume(state)
+        if self.signal is None or volume is None:
             return None
         centres = np.stack([c.numpy() for c in state.values['centre']], 1)
-        return self.signal.shares(self.volume(state), centres, self.geometry.half)
+        return self.signal.shares(volume, centres, self.geometry.half)
+
+    def scattered_light(self, state: DeviceState, geometry: Geometry) -> np.ndarray | None:
+        """What the cloud scatters into the views of a geometry, as `ScatteredLight.estimate` gives it; None where the fit models
+        no scatter."""
+        light = self.signal and self.signal.scattered
+        cloud = self.cloud(state) if light else None
+        return None if light is None or cloud is None else light.estimate(cloud, geometry)
 
     def cloud(self, state: DeviceState) -> Ellipsoids | None:
         """The Gaussians in the world frame, mm, densities in 1/mm; None for alpha compositing, which has no densities."""

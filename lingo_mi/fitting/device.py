@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,7 +14,7 @@ from lingo_mi.fitting.state import State
 from lingo_mi.projectors.upload import uploaded
 
 
-def _types():
+def _types() -> dict[str, Any]:
     return dict(
         centre=mi.Point3f,
         scale=mi.Vector3f,
@@ -52,9 +54,10 @@ class DeviceState:
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""
-        return bool(dr.all(dr.isfinite(sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values()))))
+        total: Any = sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values())
+        return bool(dr.all(dr.isfinite(total)))
 
-    def adam(self, gradients: dict, settings: Settings, iteration: int):
+    def adam(self, gradients: dict, settings: Settings, iteration: int) -> None:
         """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
         b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
         # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.

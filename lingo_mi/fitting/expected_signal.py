@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,6 +16,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.lingo.density import trilinear
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.view import View
 
 
 class ExpectedSignal:
@@ -35,13 +39,15 @@ class ExpectedSignal:
         self.effects = effects.scaled(geometry.scale)
         self.factor = dr.opaque(mi.Float, unit / geometry.scale)
         self.bands, self.split = None, None
-        self.scattered = ScatteredLight(effects, geometry) if effects.scatter else None
+        self.scattered = None
+        if effects.tube and effects.scatter:
+            self.scattered = ScatteredLight(effects.scatter, effects.tube, effects.response, geometry)
         if effects.tube and (effects.tube.hardens or effects.scatter):
             names = effects.tube.fitted()
             self.bands = effects.tube.signal(names, effects.response)
             self.split = effects.tube.split if len(names) == 2 else None
 
-    def image(self, integrals, view, scattered=None):
+    def image(self, integrals: Callable[[View], Sequence], view: View, scattered: Any = None) -> Any:
         """The expected pixels of a view, Float [height * width]. Differentiable.
 
         integrals   function of a View that returns line integrals along its rays, one Float per material
@@ -54,7 +60,7 @@ class ExpectedSignal:
 
         return self.effects.saturated(self.effects.averaged(seen, view, RenderOptions(), scattered), view) / self.factor
 
-    def shares(self, volume: np.ndarray, centres: np.ndarray, half: np.ndarray):
+    def shares(self, volume: np.ndarray, centres: np.ndarray, half: np.ndarray) -> Any:
         """The second material's share in every Gaussian's density, Float [N]; None for one material.
 
         volume    [x, y, z], the cloud's density, 1/mm

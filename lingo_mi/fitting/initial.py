@@ -41,7 +41,7 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     elif start.init == 'r2':
         volume = FDK().run(scan).volume / unit
         cloud = r2_initialise(volume, g.half, rng, start.n_points, start.fdk_threshold, start.fdk_rescale)
-        cloud = replace(cloud, density=cloud.density * unit)
+        cloud = cloud.denser(unit)
     else:
 
         def render(points, density, spacing, views):

@@ -50,16 +50,17 @@ def run(
 
     Example: `run(scan, FAST, initial_cloud(scan, FAST)).volume()`.
     """
-    if initial is None and path is None:
+    begin = path if initial is None else initial
+    if begin is None:
         raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
     settings = bounded(settings, scan)
     stepper = Stepper(scan, settings)
     rng = np.random.default_rng(seed)
     average = Average(settings.adam.average)
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
-    if initial is None:
-        host, extra, arrays = checkpoint.load(path)
-        require_same_fit(host, extra, settings, scanned, seed, path)
+    if isinstance(begin, Path):
+        host, extra, arrays = checkpoint.load(begin)
+        require_same_fit(host, extra, settings, scanned, seed, begin)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
@@ -67,10 +68,10 @@ def run(
         stepper.restore(arrays)
         average.restore(arrays)
     else:
-        points, order = initial.points.astype(np.float32), []
-        iteration, seconds, history, info = 0, 0.0, [], dict(initial.info)
-        density = None if initial.density is None else initial.density / stepper.model.unit
-        state = DeviceState(start(points, initial.spacing, density, settings))
+        points, order = begin.points.astype(np.float32), []
+        iteration, seconds, history, info = 0, 0.0, [], dict(begin.info)
+        density = None if begin.density is None else begin.density / stepper.model.unit
+        state = DeviceState(start(points, begin.spacing, density, settings))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -9,7 +11,7 @@ BINS = 256
 LANES = 32  # histograms per CPU thread
 
 
-def loss_scale(image, floor: float = 0.01):
+def loss_scale(image: Any, floor: float = 0.01) -> Any:
     """T_g + 1 / (4 T_g) with T_g = max(floor, `otsu`(image)): Float of width 1, detached.
 
     image : Float [N], line integrals
@@ -19,7 +21,7 @@ def loss_scale(image, floor: float = 0.01):
     return threshold + 0.25 / threshold
 
 
-def otsu(image):
+def otsu(image: Any) -> Any:
     """Otsu's threshold, which maximises the variance between two classes: Float of width 1, detached.
 
     image : Float [N], any unit
@@ -79,7 +81,7 @@ def _best_bin(histogram):
     Let n be the number of pixels and s the sum of their bin numbers; n1 and s1 are those of the lower class. Then the
     variance between the classes is (n s1 - n1 s)^2 / (n1 (n - n1)), up to a constant factor.
     """
-    Float64 = dr.float64_array_t(mi.Float)
+    Float64: Any = dr.float64_array_t(mi.Float)
     i, n, s = mi.UInt32(0), Float64(0), Float64(0)
     while i < BINS:
         count = Float64(dr.gather(mi.UInt32, histogram, i))

@@ -18,6 +18,7 @@ values are taken relative to a nearby origin:
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -97,7 +98,7 @@ class _Photometric(dr.CustomOp):
     def backward(self):
         slopes = self.tiles.rows_adjoint(self.slopes)
         dr.eval(slopes)
-        upstream = self.grad_out()
+        upstream: Any = self.grad_out()
         dr.make_opaque(upstream)
         self.set_grad_in('image', self.tiles.columns_adjoint(slopes, *(w * upstream for w in self.weights)))
 
@@ -310,7 +311,7 @@ class _TotalVariation(dr.CustomOp):
         return dr.sum(total) * self.scale
 
     def backward(self):
-        upstream = self.grad_out()
+        upstream: Any = self.grad_out()
         dr.make_opaque(upstream)
         self.set_grad_in('volume', self.slope * (upstream * self.scale))
 

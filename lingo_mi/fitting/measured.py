@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import ndimage
 
@@ -37,9 +39,8 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
         raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
     p = scan.projections
     valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
-    light, share = (
-        ndimage.uniform_filter(a, (0, 3, 3), mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid)
-    )
+    size: Any = 0, 3, 3  # SciPy declares one number
+    light, share = (ndimage.uniform_filter(a, size, mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
     weights = 1 / detector.deviation(light / np.maximum(share, 0.1))
     return (weights * (p.max() / (weights * p).max())).astype(np.float32)
 

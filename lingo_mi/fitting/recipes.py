@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.settings import Settings
 
@@ -78,7 +80,7 @@ METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2, '3dgs': GS3D, 'xgaussian': XG
 VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.volumetric)  # those with a volume
 
 
-def settings_of(method: str, **values) -> Settings:
+def settings_of(method: str, **values: Any) -> Settings:
     """The settings of the recipe `name` or `name:setting=value,...`. `values` replace the recipe's own settings; those in the
     name take precedence.
 
@@ -88,5 +90,6 @@ def settings_of(method: str, **values) -> Settings:
     """
     name, _, changes = method.partition(':')
     if name not in METHODS:
-        raise InputError(f'{method}: the method is unknown; use one of {", ".join(METHODS)}')
-    return METHODS[name].changed(**values).changed(**dict(c.partition('=')[::2] for c in changes.split(',') if c))
+        raise InputError(f'{method}: there is no such recipe; use one of {", ".join(METHODS)}')
+    own = {setting: value for setting, _, value in (c.partition('=') for c in changes.split(',') if c)}
+    return METHODS[name].changed(**values).changed(**own)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from lingo_mi.effects.forward import Effects
-from lingo_mi.effects.scatter import smoothed
+from lingo_mi.effects.hardening import Tube
+from lingo_mi.effects.scatter import Scatter, smoothed
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.view import View
@@ -25,12 +25,10 @@ class ScatteredLight:
     scatter   parameters; nothing scatters outside the volume, so that a single large Gaussian does not enlarge the box
     """
 
-    def __init__(self, effects: Effects, geometry: Geometry):
-        self.scatter = effects.scatter.within(geometry)
-        self.tube = replace(
-            effects.tube, material=effects.tube.fitted(), materials={}
-        )  # the cloud stands for all shapes
-        self.response = effects.response
+    def __init__(self, scatter: Scatter, tube: Tube, response: str, geometry: Geometry):
+        self.scatter = scatter.within(geometry)
+        self.tube = replace(tube, material=tube.fitted(), materials={})  # the cloud stands for all shapes
+        self.response = response
 
     def estimate(self, cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
         """Mean scattered light and its standard error on the coarse grid of every view, float64 [2, n, rows, columns].
@@ -49,4 +47,6 @@ class ScatteredLight:
 
 def light_at_pixels(found: np.ndarray, geometry: Geometry) -> np.ndarray:
     """The scattered signal relative to the open beam's at all pixels, float32 [view, v, u]. found: from `estimate`."""
-    return np.stack([smoothed(*view, *geometry.nDetector) for view in found.swapaxes(0, 1)]).astype(np.float32)
+    rows, columns = geometry.nDetector
+    views = [smoothed(means, errors, rows, columns) for means, errors in found.swapaxes(0, 1)]
+    return np.stack(views).astype(np.float32)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device import DeviceState
@@ -40,7 +44,8 @@ class Stepper:
         unit = density_unit(scan, settings)
         self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
         self.forward = forward_model(settings)
-        self.share = self.scattered = None
+        self.share: Any = None
+        self.scattered: np.ndarray | None = None
         self.targets = _targets(scan, unit, settings)
         self.coarse_until = round(settings.coarse_share * settings.iterations)
         self.coarse = _targets(scan.binned(2), unit, settings) if self.coarse_until else []
@@ -49,7 +54,7 @@ class Stepper:
         self.flat = scan.geometry.nVoxel[2] == 1
         self.poses = Poses(len(scan), self.flat) if max(settings.adam.rate_pose) > 0 else None
 
-    def step(self, state: DeviceState, views, iteration: int, rng):
+    def step(self, state: DeviceState, views: Sequence[int], iteration: int, rng: np.random.Generator) -> Any:
         """Advance the state by one Adam step on the given views. Returns the loss, Float [1], not yet evaluated.
 
         `iteration` counts from 0. `rng` places the cube of the total variation.
@@ -99,7 +104,7 @@ class Stepper:
         scattered = {} if self.scattered is None else dict(scattered=self.scattered)
         return ({} if self.poses is None else self.poses.arrays()) | share | scattered
 
-    def restore(self, arrays: dict):
+    def restore(self, arrays: dict) -> None:
         """Restore the output of `arrays`."""
         if self.poses is not None:
             self.poses.restore(arrays)
@@ -109,13 +114,15 @@ class Stepper:
             self.scattered = arrays['scattered']
             self._light_targets()
 
-    def renew_light(self, state: DeviceState):
+    def renew_light(self, state: DeviceState) -> None:
         """Estimate again the light that the cloud scatters into the views."""
-        self.scattered = self.model.signal.scattered.estimate(self.model.cloud(state), self.corrected())
+        self.scattered = self.model.scattered_light(state, self.corrected())
         self._light_targets()
 
     def _light_targets(self):
-        """Set the expected scattered light of all targets."""
+        """Give all views the scattered light that is expected in them."""
+        if self.scattered is None:
+            return
         views = Scan(self.geometry, light_at_pixels(self.scattered, self.geometry))
         for targets, scan in ((self.targets, views), (self.coarse, views.binned(2))):
             for target, image in zip(targets, scan.projections):

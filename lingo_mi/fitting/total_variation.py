@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,7 +17,7 @@ from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
 
-def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng: np.random.Generator):
+def random_cube_variation(gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator) -> Any:
     """Total variation of a randomly placed cube of samples.
 
     Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
@@ -24,7 +27,8 @@ def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng
     """
     s, half, extent = settings.loss, geometry.half, settings.model.extent
     voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1
-    shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
+    nx, ny, nz = (int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
+    shape = nx, ny, nz
     room = between - (np.array(shape) - 1) * s.tv_stride
     corner = -half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
     voxel = voxel * s.tv_stride
@@ -33,12 +37,12 @@ def random_cube_variation(gaussians, geometry: Geometry, settings: Settings, rng
         centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
         reach = dr.max(scale) * extent
         near = dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))
-        index = dr.compress(near)
+        index: Any = dr.compress(near)
     if dr.width(index) == 0:
         return mi.Float(0)
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
-    cube = voxelize(*chosen, Grid(low, vector64(voxel), shape), extent)
-    loss = s.lambda_tv * losses.tv(cube, shape[::-1])
+    cube = voxelize(*chosen, grid=Grid(low, vector64(voxel), shape), extent=extent)
+    loss = s.lambda_tv * losses.tv(cube, (nz, ny, nx))
     dr.backward(loss)
     evaluate(gaussians)
     return dr.detach(loss)

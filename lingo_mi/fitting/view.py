@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,11 +35,11 @@ class Target:
     """
 
     view: View
-    pixels: object
-    weights: object = None
-    valid: object = None
-    rays: object = None
-    scattered: object = None
+    pixels: Any
+    weights: Any = None
+    valid: Any = None
+    rays: Any = None
+    scattered: Any = None
 
     @staticmethod
     def of(scan: Scan, index: int, unit: float, weights=None) -> Target:

@@ -68,13 +68,15 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
     `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
+    _require_geometry(geometry)
     height, width = geometry.nDetector
     rays = geometry.rays()
     index = _indices(views, len(rays))
     rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        found = [line_integrals(*gaussians, View.of(rays, i, height, width), options) for i in range(len(index))]
+        views = (View.of(rays, i, height, width) for i in range(len(index)))
+        found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 
     return call(
@@ -89,13 +91,14 @@ def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent:
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
+    _require_geometry(geometry)
     shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
 
     def grid(*gaussians):
         cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
-        values = voxels.voxelize(*gaussians, cells, extent, deep=True)
+        values = voxels.voxelize(*gaussians, grid=cells, extent=extent, deep=True)
         i, (nx, ny, nz) = dr.arange(mi.UInt32, math.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
         # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
         x, rest = i // (ny * nz), i % (ny * nz)
@@ -108,10 +111,15 @@ def _checked(function, name: str):
     """A function of Gaussians that first makes sure that they are usable."""
 
     def wrapped(*gaussians):
-        require_usable(*gaussians, f'the arrays given to {name}')
+        require_usable(*gaussians, where=f'the arrays given to {name}')
         return function(*gaussians)
 
     return wrapped
+
+
+def _require_geometry(geometry):
+    if not isinstance(geometry, Geometry):
+        raise InputError(f'geometry must be a Geometry, not {type(geometry).__name__}; of a scan give scan.geometry')
 
 
 def _extent(extent) -> float:
@@ -129,5 +137,5 @@ def _indices(views, count: int) -> np.ndarray:
     except TypeError:
         raise InputError(f'views must be whole numbers, one a view, not {views!r}') from None
     if len(found) == 0 or found.min() < -count or found.max() >= count:
-        raise InputError(f'views must be at least one number from 0 to {count - 1}, not {views!r}')
+        raise InputError(f'views must be at least one number from {-count} to {count - 1}, not {views!r}')
     return found

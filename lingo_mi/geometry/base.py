@@ -23,6 +23,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,11 +32,11 @@ from lingo_mi.errors import InputError
 from lingo_mi.geometry import astra, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
-from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.rays import Index, Rays
 from lingo_mi.geometry.trajectories import helix, scanner_rays
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry(ABC):
     """A scan with a flat panel and a voxel grid: what every kind of scan has, and the constructors of both kinds.
 
@@ -126,7 +127,7 @@ class Geometry(ABC):
         return cls._moving('cone', scan, rotDetector=rotDetector, COR=COR, tilt=tilt, height=helix(angles, pitch))
 
     @classmethod
-    def _moving(cls, mode, scan: dict, **motion) -> Geometry:
+    def _moving(cls, mode: str, scan: dict[str, Any], **motion: Any) -> Geometry:
         """The circle of the numbers `scan`, or what `motion` makes of it where any of that is not zero."""
         circle = CircularGeometry(mode=mode, **scan)
         if not any(np.any(value) for value in motion.values()):
@@ -153,9 +154,8 @@ class Geometry(ABC):
         """
         if mode not in ('cone', 'parallel'):
             raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
-        panel = CircularGeometry(
-            DSO=1.0, DSD=1.0, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel, angles=[0.0]
-        )  # one number may stand for both
+        sizes: dict[str, Any] = dict(nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
+        panel = CircularGeometry(DSO=1.0, DSD=1.0, angles=np.zeros(1), **sizes)  # one number may stand for both
         rays = scanner_rays(angles, DSO, DSD, panel.nDetector, panel.dDetector, mode == 'parallel', **motion)
         if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
             raise InputError(
@@ -186,14 +186,15 @@ class Geometry(ABC):
 
             Geometry.from_poses(Rays(source, corner, u, v, parallel=False), nDetector=(20, 24), nVoxel=64, dVoxel=0.5)
         """
-        posed = PosedGeometry(poses=rays, nDetector=nDetector, nVoxel=nVoxel, dVoxel=dVoxel, offOrigin=offOrigin)
+        sizes: dict[str, Any] = dict(nDetector=nDetector, nVoxel=nVoxel, dVoxel=dVoxel, offOrigin=offOrigin)
+        posed = PosedGeometry(poses=rays, **sizes)
         circle = circle_of(posed.poses, posed.nDetector)
         if circle is None:
             return posed
         return CircularGeometry(mode=posed.mode, **circle, **posed._panel_and_grid())
 
     @classmethod
-    def from_tigre(cls, geo: object, angles: ArrayLike) -> Geometry:
+    def from_tigre(cls, geo: Any, angles: ArrayLike) -> Geometry:
         """The scan that a geometry of TIGRE for Python describes.
 
         geo      `tigre.geometry`, or a dict with its names. Its own order is turned round: nVoxel, dVoxel and offOrigin are
@@ -241,7 +242,7 @@ class Geometry(ABC):
 
     @classmethod
     def from_rtk(
-        cls, source: str | PathLike | object, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
+        cls, source: str | PathLike | Any, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
         offOrigin: ArrayLike = 0.0,
     ) -> Geometry:  # fmt: skip
         """The scan that a geometry of RTK describes.
@@ -281,7 +282,7 @@ class Geometry(ABC):
         """The rays of all views in the world frame, mm."""
 
     @abstractmethod
-    def subset(self, index) -> Geometry:
+    def subset(self, index: Index) -> Geometry:
         """The same scan with the views `index` only: a slice, or integers [m]."""
 
     @abstractmethod
@@ -355,7 +356,7 @@ class Geometry(ABC):
         return {name: getattr(self, name) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CircularGeometry(Geometry):
     """The source on a circle about z before an upright panel, rows down.
 
@@ -403,7 +404,7 @@ class CircularGeometry(Geometry):
             self.angles, self.DSO, self.DSD, self.nDetector, self.dDetector, self.mode == 'parallel', self.offDetector
         )
 
-    def subset(self, index) -> CircularGeometry:
+    def subset(self, index: Index) -> CircularGeometry:
         """The same scan with the views `index` only: a slice, or integers [m]."""
         return replace(self, angles=self.angles[index])
 
@@ -424,7 +425,7 @@ class CircularGeometry(Geometry):
         return replace(self, nDetector=shape, dDetector=step, offDetector=offset)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class PosedGeometry(Geometry):
     """A scan with a pose for every view.
 
@@ -463,7 +464,7 @@ class PosedGeometry(Geometry):
         """The rays of all views in the world frame, mm."""
         return self.poses
 
-    def subset(self, index) -> PosedGeometry:
+    def subset(self, index: Index) -> PosedGeometry:
         """The same scan with the views `index` only: a slice, or integers [m]."""
         return replace(self, poses=self.poses[index])
 
@@ -475,7 +476,7 @@ class PosedGeometry(Geometry):
         return replace(self, nDetector=(nv // by_v, nu // by_u), poses=poses)
 
 
-def _numbers(name: str, value, kind: type, length: int) -> tuple:
+def _numbers(name: str, value: ArrayLike, kind: type, length: int) -> tuple:
     """`length` finite numbers of a kind; one may stand for all."""
     array = np.atleast_1d(np.asarray(value, float)).ravel()
     if len(array) == 1:

@@ -7,6 +7,7 @@ Lengths in mm; a matrix may have any scale and sign. A parallel beam's last row 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.camera import camera_matrices
@@ -21,7 +22,13 @@ def to_matrices(rays: Rays) -> np.ndarray:
     return _TO_INDEX @ camera_matrices(rays)
 
 
-def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0.0, 0.0, 0.0)) -> Rays:
+def from_matrices(
+    matrices: ArrayLike,
+    nDetector: tuple[int, int],
+    dDetector: tuple[float, float],
+    parallel: bool,
+    towards: ArrayLike = (0.0, 0.0, 0.0),
+) -> Rays:
     """The views whose rays the matrices [n, 3, 4] describe.
 
     nDetector   (v, u) pixels
@@ -39,7 +46,7 @@ def from_matrices(matrices, nDetector, dDetector, parallel: bool, towards=(0.0, 
         raise InputError('a projection matrix holds NaN or infinity')
     P = np.linalg.inv(_TO_INDEX) @ matrices
     rows = _parallel(P, towards) if parallel else _cone(P, towards, dDetector[1])
-    return Rays(*(np.array(column) for column in zip(*rows)), parallel).checked()
+    return Rays(*(np.array(column) for column in zip(*rows)), parallel=parallel).checked()
 
 
 def _cone(P, towards, step):

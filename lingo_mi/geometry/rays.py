@@ -5,14 +5,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 
+Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Rays:
     """The rays of n flat-panel views.
 
@@ -36,15 +41,15 @@ class Rays:
     def __len__(self) -> int:
         return len(self.corner)
 
-    def __getitem__(self, index) -> Rays:
+    def __getitem__(self, index: Index) -> Rays:
         """The views selected by a slice or an integer array; one view stays [1, 3] when given as a list."""
         return Rays(self.source[index], self.corner[index], self.u[index], self.v[index], self.parallel)
 
-    def centre(self, nDetector) -> np.ndarray:
+    def centre(self, nDetector: tuple[int, int]) -> np.ndarray:
         """The panels' centres [n, 3]; nDetector is (v, u) pixels."""
         return self.corner + nDetector[1] / 2 * self.u + nDetector[0] / 2 * self.v
 
-    def moved(self, rotation=None, shift=None) -> Rays:
+    def moved(self, rotation: ArrayLike | None = None, shift: ArrayLike | None = None) -> Rays:
         """The views turned about the origin, then shifted: rotation [3, 3] or [n, 3, 3], shift [3] or [n, 3]."""
         rotation = np.eye(3) if rotation is None else np.asarray(rotation, float)
         shift = np.zeros(3) if shift is None else np.asarray(shift, float)
@@ -55,7 +60,8 @@ class Rays:
         """These views, then the other's, of the same kind of beam."""
         if self.parallel != other.parallel:
             raise InputError('views of a parallel and of a cone beam cannot be one scan')
-        return Rays(*(np.concatenate(pair) for pair in zip(self._arrays(), other._arrays())), self.parallel)
+        pairs = zip(self._arrays(), other._arrays())
+        return Rays(*(np.concatenate(pair) for pair in pairs), parallel=self.parallel)
 
     def checked(self) -> Rays:
         """These views as float64 arrays, parallel beams of unit length.
@@ -78,7 +84,7 @@ class Rays:
             source = source / np.linalg.norm(source, axis=1, keepdims=True)
         return Rays(source, corner, u, v, bool(self.parallel))
 
-    def through(self, view: int, x, y):
+    def through(self, view: int, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Origins and (unnormalised) directions [..., 3] of the rays of one view at pixel positions x, y."""
         x, y = np.asarray(x, float)[..., None], np.asarray(y, float)[..., None]
         point = self.corner[view] + x * self.u[view] + y * self.v[view]
@@ -86,7 +92,7 @@ class Rays:
             return point, np.broadcast_to(self.source[view], point.shape)
         return np.broadcast_to(self.source[view], point.shape), point - self.source[view]
 
-    def project(self, points, view: int):
+    def project(self, points: ArrayLike, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Continuous pixel positions (x, y) of `points` [N, 3], NaN where a point is not in front of the source."""
         points = np.asarray(points, float)
         a, b, c = self.u[view], self.v[view], self.corner[view]
@@ -103,11 +109,11 @@ class Rays:
         nn = n @ n
         return np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn
 
-    def _arrays(self):
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self.source, self.corner, self.u, self.v
 
 
-def _faults(source, corner, u, v, parallel):
+def _faults(source, corner, u, v, parallel) -> Iterator[tuple[str, Any]]:
     """What may be wrong with poses, each with the views [n] where it is; later ones count on the earlier."""
     yield 'holds NaN or infinity', ~np.isfinite(np.concatenate([source, corner, u, v], 1)).all(1)
     normal = np.cross(u, v)

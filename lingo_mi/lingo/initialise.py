@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +35,10 @@ class InitialCloud:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def denser(self, factor: float) -> InitialCloud:
+        """The same cloud with densities times `factor`, where it knows any."""
+        return replace(self, density=None if self.density is None else self.density * factor)
 
 
 LSQ_VIEWS = 8  # evenly spaced views for the factor of 'lsq' and 'fdk' (own choice: a few determine one number)
@@ -104,7 +109,11 @@ def _outside(wanted: str, found) -> str:
 
 
 def initialise(
-    scan: Scan, settings: LingoSettings = LingoSettings(), rng=None, render=None, fdk: np.ndarray | None = None
+    scan: Scan,
+    settings: LingoSettings = LingoSettings(),
+    rng: np.random.Generator | None = None,
+    render: Callable[..., np.ndarray] | None = None,
+    fdk: np.ndarray | None = None,
 ) -> InitialCloud:
     """The initial cloud of section III: masks, voxel scaling, intersection of all views, mean pixel.
 
@@ -156,13 +165,13 @@ def initialise(
     jitter = rng.uniform(-0.5, 0.5, centres.shape) * (np.array(grid) > 1)
     points = np.where(jittered[:, None], centres + jitter * size, centres)
 
-    if settings.init_density == 'fdk':
+    if fdk is not None and settings.init_density == 'fdk':
         density = sampled(fdk, points, half)
     else:
         unique, inverse = np.unique(cells, return_inverse=True)
         density = mean_pixel(rays, projections, voxel_centres(grid, half, unique), valid)[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
-    if settings.init_density in ('lsq', 'fdk'):
+    if render is not None and settings.init_density in ('lsq', 'fdk'):
         n = len(rays)
         views = np.unique(np.arange(min(n, LSQ_VIEWS)) * n // min(n, LSQ_VIEWS))
         rendered = render(points, density, spacing, views)

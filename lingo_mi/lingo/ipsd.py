@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 
 def ipsd(initial, structural) -> float:
@@ -17,7 +17,7 @@ def ipsd(initial, structural) -> float:
     """
     if len(initial) == 0 or len(structural) == 0:
         return float('nan')
-    return float(cKDTree(structural).query(initial)[0].mean())
+    return float(KDTree(structural).query(initial)[0].mean())
 
 
 def reverse_distance(initial, structural) -> float:
@@ -38,5 +38,5 @@ def neighbour_distance(points, fallback: float) -> np.ndarray:
     k = min(4, len(points))
     if k < 2:
         return np.full(len(points), float(fallback))
-    distance = cKDTree(points).query(points, k, workers=-1)[0][:, 1:]
+    distance = KDTree(points).query(points, k, workers=-1)[0][:, 1:]
     return np.sqrt(np.mean(distance**2, 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lingo_mi.geometry.rays import Rays
@@ -10,7 +12,13 @@ from lingo_mi.lingo.voxel_filter import valid_voxels
 
 
 def occupancy(
-    rays: Rays, masks: Masks, half, nVoxel, resolution: int = 16, misses: int = 0, outside: str = 'invalid'
+    rays: Rays,
+    masks: Masks,
+    half: np.ndarray,
+    nVoxel: Sequence[int],
+    resolution: int = 16,
+    misses: int = 0,
+    outside: str = 'invalid',
 ) -> float:
     """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
 
@@ -27,6 +35,7 @@ def scale_factor(P: float, V_S: float = 20.0) -> float:
     return max(P * V_S, 1.0)
 
 
-def scaled_grid(nVoxel, S: float, smallest: int = 8) -> tuple[int, int, int]:
+def scaled_grid(nVoxel: Sequence[int], S: float, smallest: int = 8) -> tuple[int, int, int]:
     """V_ds = V_d / S, rounded to whole cells, at least `smallest` (or all cells, if they are fewer)."""
-    return tuple(max(int(n / S + 0.5), min(smallest, int(n))) for n in nVoxel)
+    x, y, z = (max(int(n / S + 0.5), min(smallest, int(n))) for n in nVoxel)
+    return x, y, z

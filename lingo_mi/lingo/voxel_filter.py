@@ -120,7 +120,7 @@ def valid_voxels(rays: Rays, masks: Masks, grid, half, misses: int = 0, outside:
     cells = np.arange(total)
     if total > CHUNK:
         # Invalid pixels exclude no cell.
-        possible = masks.low if valid is None else masks.low | ~masks.valid
+        possible = masks.low if masks.valid is None else masks.low | ~masks.valid
         cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):
         alive = cells[start : start + CHUNK]

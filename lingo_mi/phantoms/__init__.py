@@ -29,9 +29,10 @@ class Analytic(Protocol):
 
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm."""
+        ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Phantom:
     """A voxelized test object.
 

@@ -16,6 +16,7 @@ from scipy.interpolate import PchipInterpolator
 from lingo_mi.phantoms.solids import (
     Blend,
     Block,
+    Branching,
     Cone,
     Cylinder,
     Ellipsoid,
@@ -249,8 +250,8 @@ def _trees(rng, is_lung):
         ):
             root = np.array([s * 36.0, -14 + 4 * y, 26 + 8 * z])
             for turn in rng.normal(0, 0.25, (2, 3)):  # an artery and a vein
-                vessels += branches(rng, root, turn + (s * x, y, z), 38, 4.6, 7, is_lung, shrink=0.77)
-            airways += branches(rng, root + [0, -5, 3], (s * x, y, z + 0.15), 30, 3.4, 3, is_lung, shrink=0.75)
+                vessels += branches(rng, root, turn + (s * x, y, z), 38, 4.6, 7, Branching(is_lung, 0.77))
+            airways += branches(rng, root + [0, -5, 3], (s * x, y, z + 0.15), 30, 3.4, 3, Branching(is_lung, 0.75))
     return vessels, airways
 
 

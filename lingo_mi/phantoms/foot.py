@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.phantoms.solids import (
     Blend,
@@ -77,16 +78,17 @@ class Bone:
     gap: float = 1.8
 
 
-def _long(a, b, base, shaft, head, thick=1.9, bow=0.0, flare=0.26) -> Bone:
+def _long(a: ArrayLike, b: ArrayLike, radii: tuple[float, float, float], thick=1.9, bow=0.0, flare=0.26) -> Bone:
     """A tapered long bone from the centre of its base to the centre of its head.
 
+    radii  of base, shaft and head, mm
     bow    rise at mid-shaft, mm
     flare  the fraction of its length over which the base narrows to the shaft
     """
-    a, b = np.array(a, float), np.array(b, float)
+    (base, shaft, head), start, end = radii, np.array(a, float), np.array(b, float)
 
     def at(t):
-        return tuple(a + t * (b - a) + [0, 0, 4 * bow * t * (1 - t)])
+        return tuple(start + t * (end - start) + [0, 0, 4 * bow * t * (1 - t)])
 
     parts = (
         Cone(at(0), at(flare), base, shaft * 1.05),
@@ -204,7 +206,7 @@ def bones() -> list[Bone]:
         ),
     ]
     for (base, rb, rs, rh), toe in zip(_METATARSALS, _TOES):
-        bone = _long(base, toe[0], rb, rs, rh, thick=1.9 if rs < 6 else 2.4, bow=2.0)
+        bone = _long(base, toe[0], (rb, rs, rh), thick=1.9 if rs < 6 else 2.4, bow=2.0)
         extra = ()
         if rs > 6:  # the plantar ridge between the sesamoids' grooves
             extra = (Cone((-31, 193, 15), (-31, 197, 14), 5, 4),)
@@ -223,7 +225,7 @@ def bones() -> list[Bone]:
             start = p + along * (size * 1.1 + r * 0.55 if j == 0 else r * 1.15)
             if not last:
                 bone = _long(
-                    start, q - along * r * 0.78, r, r * 0.62, r * 0.78, thick=1.4 if i else 1.9, bow=0.4, flare=0.42
+                    start, q - along * r * 0.78, (r, r * 0.62, r * 0.78), 1.4 if i else 1.9, bow=0.4, flare=0.42
                 )
             else:  # the distal phalanx ends in a spade-shaped tuft
                 tip = q - along * r * 0.3
@@ -272,8 +274,10 @@ def _skin(grid: Grid) -> np.ndarray:
         r = (11.8, 12, 9.8) if i == 0 else (8.6, 7.6, 7.8, 6.6) if i < 3 else (8.4, 7.2, 7.2, 6.2)
         pulp = Ellipsoid(np.array(toe[-1]) + [0, -3, 2], (11, 12, 9) if i == 0 else (7.3, 7.5, 6.8))
         toe = Blend((tube(toe, r), pulp), 3.0)
-        where, p = grid.near(toe, 12)
-        toes[where] = np.minimum(toes[where], toe(*p))
+        found = grid.near(toe, 12)
+        if found is not None:
+            where, p = found
+            toes[where] = np.minimum(toes[where], toe(*p))
     d = smooth_min(d, toes, 5.0)
     # The sole: flat under heel, ball and lateral edge, raised under the medial arch.
     x, y, z = grid.at((slice(None),) * 3)
@@ -310,7 +314,7 @@ def _muscles():
     for (a, *_), (b, *_), ta, tb in zip(_METATARSALS[:-1], _METATARSALS[1:], _TOES[:-1], _TOES[1:]):
         p, q = (np.array(a) + b) / 2, (np.array(ta[0]) + tb[0]) / 2
         between.append((tuple(p + 0.2 * (q - p) - [0, 0, 3]), tuple(p + 0.85 * (q - p) - [0, 0, 1]), 5.5, 4))
-    return [Cone(*m) for m in (*leg, *sole, *between)]
+    return [Cone(a, b, ra, rb) for a, b, ra, rb in (*leg, *sole, *between)]
 
 
 def _tendons():

@@ -9,11 +9,17 @@ to first order.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 from scipy.interpolate import PchipInterpolator
+
+SPREAD = 0.55  # tangent of the mean angle by which a branch turns away from the one that it leaves
+Point: TypeAlias = tuple[float, ...] | np.ndarray  # x, y, z
 
 
 def _f(p):
@@ -24,8 +30,8 @@ def _f(p):
 class Cone:
     """A capsule from a to b with a radius that varies linearly from ra to rb."""
 
-    a: tuple
-    b: tuple
+    a: Point
+    b: Point
     ra: float
     rb: float
 
@@ -49,7 +55,7 @@ class Cone:
 class Ellipsoid:
     """An ellipsoid; the rows of `axes` are its unit axes."""
 
-    centre: tuple
+    centre: Point
     radii: tuple
     axes: np.ndarray | None = None
 
@@ -74,7 +80,7 @@ class Ellipsoid:
 class Block:
     """A box with half sides `half` (rounding included) and edges rounded by the radius `edge`."""
 
-    centre: tuple
+    centre: Point
     half: tuple
     edge: float
     axes: np.ndarray | None = None
@@ -95,7 +101,7 @@ class Block:
 class Cylinder:
     """A cylinder along the world axis `axis`, half its length `half`, rims rounded by the radius `edge`."""
 
-    centre: tuple
+    centre: Point
     radius: float
     half: float
     edge: float
@@ -138,8 +144,8 @@ class Blend:
 class Cut:
     """A solid cut by the plane through `point`. `normal` (unit) points into the part that is kept."""
 
-    solid: object
-    point: tuple
+    solid: Any
+    point: Point
     normal: tuple
     k: float = 0.0
 
@@ -293,7 +299,7 @@ class Texture:
     """
 
     def __init__(self, rng, period: float, step: float, scales):
-        n = int(round(period / step))
+        n = round(period / step)
         self.step = step
         noise = rng.standard_normal((n, n, n), dtype=np.float32)
         sigma = np.array(scales) / step
@@ -314,20 +320,42 @@ class Texture:
         return out
 
 
-def branches(rng, start, direction, length, radius, depth, inside=None, spread=0.55, shrink=0.8):
+@dataclass(frozen=True)
+class Branching:
+    """What all branches of a random tree share.
+
+    inside   predicate of a point [3]: a branch that would leave it ends there; None: anywhere
+    shrink   radius of a branch's end over that of its start
+    """
+
+    inside: Callable[[np.ndarray], bool] | None = None
+    shrink: float = 0.8
+
+
+def branches(
+    rng: np.random.Generator,
+    start: ArrayLike,
+    direction: ArrayLike,
+    length: float,
+    radius: float,
+    depth: int,
+    kind: Branching = Branching(),
+) -> list[Cone]:
     """A random branching tree as cones: each branch bends a little and ends in two thinner ones.
 
-    inside  optional predicate of a point [3]: a branch that would leave it ends there
+    start, direction   of the first branch, [3]; the direction of any length
+    length, radius     of it
+    depth              generations of branches after it
     """
     start, direction = np.asarray(start, float), np.asarray(direction, float)
     direction = direction / np.linalg.norm(direction)
     cones = []
-    thin = radius * shrink
+    thin = radius * kind.shrink
     for i in range(3):
         direction = direction + rng.normal(0, 0.13, 3)
         direction /= np.linalg.norm(direction)
         end = start + direction * length / 3
-        if inside is not None and not inside(end):
+        if kind.inside is not None and not kind.inside(end):
             return cones
         r0, r1 = radius + (thin - radius) * i / 3, radius + (thin - radius) * (i + 1) / 3
         cones.append(Cone(tuple(start), tuple(end), r0, r1))
@@ -336,7 +364,7 @@ def branches(rng, start, direction, length, radius, depth, inside=None, spread=0
         side = np.cross(direction, rng.normal(size=3))
         side /= np.linalg.norm(side)
         for sign in (1, -1):
-            turned = direction + sign * side * spread * rng.uniform(0.6, 1.3)
+            turned = direction + sign * side * SPREAD * rng.uniform(0.6, 1.3)
             shorter = length * rng.uniform(0.7, 0.9)
-            cones += branches(rng, start, turned, shorter, thin, depth - 1, inside, spread, shrink)
+            cones += branches(rng, start, turned, shorter, thin, depth - 1, kind)
     return cones

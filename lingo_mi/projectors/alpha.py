@@ -134,7 +134,8 @@ class _Composite(dr.CustomOp):
             self.set_grad_in('values', tuple(dr.zeros(mi.Float, n) for _ in NAMES))
             return
         lists = self.lists
-        upstream = self.grad_out() + dr.zeros(mi.Float, dr.width(self.image))
+        grad: Any = self.grad_out()
+        upstream = grad + dr.zeros(mi.Float, dr.width(self.image))
         slots = [dr.zeros(mi.Float, lists.length) for _ in NAMES]
         dr.make_opaque(upstream, slots)
         dr.eval(_backward(_Place(lists, *self.size), lists, self.packed, self.image, upstream, slots), slots)

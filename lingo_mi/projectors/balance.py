@@ -11,6 +11,7 @@ the end, unless they would be too large. On the GPU there are many teams, one im
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +19,8 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.depth import hashed
+
+while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable
 
 PACKET = 4  # consecutive elements that a lane reads or writes at once
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
@@ -64,11 +67,11 @@ class Share:
     blocks: Any
     lanes: int
 
-    def row(self, block):
+    def row(self, block: Any) -> Any:
         """The row of an item that a lane works on, in one of its blocks, Int32."""
         return mi.Int32(block * self.lanes + self.lane % self.lanes)
 
-    def each_item(self, visit):
+    def each_item(self, visit: Callable[[Any, Any, Any], None]) -> Any:
         """Call visit(g, block, stop) for each item of the share, with its range of blocks. Returns the kernel's result.
 
         Loop states hold only variables that change: otherwise Dr.Jit traces a loop twice, and nested ones 4 or 8 times.
@@ -79,7 +82,7 @@ class Share:
             visit(g, block, dr.select(g < end[0], dr.gather(mi.UInt32, self.blocks, g), end[1]))
             return g + 1, mi.UInt32(0)
 
-        return dr.while_loop(self.begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
+        return while_loop(self.begin, lambda g, block: (g < end[0]) | (g == end[0]) & (block < end[1]), step)[0]
 
 
 @dataclass
@@ -95,7 +98,7 @@ class Target:
     base: Any
     private: bool
 
-    def add(self, value, index):
+    def add(self, value: Any, index: Any) -> None:
         """Add a packet, Vector4f. index: counts packets from the start of `values`."""
         mode = dr.ReduceMode.NoConflicts if self.private else dr.ReduceMode.Auto
         dr.scatter_add(self.values, value, index, mode=mode)
@@ -109,7 +112,7 @@ class Work:
     sharing              number of shares and lanes per team
     """
 
-    def __init__(self, blocks, block_cost, ends, sharing: Sharing):
+    def __init__(self, blocks: Any, block_cost: Any, ends: Any, sharing: Sharing):
         self.count = dr.width(blocks)
         self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
         self.sharing = sharing
@@ -118,7 +121,7 @@ class Work:
         self.arrays = self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
 
     @classmethod
-    def of(cls, blocks, block_cost, sharing: Sharing) -> Work:
+    def of(cls, blocks: Any, block_cost: Any, sharing: Sharing) -> Work:
         ends = dr.prefix_reduce(dr.ReduceOp.Add, mi.UInt64(blocks) * mi.UInt64(block_cost), exclusive=False)
         dr.eval(blocks, block_cost, ends)
         return cls(blocks, block_cost, ends, sharing)
@@ -136,18 +139,20 @@ class Work:
         )
         return Share(lane, begin, end, self.blocks, lanes)
 
-    def add_up(self, kernel, rows: int, width: int, parts: int = 1, /, **arguments):
+    def add_up(self, kernel: Callable[..., Any], rows: int, width: int, parts: int = 1, /, **arguments: Any) -> Any:
         """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole packets.
 
         Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts. Each part is
         summed by itself, and the partial sums are added in float64.
         """
         if parts > 1:
-            which, total = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts), 0
+            which = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts)
+            total: Any = 0
+            Float64: Any = dr.float64_array_t(mi.Float)
             for part in range(parts):
                 blocks = dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0)
                 some = Work.of(blocks, self.block_cost, self.sharing)
-                total += dr.float64_array_t(mi.Float)(some.add_up(kernel, rows, width, **arguments))
+                total += Float64(some.add_up(kernel, rows, width, **arguments))
                 dr.eval(total)
             return mi.Float(total)
         size = rows * packets_of(width)
@@ -175,18 +180,18 @@ def _cut(position, ends, block_cost, count):
         behind = dr.gather(mi.UInt64, ends, g + half) <= position
         return dr.select(behind, g + half + 1, g), dr.select(behind, size - half - 1, half)
 
-    g, _ = dr.while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
+    g, _ = while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
     start = dr.gather(mi.UInt64, ends, g - 1, g > 0)
     # A masked lane reads 0, and an integer division by 0 would crash.
     cost = dr.maximum(mi.UInt64(dr.gather(mi.UInt32, block_cost, g, g < count)), 1)
     return g, mi.UInt32((position - start + cost - 1) // cost)
 
 
-def repeat(first, last, body, *state):
+def repeat(first: Any, last: Any, body: Callable[..., Any], *state: Any) -> tuple:
     """`for i in range(first, last): state = body(i, *state)` in a kernel. Returns the last state."""
-    return dr.while_loop(
-        (first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *(body(i, *state) or ()))
-    )[1:]
+    return while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *(body(i, *state) or ())))[
+        1:
+    ]
 
 
 def packets_of(width: int) -> int:
@@ -194,18 +199,18 @@ def packets_of(width: int) -> int:
     return -(-width // PACKET)
 
 
-def pad(image, rows: int, width: int):
+def pad(image: Any, rows: int, width: int) -> Any:
     """Float [rows * width] with zeros at the end of each row, up to whole packets."""
     if width % PACKET == 0:
         return image
     padded = packets_of(width) * PACKET
     i = dr.arange(mi.UInt32, rows * padded)
-    padded, width = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
-    row, column = i // padded, i % padded
-    return dr.gather(mi.Float, image, row * width + column, column < width)
+    pitch, columns = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
+    row, column = i // pitch, i % pitch
+    return dr.gather(mi.Float, image, row * columns + column, column < columns)
 
 
-def crop(padded, rows: int, width: int):
+def crop(padded: Any, rows: int, width: int) -> Any:
     """The inverse of `pad`."""
     if width % PACKET == 0:
         return padded
@@ -213,7 +218,7 @@ def crop(padded, rows: int, width: int):
     return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, pitch) + i % columns)
 
 
-def pack(Packet, Element, columns):
+def pack(Packet: Any, Element: Any, columns: Sequence) -> Any:
     """Interleave columns [N] into rows of whole packets, so that a lane needs few loads."""
     count, packets = dr.width(columns[0]), len(columns) // PACKET
     target = dr.empty(Element, count * packets * PACKET)
@@ -223,7 +228,7 @@ def pack(Packet, Element, columns):
     return target
 
 
-def load(packed, index, packets=3):
+def load(packed: Any, index: Any, packets: int = 3) -> list[Any]:
     """Row `index` of an array made by `pack`."""
     return [x for j in range(packets) for x in dr.gather(mi.Vector4f, packed, index * packets + j)]
 
@@ -231,35 +236,41 @@ def load(packed, index, packets=3):
 FAR = 3e8  # keeps whole numbers of elements, and sums of a few, within Int32; the fraction takes the excess
 
 
-def whole(x):
+def whole(x: Any) -> Any:
     """The whole number nearest to x, for Float and Float64."""
     return dr.clip(dr.round(x), -FAR, FAR)
 
 
-def high_low(x):
+def high_low(x: Any) -> tuple[Any, Any]:
     """A Float64 as the sum of two Floats."""
     high = mi.Float(x)
     return high, mi.Float(x - type(x)(high))
 
 
-def times(high, low, n):
+def times(high: Any, low: Any, n: Any) -> tuple[Any, Any]:
     """The product of a `high_low` pair and a whole number, as a pair."""
     product = high * n
     return product, dr.fma(low, n, dr.fma(high, n, -product))
 
 
-def pack_halves(a, b):
+def pack_halves(a: Any, b: Any) -> Any:
     """Two corrections in one number, with eight binary digits each; `unpack_halves` is the inverse."""
-    a, b = (dr.reinterpret_array(mi.UInt32, x) & 0xFFFF0000 for x in (a, b))
+    a, b = (_bits(x) & 0xFFFF0000 for x in (a, b))
     return dr.reinterpret_array(mi.Float, a | (b >> 16))
 
 
-def unpack_halves(both):
-    bits = dr.reinterpret_array(mi.UInt32, both)
+def unpack_halves(both: Any) -> tuple[Any, Any]:
+    """The two corrections of `pack_halves`."""
+    bits = _bits(both)
     return dr.reinterpret_array(mi.Float, bits & 0xFFFF0000), dr.reinterpret_array(mi.Float, bits << 16)
 
 
-def span(low, high, offset, column, empty, packets):
+def _bits(x: Any) -> Any:
+    """The bits of a Float, UInt32."""
+    return dr.reinterpret_array(mi.UInt32, x)
+
+
+def span(low: Any, high: Any, offset: Any, column: Any, empty: Any, packets: Any) -> tuple[Any, Any]:
     """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
     far = 1e8  # keeps distant positions within Int32
     first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
@@ -269,7 +280,7 @@ def span(low, high, offset, column, empty, packets):
     return begin, dr.select(empty, begin, dr.minimum(last // PACKET + 1, packets))
 
 
-def position(packet, column, offset):
+def position(packet: Any, column: Any, offset: Any) -> Any:
     """t of the elements of a packet, with full precision near t = 0."""
     whole = mi.Float(packet * PACKET - column)
     return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)

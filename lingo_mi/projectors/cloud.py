@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +25,7 @@ POSE = 4  # arrays at the end of the inputs: source, corner, u, v
 PIXEL_VARIANCE = 1 / 12  # of a unit square, along each axis
 
 
-def columns(rows):
+def columns(rows: Any) -> tuple[Any, Any, Any]:
     """Centres Point3f, scales Vector3f and rotations Vector4f [N] of `ellipsoids`, from its rows of ten numbers, Float [10 N]."""
     i = dr.arange(mi.UInt32, dr.width(rows) // 10) * 10
     # Every entry is read once, so the derivative needs no atomics.
@@ -31,7 +33,9 @@ def columns(rows):
     return mi.Point3f(*c[:3]), mi.Vector3f(*c[3:6]), mi.Vector4f(*c[6:])
 
 
-def line_integrals(centre, scale, rotation, density, view: View, options: RenderOptions, primal: bool = True):
+def line_integrals(
+    centre: Any, scale: Any, rotation: Any, density: Any, view: View, options: RenderOptions, primal: bool = True
+) -> Any:
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
     centre, scale   Point3f, Vector3f [N]; standard deviations
@@ -47,7 +51,7 @@ def line_integrals(centre, scale, rotation, density, view: View, options: Render
     return _of_inputs((centre, scale, rotation, density), view, options, primal)
 
 
-def line_integrals_of_rows(rows, density, view: View, options: RenderOptions, primal: bool = True):
+def line_integrals_of_rows(rows: Any, density: Any, view: View, options: RenderOptions, primal: bool = True) -> Any:
     """`line_integrals` from rows of ten numbers, Float [10 N]: centre, scale, rotation (see `columns`). Saves a copy."""
     return _of_inputs((rows, density), view, options, primal)
 
@@ -73,8 +77,8 @@ class _Panel:
     def pixels(self) -> int:
         return self.width * self.height
 
-    def view(self, pose) -> View:
-        return View(*pose, self.width, self.height, self.parallel, self.panel)
+    def view(self, pose: Sequence) -> View:
+        return View(*pose, width=self.width, height=self.height, parallel=self.parallel, panel=self.panel)
 
 
 class _LineIntegrals(dr.CustomOp):
@@ -116,7 +120,8 @@ class _LineIntegrals(dr.CustomOp):
     def backward(self):
         of_pose = any(self.wanted[-POSE:])  # the pose also changes the rays' lengths, which multiply the image
         prepared, straddling = self.known or self._look(deep=of_pose)
-        self.known, upstream = None, self.grad_out()
+        self.known = None
+        upstream: Any = self.grad_out()
         found = _GATHER(*prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings)
         del prepared  # frees memory: as large as all that follows
         gradients = _BY_INPUTS(*self.inputs, *found, wanted=self.wanted, **self.settings)
@@ -138,7 +143,7 @@ class _LineIntegrals(dr.CustomOp):
         return prepared, dr.compress(straddles)
 
 
-def _read(*inputs, panel, **_):
+def _read(*inputs, panel, **_) -> tuple[tuple[Any, ...], View]:
     """The inputs as (centres, scales, rotations, densities) and the view."""
     *shapes, density = inputs[:-POSE]
     shapes = columns(*shapes) if len(shapes) == 1 else shapes
@@ -147,7 +152,8 @@ def _read(*inputs, panel, **_):
 
 def _footprints(*inputs, panel, options):
     gaussians, view = _read(*inputs, panel=panel)
-    footprints = project(*gaussians, view, options.extent, PIXEL_VARIANCE if options.area else 0.0)
+    widen = PIXEL_VARIANCE if options.area else 0.0
+    footprints = project(*gaussians, view=view, extent=options.extent, widen=widen)
     return view, _affine(footprints) if options.footprint == 'affine' else footprints
 
 
@@ -156,7 +162,7 @@ def _with_rest(image, inputs, settings, indices):
     if dr.width(indices) == 0:
         return image
     gaussians, view = _read(*inputs, **settings)
-    return image + dr.nan if view.parallel else add_straddling(image, *gaussians, view, indices)
+    return image + dr.nan if view.parallel else add_straddling(image, gaussians, view, indices)
 
 
 def _prepare(*inputs, deep, panel, options):

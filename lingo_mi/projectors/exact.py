@@ -6,8 +6,12 @@ valid pixels only.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import gather, scatter, view_table, view_walk, whole_box
@@ -22,12 +26,12 @@ class ExactPair(Stack):
     valid   bool [view, v, u]; None: all
     """
 
-    def __init__(self, geometry: Geometry, valid=None):
+    def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry)
         self._rays = [mi.Float(row) for row in view_table(geometry)]
         self._valid = None if valid is None else self.images(valid)
 
-    def forward(self, volume, views):
+    def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
         A 1 is the length of the ray inside the box, mm; zero for invalid pixels.
@@ -41,9 +45,11 @@ class ExactPair(Stack):
             for image, value in zip(out, (gather(volume, self.size, walk), path)):
                 dr.scatter(image, length * value, target, mode=dr.ReduceMode.Permute)
             dr.eval(out)
-        return tuple(out)
+        return out[0], out[1]
 
-    def adjoint(self, images, views, rule=None):
+    def adjoint(
+        self, images: Any, views: Sequence[int] | np.ndarray, rule: Callable[[Any, Any, Any], Any] | None = None
+    ) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]

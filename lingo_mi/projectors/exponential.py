@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 
 HALF_LOG2E = 0.7213475204444817  # exp(-x / 2) = 2^(-HALF_LOG2E x)
@@ -18,7 +20,7 @@ C = (
 ROUNDER = 1.5 * 2**23  # near it, float32 has no fraction; the last bits hold the added whole number
 
 
-def exp2_of_negative(x):
+def exp2_of_negative(x: Any) -> Any:
     """2^x for x <= 0, to float32's rounding; at least 2^-126."""
     if dr.backend_v(x) == dr.JitBackend.CUDA:  # a hardware instruction
         return dr.exp2(x)
@@ -29,4 +31,5 @@ def exp2_of_negative(x):
     a, b, c = (dr.fma(C[k + 1], f, C[k]) for k in (0, 2, 4))
     power = dr.fma(dr.fma(dr.fma(c, f2, b), f2, a), f, 1)
     Int = dr.int32_array_t(type(x))
-    return dr.reinterpret_array(type(x), dr.reinterpret_array(Int, power) + (dr.reinterpret_array(Int, rounded) << 23))
+    exponent: Any = dr.reinterpret_array(Int, rounded)
+    return dr.reinterpret_array(type(x), dr.reinterpret_array(Int, power) + (exponent << 23))

@@ -36,6 +36,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
+from lingo_mi.projectors.view import View
 
 SQRT_2PI = 2.5066282746310002
 
@@ -68,12 +69,14 @@ class Footprints:
     straddles: Any
 
     @property
-    def visible(self):
+    def visible(self) -> Any:
         """Whether a Gaussian has pixels in the image, Bool [N]."""
         return self.row_end > self.row_begin
 
 
-def project(centre, scale, rotation, density, view, extent: float, widen: float = 0.0) -> Footprints:
+def project(
+    centre: Any, scale: Any, rotation: Any, density: Any, view: View, extent: float, widen: float = 0.0
+) -> Footprints:
     """Footprints of N Gaussians in a view.
 
     Names in the functional API: means = centre, scales = scale, quaternions = rotation here.
@@ -85,9 +88,10 @@ def project(centre, scale, rotation, density, view, extent: float, widen: float 
     widen           variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
     """
     Vector3d = mi.Vector3d
-    Float64 = dr.value_t(Vector3d)
+    Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    rows = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    Vector4d: Any = dr.float64_array_t(type(rotation))
+    rows = rows_of(Vector4d(rotation), Vector3d)
     inverse = 1 / s
     a, b = view.u, view.v
     n = dr.cross(a, b)
@@ -113,6 +117,7 @@ def project(centre, scale, rotation, density, view, extent: float, widen: float 
             support = s * rotate_inverse(rows, n)
             depth, half = dr.dot(n, r) * dr.sign(plane), extent * dr.norm(support)
             near, far = depth - half, depth + half
+            quad = near * far
             hidden = far <= 0
             straddles = near < 0.01 * far
             if view.panel:
@@ -146,7 +151,7 @@ def project(centre, scale, rotation, density, view, extent: float, widen: float 
         else:
             # Detector rows and columns are planes through the source. The outermost, whitened, touch the kappa-sphere.
             reach = extent * dr.abs(depth) / det
-            quad, offset = near * far, extent * reach
+            offset = extent * reach
             low_y, high_y = _roots(quad, -offset * dr.dot(na, support), dr.square(reach) * aa)
             low_x, high_x = _roots(quad, offset * dr.dot(nb, support), dr.square(reach) * bb)
     if widen:

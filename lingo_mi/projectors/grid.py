@@ -14,6 +14,7 @@ the two.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,7 +90,7 @@ def _corners(cell, size):
 
 
 @dr.syntax
-def gather(data, size, walk: Walk):
+def gather(data: Any, size: tuple[int, int, int], walk: Walk) -> Any:
     """The integral along a ray, in units of t."""
     origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
     t = mi.Float(walk.t_first)
@@ -150,7 +151,7 @@ def _leave_cell(target, weight, plane, step, size, on_x, on_y):
 
 
 @dr.syntax
-def scatter(target, value, size, walk: Walk):
+def scatter(target: Any, value: Any, size: tuple[int, int, int], walk: Walk) -> None:
     """The transpose of `gather`: adds `value` times the weight of every corner to `target`.
 
     The weights of the current cell stay in registers. A step through a face writes the four corners left behind
@@ -200,22 +201,23 @@ class _LineIntegrals(dr.CustomOp):
         return 'line_integrals'
 
 
-def _walk(size, box_min, box_max, lines: Lines, low, high):
+def _walk(size, box_min: Any, box_max: Any, lines: Lines, low: Any, high: Any) -> tuple[Walk, Any]:
     """The `Walk` along lines through the part of a grid from `low` to `high`, and the length of a unit of t."""
-    origin, direction, box_min = lines.origin, lines.direction, mi.Point3f(box_min)
-    to_grid = mi.Vector3f(*size) / (mi.Point3f(box_max) - box_min)
+    origin, direction = lines.origin, lines.direction
+    box_min, shape = mi.Point3f(box_min), mi.Vector3f(*size)
+    to_grid = shape / (mi.Point3f(box_max) - box_min)
     origin = mi.Vector3f(mi.Point3f(origin) - box_min) * to_grid - 0.5
     length = dr.norm(mi.Vector3f(direction))
     d, inv, first, last = _clip(origin, mi.Vector3f(direction) * to_grid, low, high, lines.t_min, lines.t_max)
     return Walk(origin, d, inv, first, last), length
 
 
-def whole_box(size):
+def whole_box(size: Iterable[int]) -> tuple[Any, Any]:
     """Opposite corners of the grid, in grid coordinates."""
     return mi.Vector3f(-0.5), mi.Vector3f(*size) - 0.5
 
 
-def line_integrals(data, size, box_min, box_max, lines: Lines):
+def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, lines: Lines) -> Any:
     """Line integrals of a voxel volume.
 
     data               mi.Float [nx * ny * nz], z fastest: densities at the voxel centres
@@ -230,8 +232,9 @@ def line_integrals(data, size, box_min, box_max, lines: Lines):
 
     Raises InputError if `data` does not hold nx * ny * nz values.
     """
-    size = tuple(int(n) for n in size)
-    if dr.width(data) != size[0] * size[1] * size[2]:
+    nx, ny, nz = (int(n) for n in size)
+    size = nx, ny, nz
+    if dr.width(data) != nx * ny * nz:
         raise InputError(f'the volume holds {dr.width(data)} values, but its shape says {size}')
     walk, length = _walk(size, box_min, box_max, lines, *whole_box(size))
     return length * dr.custom(_LineIntegrals, data, size, dr.detach(walk))
@@ -265,7 +268,7 @@ def view_table(geometry: Geometry) -> np.ndarray:
     return np.concatenate(rows, 1).astype(np.float32)
 
 
-def view_rays(row, n_v: int, n_u: int):
+def view_rays(row: Any, n_v: int, n_u: int) -> tuple[Any, Any, Any]:
     """Rays through the pixel centres of a view, v fastest: (origin, direction, t_min).
 
     row is one row of `view_table` as an evaluated mi.Float [19]. Neighbouring lanes are neighbours along v, so
@@ -274,7 +277,7 @@ def view_rays(row, n_v: int, n_u: int):
     index = dr.arange(mi.UInt, n_v * n_u)
     column = index // n_v
     x, y = mi.Float(column) + 0.5, mi.Float(index - column * n_v) + 0.5
-    v = [mi.Vector3f(*(dr.gather(mi.Float, row, 3 * k + i) for i in range(3))) for k in range(6)]
+    v: list[Any] = [mi.Vector3f(*(dr.gather(mi.Float, row, 3 * k + i) for i in range(3))) for k in range(6)]
     return v[0] + x * v[1] + y * v[2], v[3] + x * v[4] + y * v[5], dr.gather(mi.Float, row, 18)
 
 
@@ -290,7 +293,7 @@ def _occupied(volume):
     return low, high
 
 
-def view_walk(geometry, row, low, high):
+def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, Any]:
     """The `Walk` along the rays of a view between `low` and `high`, and the length of a unit of t.
 
     row is one row of `view_table` as an evaluated mi.Float [19].
@@ -299,7 +302,7 @@ def view_walk(geometry, row, low, high):
     return _walk(geometry.nVoxel, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
 
 
-def project(volume, geometry: Geometry, progress=None) -> np.ndarray:
+def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Projections of a voxel volume along the rays of all pixel centres, exact for its trilinear interpolant.
 
     volume     [x, y, z], of shape `geometry.nVoxel`; densities per mm
@@ -331,7 +334,9 @@ def project(volume, geometry: Geometry, progress=None) -> np.ndarray:
     return out
 
 
-def backproject(projections, geometry: Geometry, progress=None) -> np.ndarray:
+def backproject(
+    projections: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None
+) -> np.ndarray:
     """The exact transpose of `project`: float32 [x, y, z], in units of the projections times mm.
 
     projections   [view, v, u], of the shape that `geometry` has

@@ -16,6 +16,7 @@ Volumes and images are on the device: volumes mi.Float [nx * ny * nz], z fastest
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,13 +76,13 @@ class Stack:
         if self.voxels >= 2**32:
             raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
 
-    def images(self, projections):
+    def images(self, projections: np.ndarray) -> Any:
         """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
         return mi.Float(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1).ravel()) + dr.opaque(
             mi.Float, 0
         )
 
-    def select(self, images, views):
+    def select(self, images: Any, views: Sequence[int] | np.ndarray) -> Any:
         """The images of the views `views` out of those of all views."""
         chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
         block = index // self.pixels
@@ -100,7 +101,8 @@ class Joseph(Stack):
         super().__init__(geometry)
         if not isinstance(geometry, CircularGeometry):
             raise InputError('this projector needs a source on a circle about z and an upright panel')
-        half = np.hypot(*(abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2])))
+        x, y = (abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2]))
+        half = np.hypot(x, y)
         if geometry.mode == 'cone' and geometry.DSO <= half:
             raise InputError(
                 f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
@@ -123,7 +125,7 @@ class Joseph(Stack):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
         return self.geometry.voxel_matrices()[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
 
-    def forward(self, volume, views):
+    def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
         A 1 is the length of the ray inside the box, mm.
@@ -135,7 +137,9 @@ class Joseph(Stack):
         column += (dr.gather(mi.UInt, chosen, block) - block) * self.panel[1]
         return _integrate(volume, self.size, self._columns, self._rows, column, row)
 
-    def adjoint(self, images, views, rule=None):
+    def adjoint(
+        self, images: Any, views: Sequence[int] | np.ndarray, rule: Callable[[Any, Any, Any], Any] | None = None
+    ) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]
@@ -168,7 +172,7 @@ class _Tables:
     size: tuple
     panel: tuple
     columns: Any
-    rows: tuple
+    rows: Sequence
     matrices: Any
     margin: int
 

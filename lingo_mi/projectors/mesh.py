@@ -22,16 +22,18 @@ smallest.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.balance import PACKET, SHARING, Share, Sharing, Target, Work, pack, packets_of, repeat
-from lingo_mi.projectors.view import vector64
+from lingo_mi.projectors.view import View, vector64
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 NEAR = 1e-9  # a mesh touches the source if its nearest vertex has at most this share of the farthest vertex's depth
@@ -51,17 +53,17 @@ class MeshPaths:
     must be used equally often in both directions.
     """
 
-    def __init__(self, vertices, faces, name: str, sharing: Sharing = SHARING):
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, name: str, sharing: Sharing = SHARING):
         self.name, self.sharing = name, sharing
-        vertices, faces = _closed(np.asarray(vertices, float), np.asarray(faces, np.int64), name)
+        corners, triangles = _closed(np.asarray(vertices, float), np.asarray(faces, np.int64), name)
         Float64 = dr.value_t(mi.Vector3d)
-        centre = (vertices.min(0) + vertices.max(0)) / 2
+        centre = (corners.min(0) + corners.max(0)) / 2
         self._centre = vector64(centre)
-        self._vertices = mi.Vector3d(*(Float64(x) for x in (vertices - centre).T))  # relative to the centre
-        self._faces = mi.Vector3u(*(mi.UInt32(i) for i in faces.T.astype(np.uint32)))
+        self._vertices = mi.Vector3d(*(Float64(x) for x in (corners - centre).T))  # relative to the centre
+        self._faces = mi.Vector3u(*(mi.UInt32(i) for i in triangles.T.astype(np.uint32)))
         dr.make_opaque(self._vertices, self._faces)
 
-    def lengths(self, view):
+    def lengths(self, view: View) -> Any:
         """Path lengths inside the mesh along the rays of all pixel centres, Float [height * width], row by row.
 
         view   `view.View`; the lengths have its unit
@@ -114,7 +116,7 @@ class MeshPaths:
         packets = packets_of(view.width)
         height, width = dr.opaque(mi.Int32, view.height), dr.opaque(mi.Int32, view.width)
         triangles, blocks, cost = _plan(vertices, self._faces, height, width, self.sharing)
-        drawn = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
+        drawn: Any = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
         if dr.width(drawn) == 0:
             return dr.zeros(mi.Float, view.height * view.width)
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
@@ -143,13 +145,13 @@ class _Packed:
     packets: Any
     bend: Any
 
-    def corners(self, i):
+    def corners(self, i: Any) -> Iterator[Any]:
         """The vertices (x, y, q, 0) of a triangle."""
-        Vector4d = dr.float64_array_t(mi.Vector4f)
+        Vector4d: Any = dr.float64_array_t(mi.Vector4f)
         return (dr.gather(Vector4d, self.vertices, mi.UInt32(k)) for k in (i.x, i.y, i.z))
 
 
-def from_mitsuba(shape) -> MeshPaths:
+def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """The paths through a Mitsuba mesh (`ply`, `obj`, `cube`, `mi.Mesh` ...), in the scene's unit.
 
     Raises InputError if the shape is no mesh, or as `MeshPaths` does.
@@ -293,7 +295,7 @@ def _fill(share: Share, target: Target, mesh: _Packed):
 
             def pixels(packet):
                 column = packet * PACKET + mi.Vector4i(0, 1, 2, 3)
-                q = dr.fma(slope, mi.Vector4f(column - anchor), q0)
+                q: Any = dr.fma(slope, mi.Vector4f(column - anchor), q0)
                 value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-mesh.bend, q, 1), 0)
                 target.add(value, target.base + row * mesh.packets + packet)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +13,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.projectors import cloud, grid
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable
+from lingo_mi.projectors.view import View
 
 # Caches of prepared meshes and of clouds known to be usable; Mitsuba's shapes cannot hold them. An array's index is part of
 # the key, so the array is kept alive: otherwise Dr.Jit could reuse the index.
@@ -21,7 +23,7 @@ _USABLE: dict = {}
 MOST_USABLE = 2
 
 
-def find_objects(scene) -> list:
+def find_objects(scene: mi.Scene) -> list:
     """The attenuating objects of a scene.
 
     Raises InputError for an object that `lingo_xray` cannot integrate, and for a scene without objects.
@@ -35,7 +37,7 @@ def find_objects(scene) -> list:
     return found
 
 
-def _object(shape):
+def _object(shape: mi.Shape) -> Ellipsoids | GridInCube | HomogeneousMesh | None:
     if shape.is_ellipsoids():
         return Ellipsoids(shape)
     medium = shape.interior_medium()
@@ -55,28 +57,29 @@ def _object(shape):
 class Ellipsoids:
     """The built-in `ellipsoids` shape with an attribute `density` [N, 1], as a cloud of Gaussians."""
 
-    def __init__(self, shape):
-        params, self.name = mi.traverse(shape), shape.id()
+    def __init__(self, shape: mi.Shape):
+        params: Any = mi.traverse(shape)
+        self.name = shape.id()
         if 'density' not in params:
             raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
         data, self.density = params['data'], params['density']
         self.second = params.get('second')  # share of a second material
         self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
         key, gaussians = (data.index, self.density.index), (self.centre, self.scale, self.rotation, self.density)
-        if key not in _USABLE and require_usable(*gaussians, f'the ellipsoids {self.name!r}'):
+        if key not in _USABLE and require_usable(*gaussians, where=f'the ellipsoids {self.name!r}'):
             while len(_USABLE) >= MOST_USABLE:
                 _USABLE.pop(next(iter(_USABLE)))
             _USABLE[key] = dr.detach(data), dr.detach(self.density)
 
     @classmethod
-    def of(cls, centre, scale, rotation, density, second, name: str) -> Ellipsoids:
+    def of(cls, centre: Any, scale: Any, rotation: Any, density: Any, second: Any, name: str) -> Ellipsoids:
         """Gaussians without a Mitsuba shape, not checked: Point3f, Vector3f, Vector4f and Float [N]. second may be None."""
         self = cls.__new__(cls)
         self.centre, self.scale, self.rotation, self.density = centre, scale, rotation, density
         self.second, self.name, self.rows = second, name, None
         return self
 
-    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+    def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
         if self.rows is not None:
             return cloud.line_integrals_of_rows(self.rows, self.density, view, options, primal)
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, options, primal)
@@ -85,14 +88,15 @@ class Ellipsoids:
 class GridInCube:
     """An axis-aligned `cube` with a heterogeneous medium whose extinction is a scalar `gridvolume`."""
 
-    def __init__(self, shape, medium):
+    def __init__(self, shape: mi.Shape, medium: mi.Medium):
         self.name, where = shape.id(), f'the medium of the shape {shape.id()!r}'
-        params = mi.traverse(medium)
+        params: Any = mi.traverse(medium)
         tensor = next((v for k, v in params.items() if k.endswith('sigma_t.data')), None)
         if tensor is None or len(tensor.shape) not in (3, 4) or (len(tensor.shape) == 4 and tensor.shape[3] != 1):
             raise InputError(f'{where} must have a gridvolume with one channel as sigma_t')
         volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and 'GridVolume' in str(node))
-        box, cube = volume.bbox(), shape.bbox()
+        box: Any = volume.bbox()
+        cube: Any = shape.bbox()
         if not (
             str(shape).startswith('Cube')
             and _axis_aligned(shape, volume)
@@ -108,7 +112,7 @@ class GridInCube:
         self.low, self.high = box.min, box.max
 
     @classmethod
-    def of(cls, values, low, high, name: str) -> GridInCube:
+    def of(cls, values: np.ndarray, low: Any, high: Any, name: str) -> GridInCube:
         """Densities [x, y, z] that fill the box from `low` to `high`, without a Mitsuba shape."""
         self = cls.__new__(cls)
         self.name, self.scale, self.size = name, 1.0, values.shape
@@ -116,7 +120,7 @@ class GridInCube:
         self.low, self.high = mi.ScalarPoint3f(low), mi.ScalarPoint3f(high)
         return self
 
-    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+    def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
         _no_area(options)
         nx, ny, nz = self.size
         # The projector needs z fastest; Mitsuba stores x fastest.
@@ -153,18 +157,18 @@ def _axis_aligned(cube, volume) -> bool:
 class HomogeneousMesh:
     """A closed mesh with a homogeneous medium inside."""
 
-    def __init__(self, shape, medium):
+    def __init__(self, shape: mi.Shape, medium: mi.Medium):
         from lingo_mi.projectors.mesh import from_mitsuba
 
         self.name = shape.id()
         if not shape.is_mesh():
             raise InputError(f'the shape {shape.id()!r} has a homogeneous medium, but is no mesh: use ply, obj or cube')
-        params = mi.traverse(medium)
+        params: Any = mi.traverse(medium)
         self.sigma = next(
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
         )
         self.scale = params.get('scale', 1.0)
-        geometry = mi.traverse(shape)
+        geometry: Any = mi.traverse(shape)
         # A kept array's index is unique, so a moved mesh does not match the old entry.
         arrays = geometry['vertex_positions'], geometry['faces']
         key = (id(shape), *(x.index for x in arrays))
@@ -179,19 +183,20 @@ class HomogeneousMesh:
         vertices, faces = (np.array(a).reshape(-1, 3) for a in self._arrays)
         return vertices[faces].astype(float)
 
-    def line_integrals(self, view, options: RenderOptions, primal: bool = True):
+    def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
         _no_area(options)
         return self.paths.lengths(view) * mi.Float(self.sigma) * self.scale
 
 
-def _lines(view, near) -> grid.Lines:
+def _lines(view: View, near: Any) -> grid.Lines:
     """The rays of all pixels, starting on the plane through `near` parallel to the panel.
 
     Starting near the object avoids the loss of float32 digits that a distant source would cause.
     """
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)
-    x, y = mi.Float(i % width) + 0.5, mi.Float(i // width) + 0.5
+    x: Any = mi.Float(i % width) + 0.5
+    y: Any = mi.Float(i // width) + 0.5
     near = mi.Vector3d(*near)
     n = dr.cross(view.u, view.v)
     Float, Vector3f = mi.Float, mi.Vector3f

@@ -12,30 +12,34 @@ Gaussians are few, and each takes a pass over the image anyway.
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
+from lingo_mi.projectors.view import View
 
 
-def add_straddling(image, centre, scale, rotation, density, view, indices):
+def add_straddling(image: Any, gaussians: tuple, view: View, indices: Any) -> Any:
     """Add the Gaussians at `indices`, UInt32, to a cone-beam image, Float [height * width]. Differentiable.
 
-    Other arguments as for `footprint.project`.
+    gaussians   centres, scales, rotations and densities, as for `footprint.project`
     """
     for k in range(dr.width(indices)):
         i = dr.gather(mi.UInt32, indices, dr.opaque(mi.UInt32, k))
-        one = [dr.gather(type(x), x, i) for x in (centre, scale, rotation, density)]
-        image += _integrate(*one, view)
+        one = [dr.gather(type(x), x, i) for x in gaussians]
+        image += _integrate(*one, view=view)
         dr.eval(image)
     return image
 
 
-def _integrate(centre, scale, rotation, density, view):
+def _integrate(centre: Any, scale: Any, rotation: Any, density: Any, view: View) -> Any:
     Vector3d = mi.Vector3d
-    Float64 = dr.value_t(Vector3d)
+    Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    rows = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    Vector4d: Any = dr.float64_array_t(type(rotation))
+    rows = rows_of(Vector4d(rotation), Vector3d)
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)
     x, y = Float64(i % width) + 0.5, Float64(i // width) + 0.5

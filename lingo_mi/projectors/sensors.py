@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -9,8 +11,8 @@ from lingo_mi.errors import InputError
 from lingo_mi.projectors.view import View
 
 
-def view_of(sensor) -> View:
-    """The rays through the pixel centres of a flat sensor's film.
+def view_of(sensor: Any) -> View:
+    """The rays through the pixel centres of the film of a flat `mi.Sensor`.
 
     Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's
     crop window. Raises InputError for any other sensor.
@@ -23,7 +25,8 @@ def view_of(sensor) -> View:
             f'lingo_xray cannot use the sensor {sensor.id()!r} ({kind}): '
             'it takes ct_scanner, perspective and orthographic'
         )
-    film, params = sensor.film(), mi.traverse(sensor)
+    film = sensor.film()
+    params: Any = mi.traverse(sensor)
     (width, height), (crop_x, crop_y) = film.size(), film.crop_offset()
     (crop_width, crop_height) = film.crop_size()
     Vector3d = mi.Vector3d

@@ -116,7 +116,7 @@ class Plan:
 
     def __init__(self, prepared, height: int, width: int, extent: float, sharing: Sharing):
         packed, places, *work = prepared
-        self.height, self.width, self.work = height, width, Work(*work, sharing)
+        self.height, self.width, self.work = height, width, Work(*work, sharing=sharing)
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(width))
         self.packed = _Packed(packed, places, extent2, packets)
 

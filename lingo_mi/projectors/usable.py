@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +15,7 @@ MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7
 SAFE_ASPECT = 1e6
 
 
-def require_usable(centre, scale, rotation, density, where: str) -> bool:
+def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: str) -> bool:
     """Whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
 
     centre, scale, rotation, density   as for `footprint.project`
@@ -38,14 +39,14 @@ def require_usable(centre, scale, rotation, density, where: str) -> bool:
         thin = longest > SAFE_ASPECT * shortest
         worst = dr.max(dr.select(sound, dr.select(thin, mi.UInt32(1), 0), 2))[0] if dr.width(sound) else 0
         if worst == 2:
-            first = int(dr.compress(~sound)[0])
+            first = _first(~sound)
             raise InputError(
                 f'Gaussian {first} of {where} is not usable: centre, density and rotation must '
                 f'be finite, the quaternion not zero, the scales positive and at most {MOST_ASPECT:.0e} apart, '
                 f'lengths below {MOST_LENGTH:.0e} and above {1 / MOST_LENGTH:.0e}, densities below {MOST_DENSITY:.0e}'
             )
         if worst == 1:
-            first = int(dr.compress(thin)[0])
+            first = _first(thin)
             warnings.warn(
                 AccuracyWarning(
                     f'the scales of Gaussian {first} of {where} are more than {SAFE_ASPECT:.0e} '
@@ -54,3 +55,9 @@ def require_usable(centre, scale, rotation, density, where: str) -> bool:
                 stacklevel=3,
             )
     return worst == 0
+
+
+def _first(where: Any) -> int:
+    """The first index at which a Bool is true."""
+    index: Any = dr.compress(where)
+    return int(index[0])

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.geometry.rays import Rays
 
-def vector64(xyz):
+
+def vector64(xyz: Iterable[float]) -> Any:
     """An opaque Array3f64 of three Python numbers; literals would be compiled into the kernel."""
     Array3d, Float64 = mi.Vector3d, dr.value_t(mi.Vector3d)
     return Array3d(*(dr.opaque(Float64, float(x)) for x in xyz))
@@ -39,23 +42,24 @@ class View:
     panel: bool = True
 
     @staticmethod
-    def of(rays, index: int, height: int, width: int, panel: bool = True) -> View:
-        """View `index` of `lingo_mi.geometry.base.Rays`."""
+    def of(rays: Rays, index: int, height: int, width: int, panel: bool = True) -> View:
+        """View `index` of `lingo_mi.geometry.rays.Rays`."""
         return View(
             *(vector64(a[index]) for a in (rays.source, rays.corner, rays.u, rays.v)),
-            width,
-            height,
-            rays.parallel,
-            panel,
+            width=width,
+            height=height,
+            parallel=rays.parallel,
+            panel=panel,
         )
 
-    def lengths(self):
+    def lengths(self) -> Any:
         """|D| of every pixel, Float [height * width], row by row: the Jacobian of the ray parameter, 1 for parallel beams."""
         if self.parallel:
             return mi.Float(1)
-        i = dr.arange(mi.UInt32, self.width * self.height)
-        x, y = i % self.width + 0.5, i // self.width + 0.5
+        i: Any = dr.arange(mi.UInt32, self.width * self.height)
+        x: Any = mi.Float(i % self.width + 0.5)
+        y: Any = mi.Float(i // self.width + 0.5)
         axis = self.corner - self.source
         # All in float32, also the constant, which would promote the sum to float64: |D| only needs relative accuracy.
-        d = mi.Vector3f(axis) + mi.Float(x) * mi.Vector3f(self.u) + mi.Float(y) * mi.Vector3f(self.v)
+        d = mi.Vector3f(axis) + x * mi.Vector3f(self.u) + y * mi.Vector3f(self.v)
         return dr.norm(d)

@@ -61,12 +61,14 @@ class Grid:
     shape: tuple[int, int, int]
     sharing: Sharing = SHARING
 
-    def volume(self, values):
+    def volume(self, values: Any) -> np.ndarray:
         """Float [nz * ny * nx] as a host volume, float32 [x, y, z]."""
         return np.ascontiguousarray(values.numpy().reshape(self.shape[::-1]).transpose(2, 1, 0))
 
 
-def voxelize(centre, scale, rotation, density, grid: Grid, extent: float, deep: bool = False):
+def voxelize(
+    centre: Any, scale: Any, rotation: Any, density: Any, grid: Grid, extent: float, deep: bool = False
+) -> Any:
     """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
 
     centre, scale, rotation, density   as for `footprint.project`; if a Gaussian is not finite, or has a zero scale or
@@ -75,9 +77,10 @@ def voxelize(centre, scale, rotation, density, grid: Grid, extent: float, deep: 
     deep                               whether to use partial sums where many Gaussians overlap (see `depth`)
     """
     Vector3d = mi.Vector3d
-    Float64 = dr.value_t(Vector3d)
+    Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
-    axes = rows_of(dr.float64_array_t(type(rotation))(rotation), Vector3d)
+    Vector4d: Any = dr.float64_array_t(type(rotation))
+    axes = rows_of(Vector4d(rotation), Vector3d)
     cx, cy, cz = (axis * (grid.step[i] / s) for i, axis in enumerate(axes))
     m1 = dr.norm(cx)
     s1, s2 = dr.dot(cx, cy) / dr.square(m1), dr.dot(cx, cz) / dr.square(m1)

@@ -23,9 +23,10 @@ import scipy.fft
 from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.arcs import gaps
+from lingo_mi.reconstruction.preconditions import require_circle
 from lingo_mi.reconstruction.rectify import rectified
 from lingo_mi.scan import Scan
 
@@ -40,6 +41,7 @@ WINDOWS = {
     'hann': lambda f: 0.5 + 0.5 * np.cos(np.pi * f),
 }
 
+NAME = 'filtered backprojection'  # in messages
 BATCH = 4  # views per launch, which share the index arithmetic and the volume's memory traffic
 
 
@@ -86,7 +88,7 @@ def view_weights(geometry: Geometry) -> np.ndarray:
     return weight * min(1.0, np.pi / gap.sum())
 
 
-def ray_weights(geometry: Geometry) -> np.ndarray:
+def ray_weights(geometry: CircularGeometry) -> np.ndarray:
     """Weight of every ray among its repetitions, times their usual number: [view, u], or [1, u] if all views agree.
 
     short scan         a cone beam over an open arc that exceeds half a turn by at least the fan angle: Parker, "Optimal
@@ -119,7 +121,7 @@ def ray_weights(geometry: Geometry) -> np.ndarray:
     return np.sin(np.pi / 4 * np.clip(np.minimum(rise, fall), 0, 2)) ** 2 * gap.sum() / np.pi
 
 
-def _lacking(geometry: Geometry) -> int:
+def _lacking(geometry: CircularGeometry) -> int:
     """Columns missing on a panel's shorter side. Only on a closed circle, where opposite views measure those rays."""
     if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
         return 0
@@ -131,7 +133,7 @@ def extended(scan: Scan) -> Scan:
 
     Filtering spreads measured values into these columns. Any other scan is returned unchanged.
     """
-    geometry = scan.geometry
+    geometry = require_circle(scan, NAME)
     lacking = _lacking(geometry)
     if lacking == 0:
         return scan
@@ -145,7 +147,7 @@ def extended(scan: Scan) -> Scan:
     return Scan(wider, np.pad(scan.projections, ((0, 0), (0, 0), columns)))
 
 
-def filtered(projections: np.ndarray, geometry: Geometry, window: str = 'ram-lak') -> np.ndarray:
+def filtered(projections: np.ndarray, geometry: CircularGeometry, window: str = 'ram-lak') -> np.ndarray:
     """Cosine-weighted, ramp-filtered projections, float32 [view, v, u], per mm."""
     n_v, n_u = geometry.nDetector
     tau = geometry.dDetector[1]
@@ -234,10 +236,10 @@ class FDK(Algorithm):
                 'filtered backprojection starts from no volume: leave out start, or take another algorithm'
             )
         began = time.perf_counter()
-        level = rectified(scan, 'filtered backprojection')
-        rays = ray_weights(level.geometry)[:, None].astype(np.float32)
+        level = rectified(scan, NAME)
+        rays = ray_weights(require_circle(level, NAME))[:, None].astype(np.float32)
         level = extended(Scan(level.geometry, level.projections * rays))
-        geometry = level.geometry
+        geometry = require_circle(level, NAME)
         volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
         dr.make_opaque(volume)
         matrices, weights = geometry.voxel_matrices(), view_weights(geometry)

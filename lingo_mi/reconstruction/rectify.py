@@ -60,7 +60,7 @@ def can_rectify(scan: Scan) -> bool:
     return True
 
 
-def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Geometry:
+def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> CircularGeometry:
     """The geometry of an upright panel that contains the real panel's shadow in all views, with pixels no coarser.
 
     With an offset panel on a closed circle, the new panel is cut on the short side where its last row begins to see, because
@@ -98,10 +98,11 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ge
             right = max(right, -left)
             left = -right
     step_u, step_v = _steps(_homographies(plane, rays), shadow)
+    rows, columns = (int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u))
     return CircularGeometry(
         DSO=DSO,
         DSD=DSD,
-        nDetector=tuple(int(np.ceil(x - 1e-6)) for x in ((bottom - top) / step_v, (right - left) / step_u)),
+        nDetector=(rows, columns),
         dDetector=(step_v, step_u),
         nVoxel=geometry.nVoxel,
         dVoxel=geometry.dVoxel,

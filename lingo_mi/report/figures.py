@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -402,7 +403,8 @@ def _png(draw, width, height, dpi):
     out = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         fig = Figure(figsize=(width, height), layout='constrained')
-        fig.get_layout_engine().set(**PADS)
+        engine: Any = fig.get_layout_engine()  # the one that was just chosen
+        engine.set(**PADS)
         draw(fig)
         fig.savefig(out, format='png', dpi=dpi)
     return out.getvalue()

@@ -197,7 +197,7 @@ def _page(data: ReportData) -> str:
     metrics = data.metrics
     quality = [(label, _value(key, metrics[key])) for key, (label, *_) in QUALITY.items() if key in metrics]
     settings = [(label, _value(key, metrics[key])) for key, label in SETTINGS.items() if key in metrics]
-    size = ' x '.join(str(n) for n in data.shape)
+    size = ' x '.join(str(n) for n in data.shape or ())
     settings.append(('Volume', f'{size} voxels of {" x ".join(f"{s:.4g}" for s in data.spacing)} mm'))
     known = {*QUALITY, *SETTINGS, 'history'}
     settings += [

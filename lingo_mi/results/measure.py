@@ -13,7 +13,7 @@ from lingo_mi.scan import Dataset, Scan
 
 
 def quick_measure(dataset: Dataset, most: int = 4):
-    """A function for `fit.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where the truth is known."""
+    """A function for `fitting.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where there is a truth."""
     test = dataset.test
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)
@@ -67,6 +67,7 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
         psnr_2d=of(metrics.psnr_2d, rendered, expected),
         ssim_2d=of(metrics.ssim_2d, rendered, expected),
+        ssim_2d_absolute=of(metrics.ssim_2d_absolute, rendered, expected),
         **compared(volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
@@ -17,7 +18,8 @@ def data_file(name: str, parameter: str) -> str:
 
     Raises InputError, in one line, if there is no such file.
     """
-    found = Path(str(mi.file_resolver().resolve(name)))
+    resolver: Any = mi.file_resolver  # declared as an object
+    found = Path(str(resolver().resolve(name)))
     folder = os.environ.get('LINGO_MI_DATA')
     if not found.exists() and folder:
         found = Path(folder) / name

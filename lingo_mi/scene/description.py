@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import numpy as np
 
 from lingo_mi.errors import InputError
@@ -13,6 +15,7 @@ from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.scene.data_files import data_file
 
 MOST_VIEWS = 100_000
+T = TypeVar('T', str, int, float)
 NAMES = (
     'mode',
     'DSO',
@@ -75,7 +78,7 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
     )
 
 
-def parameter(props, name, default):
+def parameter(props: Any, name: str, default: T) -> T:
     """A property with the type of its default: a string, a whole number or a finite number."""
     value = props.get(name, default)
     kind, wanted = {str: (str, 'text'), int: (int, 'a whole number'), float: ((int, float), 'a number')}[type(default)]
@@ -108,10 +111,10 @@ def _counts(props, name):
     return values
 
 
-def read_scanner(props):
+def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     """The scan's and the held-out views' geometry from a plugin's properties."""
     mode = parameter(props, 'mode', 'cone')
-    shared = dict(
+    shared: dict[str, Any] = dict(
         mode=mode,
         nDetector=_counts(props, 'nDetector'),
         nVoxel=_counts(props, 'nVoxel'),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
@@ -16,10 +18,10 @@ from lingo_mi.scene.checks import check_memory
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A scene, its scanner and their origin."""
+    """A scene (`mi.Scene`), its scanner (the plugin `ct_scanner`) and their origin."""
 
-    scene: object
-    scanner: object
+    scene: Any
+    scanner: Any
     path: Path
 
     @property
@@ -27,7 +29,7 @@ class LoadedScene:
         return self.path.stem
 
 
-def load_scene(path, parameters: dict | None = None) -> LoadedScene:
+def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedScene:
     """Load a Mitsuba scene with a `ct_scanner`.
 
     parameters   values for the scene's own `<default>` names
@@ -59,7 +61,7 @@ def load_scene(path, parameters: dict | None = None) -> LoadedScene:
     return LoadedScene(scene, scanner, path)
 
 
-def defaults(path) -> set[str]:
+def defaults(path: PathLike | str) -> set[str]:
     """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no XML."""
     if not Path(path).is_file():
         raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')

@@ -31,8 +31,8 @@ def dataset(side: int, pixels: int, views: int) -> Dataset:
     geometry = CircularGeometry(
         DSO=1000.0,
         DSD=1500.0,
-        nDetector=pixels,
-        dDetector=512 / pixels,
+        nDetector=(pixels, pixels),
+        dDetector=(512 / pixels, 512 / pixels),
         nVoxel=phantom.data.shape,
         dVoxel=phantom.spacing,
         angles=angles,
@@ -60,7 +60,8 @@ def initialisations(sizes: Sizes) -> list[dict]:
             settings = fast.changed(n_points=n, **changes)
             cloud = initial_cloud(data.train, settings)
             model = CloudModel(settings, data.train.geometry, density_unit(data.train, settings))
-            state = DeviceState(start(cloud.points, cloud.spacing, cloud.density / model.unit, settings))
+            density = None if cloud.density is None else cloud.density / model.unit
+            state = DeviceState(start(cloud.points, cloud.spacing, density, settings))
             fitted = run(data.train, settings, cloud)
             born = fitted.state.values['centre'][fitted.state.born]
             rows.append(

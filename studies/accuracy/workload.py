@@ -42,11 +42,11 @@ class Workload:
         self.geometry = CircularGeometry(
             DSO=DSO,
             DSD=DSD,
-            nDetector=pixels,
-            dDetector=PANEL / pixels,
-            nVoxel=8,
-            dVoxel=1 / 4,
-            angles=[0.4],
+            nDetector=(pixels, pixels),
+            dDetector=(PANEL / pixels, PANEL / pixels),
+            nVoxel=(8, 8, 8),
+            dVoxel=(1 / 4, 1 / 4, 1 / 4),
+            angles=np.array([0.4]),
             mode=mode,
         )
         self.view = View.of(self.geometry.rays(), 0, pixels, pixels)

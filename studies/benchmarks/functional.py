@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.functional import project
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
@@ -28,8 +29,8 @@ from lingo_mi.runtime import use_variant
 WARM = 3  # turns that are not counted
 
 
-def main():
-    p = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main() -> None:
+    p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     p.add_argument('--gaussians', type=int, default=20_000)
     p.add_argument('--pixels', type=int, default=256, help='rows and columns of the panel')
     p.add_argument('--repeats', type=int, default=20, help='turns')
@@ -52,8 +53,8 @@ def measured(count: int, pixels: int, repeats: int) -> tuple[float, float]:
         rng.normal(size=(count, 4)),
         rng.uniform(0.01, 0.02, count),
     )
-    geometry = CircularGeometry(
-        500, 750, (pixels, pixels), (256 / pixels, 256 / pixels), (64,) * 3, (2.5,) * 3, circular(1)
+    geometry = Geometry.cone(
+        DSO=500, DSD=750, nDetector=pixels, dDetector=256 / pixels, nVoxel=64, dVoxel=2.5, angles=circular(1)
     )
     upstream = np.float32(rng.normal(size=(pixels, pixels)))
     both = _native(cloud, geometry, upstream), _through_torch(cloud, geometry, upstream)
@@ -70,7 +71,7 @@ def _native(cloud, geometry, upstream):
     def run():
         leaf = [dr.detach(x) for x in gaussians]
         dr.enable_grad(leaf)
-        image = line_integrals(*leaf, view, RenderOptions())
+        image = line_integrals(*leaf, view=view, options=RenderOptions())
         dr.set_grad(image, upstream)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
@@ -90,7 +91,8 @@ def _through_torch(cloud, geometry, upstream):
     def run():
         for x in tensors:
             x.grad = None
-        project(*tensors, geometry).backward(upstream)
+        image: Any = project(*tensors, geometry=geometry)
+        image.backward(upstream)
         dr.sync_thread()
         if device == 'cuda':
             torch.cuda.synchronize()

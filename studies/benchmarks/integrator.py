@@ -180,8 +180,9 @@ class Bench:
         start = rays(view, 2 * 128.0)
         tree.image(*(type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start))  # builds the tree
         image_of_tree, forward = _timed(tree.image, *start)
-        by_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
-        return out | dict(zip(TREE, (forward, backward, *errors(image_of_tree.numpy(), *(x.numpy() for x in by_tree)))))
+        gradients_of_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
+        of_tree = errors(image_of_tree.numpy(), *(x.numpy() for x in gradients_of_tree))
+        return out | dict(zip(TREE, (forward, backward, *of_tree)))
 
 
 def _timed(function, *arguments):

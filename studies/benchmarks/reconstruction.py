@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi import phantoms
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction.fdk import FDK
@@ -43,7 +43,9 @@ def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
     dr.set_thread_count(cores)
     volume = phantoms.make('shepp_logan', size).data
-    geometry = CircularGeometry(1000.0, 1500.0, (size, size), 512 / size, volume.shape, 256 / size, circular(views))
+    geometry = Geometry.cone(
+        DSO=1000, DSD=1500, nDetector=size, dDetector=512 / size, nVoxel=size, dVoxel=256 / size, angles=circular(views)
+    )
     empty = Scan(geometry, np.zeros((views, size, size), np.float32))
     scan = Scan(geometry, ours(empty, volume)['projector']())
     packages = dict(ours=ours(scan, volume))
@@ -88,7 +90,9 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
 
     def sart():
         system = System(scan)
-        x = sweep(system, system.start(None), 1.0, blocks(geometry.angles, 1, 'ordered', None), True)
+        x = sweep(
+            system, system.start(None), 1.0, blocks(geometry.angles, 1, 'ordered', np.random.default_rng(0)), True
+        )
         dr.eval(x)
         return system.volume(x)
 
@@ -125,9 +129,9 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
         return None
     torch.set_num_threads(cores)
     geometry = scan.geometry
-    frames = geometry.rays()
+    rays = geometry.rays()
     pixel, voxel = geometry.dDetector[::-1], geometry.dVoxel[::-1]
-    place = [frames.source, frames.centre(geometry.nDetector), frames.u / pixel[0], frames.v / pixel[1]]
+    place = [rays.source, rays.centre(geometry.nDetector), rays.u / pixel[0], rays.v / pixel[1]]
     trajectory = tuple(torch.tensor(np.ascontiguousarray(x), dtype=torch.float32) for x in place)
     shapes = dict(detector_spacing=pixel, voxel_spacing=voxel, backend='torch')
     projector = Projector(trajectory, geometry.nVoxel[::-1], geometry.nDetector[::-1], **shapes)

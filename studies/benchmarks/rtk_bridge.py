@@ -8,21 +8,26 @@ RTK rotates about y: its (x, y, z) is (y, z, x) here. Gantry angles are the same
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
-def gantry(geometry: Geometry, itk):
-    """RTK's geometry object."""
+def gantry(geometry: Geometry, itk: Any):
+    """RTK's geometry object. Raises InputError for a scan that is not on a circle."""
+    if not isinstance(geometry, CircularGeometry):
+        raise InputError('RTK is compared with on circles only; this scan has other poses')
     out = itk.RTK.ThreeDCircularProjectionGeometry.New()
     for angle in np.degrees(geometry.angles):
         out.AddProjection(geometry.DSO, geometry.DSD, float(angle), geometry.offDetector[1], geometry.offDetector[0])
     return out
 
 
-def volume_image(volume: np.ndarray, geometry: Geometry, itk):
+def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any):
     """A volume [x, y, z] as an ITK image (y, z, x)."""
     image = itk.image_from_array(np.ascontiguousarray(volume.transpose(0, 2, 1), np.float32))
     order = [1, 2, 0]
@@ -32,7 +37,7 @@ def volume_image(volume: np.ndarray, geometry: Geometry, itk):
     return image
 
 
-def projection_image(projections: np.ndarray, geometry: Geometry, itk):
+def projection_image(projections: np.ndarray, geometry: Geometry, itk: Any):
     """Projections [view, v, u] as an ITK stack; rows upwards."""
     image = itk.image_from_array(np.ascontiguousarray(projections[:, ::-1], np.float32))
     (dv, du), (nv, nu) = geometry.dDetector, geometry.nDetector
@@ -41,12 +46,12 @@ def projection_image(projections: np.ndarray, geometry: Geometry, itk):
     return image
 
 
-def array(image, itk) -> np.ndarray:
+def array(image, itk: Any) -> np.ndarray:
     """A volume image as [x, y, z]."""
     return itk.array_from_image(image).transpose(0, 2, 1)
 
 
-def reconstruct(kind: str, scan: Scan, itk, **settings) -> np.ndarray:
+def reconstruct(kind: str, scan: Scan, itk: Any, **settings) -> np.ndarray:
     """Volume [x, y, z] of one of RTK's filters.
 
     kind       'FDK', 'SART' or 'ConjugateGradient'
@@ -68,7 +73,7 @@ def reconstruct(kind: str, scan: Scan, itk, **settings) -> np.ndarray:
     return array(reconstruction.GetOutput(), itk).copy()
 
 
-def project(volume: np.ndarray, geometry: Geometry, itk) -> np.ndarray:
+def project(volume: np.ndarray, geometry: Geometry, itk: Any) -> np.ndarray:
     """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
     zeros = np.zeros((len(geometry), *geometry.nDetector))
     found = _filter(
@@ -81,7 +86,7 @@ def project(volume: np.ndarray, geometry: Geometry, itk) -> np.ndarray:
     return itk.array_from_image(found)[:, ::-1]
 
 
-def backproject(scan: Scan, itk) -> np.ndarray:
+def backproject(scan: Scan, itk: Any) -> np.ndarray:
     """Volume [x, y, z] of a scan by the transpose of that projector."""
     geometry = scan.geometry
     found = _filter(
@@ -94,7 +99,7 @@ def backproject(scan: Scan, itk) -> np.ndarray:
     return array(found, itk)
 
 
-def _filter(name, geometry, itk, *inputs):
+def _filter(name, geometry, itk: Any, *inputs):
     image = itk.Image[itk.F, 3]
     run = getattr(itk.RTK, name)[image, image].New()
     for i, x in enumerate(inputs):

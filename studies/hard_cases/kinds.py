@@ -28,7 +28,7 @@ class ViewCase:
 
     name: str
     cloud: Cloud
-    frames: Rays
+    rays: Rays
     shape: tuple[int, ...]
     image: float = IMAGE
     gradient: float = GRADIENT

@@ -84,8 +84,8 @@ def host(value):
     return array.T if array.ndim > 1 else array
 
 
-def image_and_gradients(cloud: Cloud, frames: Rays, shape, weights, panel: bool = True, extent: float = EXTENT):
-    """The device's image of a cloud in the first view of `frames`, float64 [pixels], and derivatives of sum(weights * image) by
+def image_and_gradients(cloud: Cloud, rays: Rays, shape, weights, panel: bool = True, extent: float = EXTENT):
+    """The device's image of a cloud in the first view of `rays`, float64 [pixels], and derivatives of sum(weights * image) by
     name.
 
     shape     of the image, (v, u)
@@ -93,7 +93,7 @@ def image_and_gradients(cloud: Cloud, frames: Rays, shape, weights, panel: bool 
     panel     whether integrals end at the panel
     extent    cut-off in standard deviations
     """
-    view, gaussians = View.of(frames, 0, shape[0], shape[1], panel), on_device(cloud)
+    view, gaussians = View.of(rays, 0, shape[0], shape[1], panel), on_device(cloud)
     dr.enable_grad(gaussians)
     image = line_integrals(*gaussians, view, RenderOptions(extent))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))
@@ -149,10 +149,10 @@ def measure(case: ViewCase | VoxelCase | ScanCase) -> Result:
 
 
 def _measure_view(case):
-    weights, pose = weights_of(case.shape), Pose.of(case.frames, 0, *case.shape)
+    weights, pose = weights_of(case.shape), Pose.of(case.rays, 0, *case.shape)
     ends = pose.ends(case.panel)
     many = case.cloud[np.tile(np.arange(len(case.cloud)), case.copies)] if case.copies > 1 else case.cloud
-    image, gradients = image_and_gradients(many, case.frames, case.shape, weights, case.panel)
+    image, gradients = image_and_gradients(many, case.rays, case.shape, weights, case.panel)
     expected, few = _expected_image(case.cloud, pose, *ends)
     gradients = {name: g[few] for name, g in gradients.items()}
     cloud = case.cloud[few]

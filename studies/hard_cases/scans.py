@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.fitting.state import activate
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.scan import Scan
@@ -18,13 +21,13 @@ from lingo_mi.studies.hard_cases.kinds import ScanCase
 from lingo_mi.studies.oracle import Pose, random_cloud
 
 
-def measured(angles, shape: tuple[int, int] = (24, 24)) -> Scan:
+def measured(angles: ArrayLike, shape: tuple[int, int] = (24, 24)) -> Scan:
     """An exact scan of some Gaussians, from angles in radians."""
-    geometry = CircularGeometry(
+    geometry = Geometry.cone(
         DSO=5.0, DSD=7.5, nDetector=shape, dDetector=3.4 / max(shape), nVoxel=16, dVoxel=0.125, angles=angles
     )
-    cloud, frames = random_cloud(np.random.default_rng(9), 6, spread=0.4, size=0.15), geometry.rays()
-    images = [oracle.line_integrals(cloud, Pose.of(frames, i, *shape)) for i in range(len(geometry))]
+    cloud, rays = random_cloud(np.random.default_rng(9), 6, spread=0.4, size=0.15), geometry.rays()
+    images = [oracle.line_integrals(cloud, Pose.of(rays, i, *shape)) for i in range(len(geometry))]
     return Scan(geometry, np.reshape(images, (-1, *shape)))
 
 
@@ -37,8 +40,8 @@ def points(n: int = 50) -> InitialCloud:
     return InitialCloud(centre, np.full(n, 0.2), np.full(n, 0.1))
 
 
-def fit_to(scan: Scan, iterations: int, **changes):
-    """A fit that densifies often, as `fit.loop.run` returns it.
+def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fitted:
+    """A fit that densifies often, as `fitting.loop.run` returns it.
 
     changes   to its settings
 

@@ -18,6 +18,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -250,14 +251,14 @@ class Cells:
         return insert_views(self._measured(fit).train, COMPLETED, self._cloud(fit).render)
 
     def _volume(self, cell: Volume, path: Path, label: str) -> dict:
-        algorithm, inputs = ALGORITHMS[cell.algorithm], {}
+        algorithm = ALGORITHMS[cell.algorithm]
+        inputs: dict[str, Any] = {}
         if cell.fit.method != 'none' and self.get(cell.fit) is None:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
         if isinstance(algorithm, Refined):
-            stepper, state = self._cloud(cell.fit)
-            inputs = dict(completed=views, sample=lambda geometry: stepper.volume(state, geometry))
+            inputs = dict(completed=views, sample=self._cloud(cell.fit).volume)
             views = dataset.train
         with progress_bar(algorithm, views, label) as progress:
             found = algorithm.run(views, progress=progress, **inputs)

@@ -108,7 +108,7 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.simulate(np.zeros((20, 20, 20)), g, parameters=dict(views=3)), 'parameters'),
         (lambda g: lm.phantom('hand'), 'no phantom'),
         (lambda g: lm.load('missing.pickle'), 'no such file'),
-        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fastest'), 'method is unknown'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fastest'), 'no such recipe'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'n_pints'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), resume=True), 'checkpoint'),
         (lambda g: lm.fit(lm.Scan(g, np.zeros((10, 24, 30)))), 'zero everywhere'),

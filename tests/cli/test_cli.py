@@ -29,11 +29,28 @@ from lingo_mi.scene.simulate import take_scan
 SCENES = Path(__file__).parents[2] / 'scenes'
 SMALL = '-D', 'n_points=300', '-D', 'densify_from=10', '-D', 'densify_every=10', '-D', 'densify_threshold=1e-4'
 QUICK = '--iterations', '2', '-D', 'n_points=100'
-KEYS = (
-    'psnr_2d_r2 psnr_2d ssim_2d psnr_3d ssim_3d psnr_3d_absolute ssim_3d_absolute ipsd ipsd_targets gaussians '
-    'iterations seconds_init seconds_fit '
-    'ms_per_iteration variant method seed views versions history'
-).split()
+KEYS = [
+    'psnr_2d_r2',
+    'psnr_2d',
+    'ssim_2d',
+    'psnr_3d',
+    'ssim_3d',
+    'psnr_3d_absolute',
+    'ssim_3d_absolute',
+    'ipsd',
+    'ipsd_targets',
+    'gaussians',
+    'iterations',
+    'seconds_init',
+    'seconds_fit',
+    'ms_per_iteration',
+    'variant',
+    'method',
+    'seed',
+    'views',
+    'versions',
+    'history',
+]
 
 
 @pytest.fixture(scope='module')

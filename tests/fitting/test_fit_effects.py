@@ -19,6 +19,7 @@ from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.errors import InputError
 from lingo_mi.files.images import read_exr
 from lingo_mi.fitting import losses
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.loss_scale import loss_scale
@@ -330,3 +331,13 @@ def test_what_cannot_be_modelled(effects, match):
     with pytest.raises(InputError, match=match):
         Stepper(scan, SHORT)
     Stepper(scan, SHORT.changed(effects='ignore'))
+
+
+def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path):
+    effects, path = Effects(None, None, detector(psf=15.0)), tmp_path / 'fit.npz'
+    scan = replace(tiny_scan(geometry(3)), effects=effects)
+    done = run(scan, SHORT.changed(iterations=2), some_points(scan.geometry), path=path)
+    with pytest.raises(InputError, match='modelled effects'):
+        Fitted.from_checkpoint(path)
+    again = Fitted.from_checkpoint(path, effects)
+    np.testing.assert_allclose(again.render(scan.geometry), done.render(scan.geometry), rtol=1e-5, atol=1e-5)

@@ -267,7 +267,9 @@ def test_within_a_jitted_function_of_jax():
 def test_a_training_loop_in_torch():
     """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
     torch = framework('torch')
-    g = CircularGeometry(500, 750, (32, 32), (6, 6), (16,) * 3, (8,) * 3, circular(8))
+    g = CircularGeometry(
+        DSO=500, DSD=750, nDetector=(32, 32), dDetector=6, nVoxel=(16,) * 3, dVoxel=8, angles=circular(8)
+    )
     rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
     measured = torch.tensor(project(*truth, g, extent=8.0), device=_device())
     grid = voxelize(*truth, g, extent=8.0)
@@ -359,8 +361,8 @@ def test_bad_arrays(function, name, kind):
     'views, message',
     [
         ([], 'at least one'),
-        ([3], 'from 0 to 2'),
-        ([-4], 'from 0 to 2'),
+        ([3], 'from -3 to 2'),
+        ([-4], 'from -3 to 2'),
         ([0.5], 'whole'),
         ('ab', 'whole'),
         (7, 'whole'),
@@ -407,9 +409,12 @@ def test_a_fresh_process(kind):
     program = f"""
 import sys, {make.partition('.')[0]}
 from lingo_mi.functional import project, voxelize
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 cloud = [{make}(x) for x in ([[0.0, 1.0, 2.0]], [[9.0, 8.0, 7.0]], [[0.0, 0.0, 0.0, 1.0]], [0.5])]
-geometry = CircularGeometry(500, 750, (8, 9), (20, 20), (4, 5, 6), (20, 20, 20), circular(2))
+geometry = CircularGeometry(
+    DSO=500, DSD=750, nDetector=(8, 9), dDetector=20, nVoxel=(4, 5, 6), dVoxel=20, angles=circular(2)
+)
 print(project(*cloud, geometry).shape, voxelize(*cloud, geometry).shape, *sorted({{'torch', 'jax'}} & set(sys.modules)))
 """
     found = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)

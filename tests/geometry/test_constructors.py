@@ -40,7 +40,7 @@ def scanner(parallel=False, **motion):
 
 def test_the_base_is_abstract():
     with pytest.raises(TypeError, match='abstract'):
-        CircularGeometry(**CONE, mode='cone')
+        Geometry(**CONE, mode='cone')
 
 
 @pytest.mark.parametrize('make', [Geometry.cone, Geometry.parallel])

@@ -206,7 +206,7 @@ def test_scene_gradients(colour):
         scene = load(objects, output=output)
         params = mi.traverse(scene)
         keys = ['cloud.data', 'cloud.density', 'grid.interior_medium.sigma_t.data']
-        keys += [k for k in params.keys() if k.startswith('block') and 'sigma_t' in k and colour == 'mono']
+        keys += [k for k, _ in params.items() if k.startswith('block') and 'sigma_t' in k and colour == 'mono']
         for key in keys:
             dr.enable_grad(params[key])
         params.update()

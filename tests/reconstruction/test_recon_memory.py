@@ -19,7 +19,8 @@ import numpy as np
 from lingo_mi.runtime import use_variant
 use_variant('llvm_ad_mono')
 import mitsuba as mi
-from lingo_mi.geometry.base import Geometry, circular
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction import ALGORITHMS
 from lingo_mi.scan import Scan
 from lingo_mi.projectors.joseph import Joseph

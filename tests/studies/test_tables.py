@@ -103,8 +103,7 @@ def test_two_stages(out):
     truth = make('foot', 16).data
     assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
     measured = train.subset([0, 6, 12, 18])
-    stepper, state = cells._cloud(fit)
-    refined = tables.Refined().run(measured, completed=whole, sample=lambda geometry: stepper.volume(state, geometry))
+    refined = tables.Refined().run(measured, completed=whole, sample=cells._cloud(fit).volume)
     found = refined.volume
     assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(found, truth), abs=1e-3)
     assert (
@@ -324,7 +323,7 @@ def test_recipes():
         found.loss.loss_scale,
         recipe(Fit('foot', 5, 'r2'), TINY).start.n_points,
     ) == (1, 70, 'dynamic', 200)
-    with pytest.raises(InputError, match='unknown'):
+    with pytest.raises(InputError, match='no such recipe'):
         recipe(Fit('foot', 5, '3d'), TINY)
 
 
@@ -337,7 +336,7 @@ def test_recipes():
         (['ct', '--iterations', '0'], 'at least 1'),
         (['views', '--seed', '-1'], 'negative'),
         (['figures'], 'invalid choice'),
-        (['views', '--methods', 'nerf'], 'unknown'),
+        (['views', '--methods', 'nerf'], 'no such recipe'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
         (['ct', '--finer', '0'], 'at least 1'),
     ],

@@ -102,7 +102,7 @@ def scene_radius(geometry: Geometry) -> float:
 
     1 for a single view and for a parallel beam, where that distance does not exist.
     """
-    frames = geometry.normalised_rays()
-    if frames.parallel:
+    rays = geometry.normalised_rays()
+    if rays.parallel:
         return 1.0
-    return 1.1 * float(np.linalg.norm(frames.source - frames.source.mean(0), axis=1).max()) or 1.0
+    return 1.1 * float(np.linalg.norm(rays.source - rays.source.mean(0), axis=1).max()) or 1.0

@@ -44,7 +44,7 @@ class LineIntegrals(ForwardModel):
         return *self._shape(values), _softplus(values['density'])
 
     def footprints(self, gaussians, rays):
-        return project(*gaussians, rays, self.settings.model.extent)
+        return project(*gaussians, view=rays, extent=self.settings.model.extent)
 
     def integrals(self, footprints, rays, share=None):
         amplitude, *others = footprints.values

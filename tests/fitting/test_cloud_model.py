@@ -1,0 +1,34 @@
+"""A fitted cloud in other geometries than that of its scan."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.fits import SHORT, geometry, some_points, tiny_scan
+from lingo_mi.fitting.loop import run
+from lingo_mi.functional import voxelize
+
+
+@pytest.fixture(scope='module')
+def fitted():
+    scan = tiny_scan(geometry())
+    return run(scan, SHORT.changed(iterations=2), some_points(scan.geometry))
+
+
+def test_images_do_not_depend_on_the_voxels_of_a_geometry(fitted):
+    g = fitted.geometry
+    expected = fitted.render(g)
+    for n, factor, shift in ((3, 2.0, 0.0), (7, 0.5, 4.0)):
+        other = replace(g, nVoxel=(n,) * 3, dVoxel=tuple(factor * d for d in g.dVoxel), offOrigin=(shift,) * 3)
+        np.testing.assert_allclose(fitted.render(other), expected, atol=1e-5 * expected.max())
+
+
+def test_the_volume_on_another_grid(fitted):
+    """Smaller voxels in a part of the volume, beside its centre: the densities of the cloud at these places."""
+    g = fitted.geometry
+    part = replace(g, nVoxel=(6, 5, 4), dVoxel=tuple(0.4 * d for d in g.dVoxel), offOrigin=(3.0, -2.0, 1.0))
+    found = fitted.volume(part)
+    expected = voxelize(*fitted.world_gaussians(), part, extent=fitted.settings.model.extent)
+    assert found.shape == (6, 5, 4) and expected.max() > 0
+    np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
