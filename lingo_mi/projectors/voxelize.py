@@ -127,7 +127,9 @@ class _Voxelize(dr.CustomOp):
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
         lanes = grid.sharing.lanes
         blocks, cost = (mi.UInt32(rest[3]) + (lanes - 1)) // lanes, length // PACKET + SETUP
-        dr.eval(packed, places, blocks, cost, rest, covered)  # in one kernel: otherwise each would compute all Gaussians again
+        dr.eval(
+            packed, places, blocks, cost, rest, covered
+        )  # in one kernel: otherwise each would compute all Gaussians again
         self.work = Work.of(blocks, cost, grid.sharing)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(nx))
@@ -179,9 +181,7 @@ def _line(c, w, v, index, f: _Packed):
     Returns its constants dz, r and m; where t is 0, as a column and a fraction; its packets [begin, end); its first packet.
     """
     _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
-    rows_of_slice = dr.maximum(
-        v.z, 1
-    )  # a lane of a finished team reads 0, and an integer division by 0 crashes
+    rows_of_slice = dr.maximum(v.z, 1)  # a lane of a finished team reads 0, and an integer division by 0 crashes
     y, z = v.x + index % rows_of_slice, v.y + index // rows_of_slice
     ny, nz = mi.Float(y - w.y), mi.Float(z - w.z)
     dz = nz - fz
