@@ -45,7 +45,7 @@ class Bands:
         return _hardened(np.stack([np.asarray(p, float) for p in integrals], -1), self.weights, self.ratios)
 
     def precorrected(self, measured: ArrayLike) -> np.ndarray:
-        """The line integrals at the reference energy that h takes to `measured`, float64 (water precorrection, M = 1).
+        """The inverse of h: line integrals at the reference energy from `measured`, float64 (water precorrection, M = 1).
 
         measured   an array of any shape; h is continued linearly to negative values, which occur with noise
 

@@ -129,7 +129,7 @@ def valid_voxels(
     total = int(np.prod(grid))
     cells = np.arange(total)
     if total > CHUNK:
-        # Nothing is known behind pixels that are not valid.
+        # Invalid pixels exclude no cell.
         possible = masks.low if masks.valid is None else masks.low | ~masks.valid
         cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):

@@ -72,7 +72,7 @@ class Share:
         return mi.Int32(block * self.lanes + self.lane % self.lanes)
 
     def each_item(self, visit: Callable[[Any, Any, Any], None]) -> Any:
-        """Call visit(g, block, stop) with each item of the share and the range of its blocks in it; the kernel's result.
+        """Call visit(g, block, stop) for each item of the share, with its range of blocks. Returns the kernel's result.
 
         Loop states hold only variables that change: otherwise Dr.Jit traces a loop twice, and nested ones 4 or 8 times.
         """

@@ -60,6 +60,6 @@ class View:
         x: Any = mi.Float(i % self.width + 0.5)
         y: Any = mi.Float(i // self.width + 0.5)
         axis = self.corner - self.source
-        # Two float32 products added to a float64 constant would promote everything; |D| only needs relative accuracy.
+        # All in float32, also the constant, which would promote the sum to float64: |D| only needs relative accuracy.
         d = mi.Vector3f(axis) + x * mi.Vector3f(self.u) + y * mi.Vector3f(self.v)
         return dr.norm(d)

@@ -20,7 +20,7 @@ def is_circular(scan: Scan) -> bool:
 
 
 def require_circle(scan: Scan, what: str) -> CircularGeometry:
-    """Raises InputError for a scan that is not `is_circular`. what: the method that needs it, for the message."""
+    """The geometry of a scan. Raises InputError if it is not `is_circular`. what: the method that needs it, for the message."""
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)

@@ -89,9 +89,9 @@ class System:
     def correct(self, x: mi.Float) -> None:
         """Shift b so that, at x, b - A x equals the residual of the *exact* line integrals of the trilinear interpolant.
 
-        Defect correction (Stetter, Numer. Math. 29, 1978). Joseph's projector has an error of about 0.45 %
-        (docs/benchmarks/volumes.md), which causes streaks if an algorithm matches the projections more closely. Costs two
-        projections; does nothing for the exact projector.
+        Defect correction (Stetter, Numer. Math. 29, 1978). Joseph's projector has an error of about 0.45 % (docs/benchmarks),
+        which causes streaks if an algorithm matches the projections more closely. Costs two projections; does nothing for the
+        exact projector.
         """
         if isinstance(self.A, Joseph):
             joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, ExactPair(self.geometry)))
