@@ -224,7 +224,7 @@ def test_permissions(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, 'open', denied)
     refused(path, 'Permission denied')
     with pytest.raises(InputError, match='Permission denied'), paths.replacing(tmp_path / 'w') as temporary:
-        temporary.read_bytes()
+        open(temporary, 'wb')  # noqa: SIM115
 
 
 # ---- NumPy and raw -----------------------------------------------------------------------------------------
