@@ -1,7 +1,8 @@
-"""Arrays of any library as NumPy's."""
+"""Arrays of any library as NumPy's, and how records of arrays are printed."""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -29,3 +30,17 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
     except (TypeError, ValueError, RuntimeError, BufferError) as error:
         why = ' '.join(str(error).split()).rstrip('.')
         raise InputError(f'{name} cannot be read as an array ({why}); give a NumPy array') from None
+
+
+def short_repr(self: Any) -> str:
+    """The repr of a dataclass with arrays as types and shapes, such as `float32[50, 512, 512]`, and nothing for None."""
+
+    def short(value) -> str:
+        if isinstance(value, np.ndarray):
+            return f'{value.dtype}{list(value.shape)}'
+        if isinstance(value, list) and len(value) > 4:
+            return f'[{value[0]!r}, ..., {value[-1]!r}]'
+        return repr(value)
+
+    values = ((f.name, getattr(self, f.name)) for f in fields(self) if f.repr)
+    return f'{type(self).__name__}({", ".join(f"{n}={short(v)}" for n, v in values if v is not None)})'

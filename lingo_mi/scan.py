@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.arrays import as_numpy
+from lingo_mi.arrays import as_numpy, short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Index
@@ -33,6 +33,8 @@ class Scan:
     geometry: Geometry
     projections: np.ndarray
     valid: np.ndarray | None = None
+
+    __repr__ = short_repr
     effects: Any = None  # `Effects` is in a package above this one
 
     def __post_init__(self):
@@ -105,6 +107,8 @@ class Dataset:
     train: Scan
     test: Scan | None = None
     volume: np.ndarray | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self):
         if self.volume is not None:

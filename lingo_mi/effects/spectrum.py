@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
 
 STEP = 0.5  # keV, width of a spectrum's bins
@@ -42,6 +43,8 @@ class Spectrum:
 
     energies: np.ndarray
     photons: np.ndarray
+
+    __repr__ = short_repr
 
     @property
     def mean(self) -> float:

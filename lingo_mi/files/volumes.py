@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.arrays import numeric
@@ -57,6 +58,8 @@ class Volume:
     spacing: tuple[float, float, float]
     affine: np.ndarray
     unit: str
+
+    __repr__ = short_repr
 
 
 def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import astra, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
@@ -61,10 +62,12 @@ class Geometry(ABC):
     dDetector: tuple[float, float]
     nVoxel: tuple[int, int, int]
     dVoxel: tuple[float, float, float]
-    angles: np.ndarray = field(repr=False)
+    angles: np.ndarray
     DSO: float
     DSD: float
     offOrigin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    __repr__ = short_repr
 
     # ---- constructors --------------------------------------------------------------------------------------
 
@@ -356,7 +359,7 @@ class Geometry(ABC):
         return {name: getattr(self, name) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class CircularGeometry(Geometry):
     """The source on a circle about z before an upright panel, rows down.
 
@@ -425,7 +428,7 @@ class CircularGeometry(Geometry):
         return replace(self, nDetector=shape, dDetector=step, offDetector=offset)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class PosedGeometry(Geometry):
     """A scan with a pose for every view.
 
@@ -441,7 +444,7 @@ class PosedGeometry(Geometry):
     poses: Rays = field(repr=False)
     mode: str = field(init=False)
     dDetector: tuple[float, float] = field(init=False)
-    angles: np.ndarray = field(init=False, repr=False)
+    angles: np.ndarray = field(init=False)
     DSO: float = field(init=False)
     DSD: float = field(init=False)
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import importlib
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
+from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 
@@ -45,7 +46,9 @@ class Phantom:
     data: np.ndarray
     spacing: tuple[float, float, float]
     name: str
-    analytic: Analytic | None = None
+    analytic: Analytic | None = field(default=None, repr=False)
+
+    __repr__ = short_repr
 
     @property
     def origin(self) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.arrays import short_repr
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.scan import Scan
 
@@ -31,6 +32,8 @@ class Reconstruction:
     residuals: list[float]
     seconds: float
     geometry: Geometry
+
+    __repr__ = short_repr
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.volume, dtype) if copy else np.asarray(self.volume, dtype)

@@ -166,6 +166,14 @@ def test_checkpoint_and_resume(data, tmp_path):
     np.testing.assert_allclose(longer.volume(), direct.volume(), atol=1e-6)
 
 
+def test_records_are_printed_by_shape_not_by_values(data):
+    plain = lm.reconstruct(data.train, lm.SIRT(niter=6), progress=False)
+    assert 'projections=float32[' in repr(data.train) and 'volume=float32[20, 20, 20]' in repr(data)
+    assert 'residuals=[1.0, ..., ' in repr(plain) and 'angles=float64[' in repr(plain)
+    assert 'valid' not in repr(data.train)
+    assert max(len(repr(x)) for x in (data.train, data, plain, lm.phantom('shepp_logan', size=8))) < 1000
+
+
 def test_reconstruct(data, result):
     plain = lm.reconstruct(data.train, lm.SART(niter=2), progress=False)
     assert plain.volume.shape == (20, 20, 20) and len(plain.residuals) == 3 and plain.seconds > 0
