@@ -116,14 +116,19 @@ class Result:
     def _measured(self) -> Measured:
         return measure(self.fitted) if self.data is None else measure(self.fitted, self.data.test, self.data.volume)
 
-    def metrics(self, data: Dataset | None = None) -> dict:
+    def metrics(self, data: Dataset | None = None) -> dict[str, float | None]:
         """PSNR and SSIM of held-out views and volume, IPSD, times; None where there is no truth to compare with.
 
         data   what to compare with (default: what was given to `lm.fit`; of a loaded result, the numbers as saved)
+
+        The full scale of `psnr_3d` and `ssim_3d` is a density of 1, as in R2-Gaussian. That of `psnr_3d_absolute` and
+        `ssim_3d_absolute` is the largest true density: take these for densities per mm of real objects.
         """
         if data is not None:
-            return measure(self.fitted, data.test, data.volume).numbers
-        return self._measured.numbers if self._stored is None else self._stored
+            numbers = measure(self.fitted, data.test, data.volume).numbers
+        else:
+            numbers = self._measured.numbers if self._stored is None else self._stored
+        return {name: value for name, value in numbers.items() if value is None or isinstance(value, int | float)}
 
     def save(self, folder: str | PathLike, *, title: str = '', force: bool = False) -> Path:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz; returns the folder.

@@ -127,6 +127,7 @@ def test_result(result, data):
     views = result.render(data.test.geometry)
     assert views.shape == (2, 24, 30)
     numbers = result.metrics()
+    assert all(value is None or isinstance(value, int | float) for value in numbers.values())
     assert numbers['psnr_3d'] > 10 and numbers['gaussians'] == len(result)
     assert 'Gaussians' in repr(result) and result.seconds > 0
     assert result._repr_html_().startswith('<img ')
@@ -149,6 +150,7 @@ def test_save_and_load(result, data, tmp_path):
     again = lm.load_result(folder)
     np.testing.assert_allclose(again.volume(), result.volume(), atol=1e-6)
     np.testing.assert_allclose(again.render(data.test.geometry), result.render(data.test.geometry), atol=1e-4)
+    assert set(result.metrics()) <= set(again.metrics())
     assert again.metrics()['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'])
     assert again.metrics(data)['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'], abs=1e-4)
     assert len(lm.load_result(folder / 'checkpoint.npz')) == len(result)
