@@ -264,7 +264,7 @@ def test_within_a_jitted_function_of_jax():
 def test_a_training_loop_in_torch():
     """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
     torch = framework('torch')
-    g = CircularGeometry(500, 750, (32, 32), (6, 6), (16,) * 3, (8,) * 3, circular(8))
+    g = CircularGeometry(DSO=500, DSD=750, nDetector=32, dDetector=6, nVoxel=16, dVoxel=8, angles=circular(8))
     rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
     measured = torch.tensor(project(*truth, g, extent=8.0), device=_device())
     grid = voxelize(*truth, g, extent=8.0)

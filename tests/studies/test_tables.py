@@ -103,8 +103,7 @@ def test_two_stages(out):
     truth = make('foot', 16).data
     assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
     measured = train.subset([0, 6, 12, 18])
-    stepper, state = cells._cloud(fit)
-    refined = tables.Refined().run(measured, completed=whole, sample=lambda geometry: stepper.volume(state, geometry))
+    refined = tables.Refined().run(measured, completed=whole, sample=cells._cloud(fit).volume)
     found = refined.volume
     assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(found, truth), abs=1e-3)
     assert (
