@@ -5,11 +5,12 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
 @contextmanager
-def between_steps():
+def between_steps() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C back: yields a function that raises KeyboardInterrupt if it was pressed since the last call.
 
     A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A

@@ -19,7 +19,10 @@ from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
 from lingo_mi.errors import InputError
@@ -29,7 +32,7 @@ WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
 
 
-def psnr_2d_r2(images, truth) -> float:
+def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     """PSNR in dB as R2-Gaussian reports it: views divided by their own maxima, peak 1, mean over the views.
 
     images, truth : [view, v, u]. Views whose truth has no positive pixel are left out; an image without a
@@ -39,7 +42,7 @@ def psnr_2d_r2(images, truth) -> float:
     return _mean(_psnr(*views, 1.0) for views in _own_maximum(images, truth))
 
 
-def psnr_2d(images, truth, peak: float | None = None) -> float:
+def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """PSNR in dB of line integrals as they are, mean over the views.
 
     images, truth : [view, v, u]
@@ -50,7 +53,7 @@ def psnr_2d(images, truth, peak: float | None = None) -> float:
     return _mean(_psnr(a, b, peak) for a, b in zip(images, truth)) if peak > 0 else np.nan
 
 
-def ssim_2d(images, truth) -> float:
+def ssim_2d(images: ArrayLike, truth: ArrayLike) -> float:
     """SSIM as R2-Gaussian reports it: each view divided by its own maximum, mean over the views.
 
     images, truth : [view, v, u]. Views whose truth has no positive pixel are left out.
@@ -59,7 +62,7 @@ def ssim_2d(images, truth) -> float:
     return _mean(ssim_map(a, b).mean() for a, b in _own_maximum(images, truth))
 
 
-def ssim_2d_absolute(images, truth, peak: float | None = None) -> float:
+def ssim_2d_absolute(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of line integrals with one full scale for both stacks, mean over the views.
 
     images, truth : [view, v, u]
@@ -70,7 +73,7 @@ def ssim_2d_absolute(images, truth, peak: float | None = None) -> float:
     return _mean(ssim_map(a / peak, b / peak).mean() for a, b in zip(images, truth)) if peak > 0 else np.nan
 
 
-def psnr_3d(volume, truth) -> float:
+def psnr_3d(volume: ArrayLike, truth: ArrayLike) -> float:
     """PSNR in dB with peak 1, neither volume rescaled or clipped.
 
     volume, truth : [x, y, z]. The number means what it says where the truth's densities fill [0, 1].
@@ -78,7 +81,7 @@ def psnr_3d(volume, truth) -> float:
     return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.0)
 
 
-def ssim_3d(volume, truth) -> float:
+def ssim_3d(volume: ArrayLike, truth: ArrayLike) -> float:
     """SSIM of all slices with full scale 1: mean over the slices of an axis, then over the three axes.
 
     volume, truth : [x, y, z]. Slices whose truth has no positive voxel are left out. So is an axis whose
@@ -100,7 +103,7 @@ def ssim_3d(volume, truth) -> float:
     return _mean(means)
 
 
-def psnr_3d_absolute(volume, truth, peak: float | None = None) -> float:
+def psnr_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """PSNR in dB of densities in any unit.
 
     volume, truth : [x, y, z]
@@ -111,7 +114,7 @@ def psnr_3d_absolute(volume, truth, peak: float | None = None) -> float:
     return _psnr(volume, truth, peak) if peak > 0 else np.nan
 
 
-def ssim_3d_absolute(volume, truth, peak: float | None = None) -> float:
+def ssim_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of densities in any unit, with a window of 11 x 11 x 11 voxels, mean over all of them.
 
     volume, truth : [x, y, z]; along an axis of one voxel there is no window
@@ -123,7 +126,7 @@ def ssim_3d_absolute(volume, truth, peak: float | None = None) -> float:
     return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
 
 
-def ssim_map(a, b, axes=(0, 1)) -> np.ndarray:
+def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.ndarray:
     """SSIM of two images [rows, columns], or volumes, at every pixel, for values with full scale 1.
 
     The window is a Gaussian of sigma 1.5, 11 wide along each of the `axes`, the image is continued by zeros, variances are

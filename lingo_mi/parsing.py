@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from lingo_mi.errors import InputError
 
 
-def parse(name: str, text: str, like):
+def parse(name: str, text: str, like: Any) -> Any:
     """The value that `text` says, of the kind of `like`: text, true or false, a whole number, a number, or two numbers, of
     which one stands for both.
 

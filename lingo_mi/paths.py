@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from lingo_mi.errors import InputError
 
@@ -16,7 +19,7 @@ def one_line(error: BaseException | str) -> str:
 
 
 @contextmanager
-def reading(path):
+def reading(path: PathLike | str) -> Iterator[None]:
     """Turns what the file system says about `path` while it is read into an InputError."""
     try:
         yield
@@ -55,7 +58,7 @@ def _remove_file(path):
 
 
 @contextmanager
-def replacing(path):
+def replacing(path: PathLike | str) -> Iterator[Path]:
     """Yields a temporary path beside `path`, which takes its place when the block ends without an error.
 
     Raises InputError if the file cannot be written.
@@ -65,7 +68,7 @@ def replacing(path):
 
 
 @contextmanager
-def new_folder(path):
+def new_folder(path: PathLike | str) -> Iterator[Path]:
     """Yields a temporary folder, which becomes `path` when the block ends without an error.
 
     Raises InputError if `path` exists and is not an empty folder, or cannot be written.
@@ -78,7 +81,7 @@ def new_folder(path):
         yield temporary
 
 
-def optional(module: str):
+def optional(module: str) -> Any:
     """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
     import importlib
 

@@ -38,7 +38,7 @@ def find_libllvm() -> str | None:
     return None
 
 
-def mend_llvm():
+def mend_llvm() -> None:
     """Where Dr.Jit was imported before us and took an LLVM that cannot work, restart it on the bundled one.
 
     Dr.Jit loads LLVM as soon as it is imported, so that `import mitsuba` before `import lingo_mi` meets a system LLVM first.

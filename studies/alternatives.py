@@ -14,9 +14,10 @@ import mitsuba as mi
 
 from lingo_mi.projectors.footprint import SQRT_2PI
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
+from lingo_mi.projectors.view import View
 
 
-def rays(view, distance: float):
+def rays(view: View, distance: float) -> tuple[Any, Any]:
     """Origins Point3f and unit directions Vector3f of a cone beam's rays, row by row.
 
     They start `distance` before they are nearest to the world's origin, or at the source: near the object float32 has
@@ -37,7 +38,7 @@ def rays(view, distance: float):
 # ------------------------------------------------------------------------------------------------------------
 
 
-def per_ray(centre, scale, rotation, density, view, precision: str = 'float32'):
+def per_ray(centre: Any, scale: Any, rotation: Any, density: Any, view: View, precision: str = 'float32') -> Any:
     """Line integrals along whole rays, without a cut-off; arguments as for `cloud.line_integrals`.
 
     precision   'float32' or 'float64', of everything; or 'compensated': float32, summed as Kahan does, which has no
@@ -94,7 +95,7 @@ def _sum_gaussians(columns, start, direction, count, Float, Vector, compensated)
 # ------------------------------------------------------------------------------------------------------------
 
 
-def march(data, size, half, origin, direction, step: float):
+def march(data: Any, size: int, half: float, origin: Any, direction: Any, step: float) -> Any:
     """Line integrals of a grid by the midpoint rule with steps of `step` along the rays, in the box [-half, half]^3.
 
     data                Float [size^3], x fastest: values at the voxel centres, interpolated trilinearly
@@ -140,7 +141,7 @@ class Tree:
     second walk.
     """
 
-    def __init__(self, data, density, extent: float, epsilon: float):
+    def __init__(self, data: Any, density: Any, extent: float, epsilon: float):
         """data      TensorXf [N, 10], as `ellipsoids` takes it, with unit quaternions
         density   TensorXf [N, 1]
         extent    cut-off in standard deviations
@@ -151,7 +152,7 @@ class Tree:
         self.data, self.density = mi.Float(data.array), mi.Float(density.array)
         self.epsilon = epsilon
 
-    def image(self, origin, direction):
+    def image(self, origin: Any, direction: Any) -> Any:
         """Line integrals along rays, Float [rays]. origin, direction   Point3f, Vector3f of length 1"""
         image = _walk(
             self.scene,
@@ -165,7 +166,7 @@ class Tree:
         dr.eval(image)
         return image
 
-    def gradients(self, origin, direction, upstream):
+    def gradients(self, origin: Any, direction: Any, upstream: Any) -> tuple[Any, Any]:
         """Derivatives of sum(upstream * image) by data, Float [10 N], and by density, Float [N]."""
         for array in (self.data, self.density):
             dr.enable_grad(array)

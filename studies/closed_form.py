@@ -11,6 +11,9 @@ source or the panel, and explains why both are needed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +24,11 @@ REACH = 9.0  # standard deviations: beyond, a Gaussian is below 3e-18 of its pea
 
 
 def image_and_gradients(
-    gaussians, rays: Rays, shape, weights=None, order: int = 0
+    gaussians: Sequence[np.ndarray],
+    rays: Rays,
+    shape: tuple[int, int],
+    weights: np.ndarray | None = None,
+    order: int = 0,
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """One view of a cloud, float64 [v, u]; and derivatives of sum(weights * image) by name, float64 [N, ...].
 
@@ -57,10 +64,13 @@ def image_and_gradients(
     return image, gradients if weights is not None else {}
 
 
-def rays_and_gradients(gaussians, start, direction, weights):
+def rays_and_gradients(
+    gaussians: Sequence[np.ndarray], start: np.ndarray, direction: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Line integrals of a cloud along rays [M, 3], float64 [M], and derivatives as `image_and_gradients` gives them."""
     gaussians = [np.asarray(x, float) for x in gaussians]
-    total, rows = 0.0, []
+    total: Any = 0.0
+    rows = []
     for one in zip(*gaussians):
         value, row = _gaussian(one, start, direction, weights)
         total = total + value

@@ -18,7 +18,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -51,7 +53,7 @@ class Row:
     error: float
 
 
-def load_scene_file(path):
+def load_scene_file(path: PathLike | str) -> Any:
     """Any Mitsuba scene, with or without a scanner. Raises InputError, in one line, for whatever Mitsuba finds wrong."""
     if not Path(path).is_file():
         raise InputError(f'{path}: there is no such file')
@@ -61,7 +63,7 @@ def load_scene_file(path):
         raise InputError(f'{path}: {plain(error)}') from None
 
 
-def check_gradients(scene, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
+def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
     """Compare derivatives of a scene's image in its first sensor.
 
     step    of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the

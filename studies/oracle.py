@@ -18,13 +18,16 @@ is tested against the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
+
+from lingo_mi.geometry.rays import Rays
 
 
 @dataclass(frozen=True, init=False)
@@ -53,12 +56,14 @@ class Cloud:
     def __add__(self, other):
         return Cloud(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
-    def changed(self, **columns) -> Cloud:
+    def changed(self, **columns: ArrayLike) -> Cloud:
         """The cloud with other columns, such as density=np.ones(len(cloud))."""
         return replace(self, **columns)
 
 
-def random_cloud(rng, n, spread=0.6, size=0.08, centre=(0.0, 0.0, 0.0)) -> Cloud:
+def random_cloud(
+    rng: np.random.Generator, n: int, spread: float = 0.6, size: float = 0.08, centre: ArrayLike = (0.0, 0.0, 0.0)
+) -> Cloud:
     """n Gaussians with centres in a cube of half side `spread`, scales around `size`, any rotation and length of it."""
     return Cloud(
         np.array(centre) + rng.uniform(-spread, spread, (n, 3)),
@@ -81,13 +86,13 @@ class Pose:
     parallel: bool = False
 
     @staticmethod
-    def of(rays, index, height, width) -> Pose:
+    def of(rays: Rays, index: int, height: int, width: int) -> Pose:
         """View `index` of a `lingo_mi.geometry.rays.Rays`, for an image of height x width pixels."""
         source, corner, u, v = (np.array(a[index], float) for a in (rays.source, rays.corner, rays.u, rays.v))
         return Pose(source, corner, u, v, height, width, rays.parallel)
 
     @staticmethod
-    def of_view(view) -> Pose:
+    def of_view(view: Any) -> Pose:
         """A `lingo_mi.projectors.view.View`."""
         source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
         return Pose(source, corner, u, v, view.height, view.width, view.parallel)
@@ -105,12 +110,14 @@ class Pose:
         return np.broadcast_to(self.source, on_panel.shape), on_panel - self.source
 
 
-def whiten(scale, rotation, vectors) -> np.ndarray:
+def whiten(scale: ArrayLike, rotation: ArrayLike, vectors: np.ndarray) -> np.ndarray:
     """diag(1/s) R^T v for one Gaussian."""
     return vectors @ Rotation.from_quat(rotation).as_matrix() / scale
 
 
-def one_integral(gaussian, start, direction, t0: float = -np.inf, t1: float = np.inf) -> np.ndarray:
+def one_integral(
+    gaussian: tuple, start: np.ndarray, direction: np.ndarray, t0: float = -np.inf, t1: float = np.inf
+) -> np.ndarray:
     """Line integrals of one Gaussian along rays, for t in [t0, t1], [M].
 
     gaussian           its centre, scale, rotation and density, as `rows` gives them
@@ -138,24 +145,26 @@ def rows(cloud: Cloud) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, flo
     return zip(cloud.centre, cloud.scale, cloud.rotation, cloud.density)
 
 
-def derivative(function, step):
+def derivative(function: Callable[..., Any], step: Any) -> Any:
     """f'(0) by the five-point stencil, exact to the fourth power of the step."""
     a, b, c, d = (function(k * step) for k in (-2, -1, 1, 2))
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-def gradients(cloud: Cloud, pose: Pose, weights, t0: float = -np.inf, t1: float = np.inf) -> dict[str, np.ndarray]:
+def gradients(
+    cloud: Cloud, pose: Pose, weights: np.ndarray, t0: float = -np.inf, t1: float = np.inf
+) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by all parameters: a dict of arrays shaped like the cloud's."""
     rays = pose.rays()
     return _gradients(cloud, lambda row: (weights * one_integral(row, *rays, t0, t1)).sum())
 
 
-def values_at(cloud: Cloud, points) -> np.ndarray:
+def values_at(cloud: Cloud, points: np.ndarray) -> np.ndarray:
     """sigma [M] at points [M, 3]."""
     return sum((_value(row, points) for row in rows(cloud)), np.zeros(len(points)))
 
 
-def value_gradients(cloud: Cloud, points, weights) -> dict[str, np.ndarray]:
+def value_gradients(cloud: Cloud, points: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * sigma(points)), like `gradients`."""
     return _gradients(cloud, lambda row: (weights * _value(row, points)).sum())
 
@@ -189,7 +198,9 @@ def _gradients(cloud, loss, step=1e-3):
     return out
 
 
-def pose_gradients(cloud: Cloud, pose: Pose, weights, t0: float = -np.inf, t1: float = np.inf) -> dict[str, np.ndarray]:
+def pose_gradients(
+    cloud: Cloud, pose: Pose, weights: np.ndarray, t0: float = -np.inf, t1: float = np.inf
+) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by the view's four vectors."""
     smallest = cloud.scale.min()
     reach = dict(source=1, corner=1, u=pose.width, v=pose.height)
@@ -212,7 +223,7 @@ def pose_gradients(cloud: Cloud, pose: Pose, weights, t0: float = -np.inf, t1: f
     return out
 
 
-def relative(found, expected) -> float:
+def relative(found: ArrayLike, expected: ArrayLike) -> float:
     """Root mean square deviation over that of the expected values."""
     found, expected = np.ravel(found), np.ravel(expected)
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -11,7 +12,7 @@ from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
 
 
-def count_pairs(gaussians, view: View, extent: float) -> float:
+def count_pairs(gaussians: Sequence, view: View, extent: float) -> float:
     """Pairs of a pixel and a Gaussian: pixels in the bounding boxes of all footprints, summed.
 
     gaussians   centre, scale, rotation and density as Dr.Jit arrays

@@ -16,6 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 from lingo_mi.errors import InputError
@@ -67,7 +68,7 @@ class Comparison:
             settings_of(method)
         return {(Path(scene).stem, method): self.result(scene, method) for scene in scenes for method in methods}
 
-    def result(self, scene, method: str) -> dict:
+    def result(self, scene: PathLike | str, method: str) -> dict:
         """The metrics of one fit, run now unless they are there."""
         folder, command = self.plan(scene, method)
         if not (folder / 'metrics.json').exists():
@@ -78,7 +79,7 @@ class Comparison:
                 raise InputError(f'{scene}: lingo-mi fit --method {method} failed with exit code {code}')
         return json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
 
-    def plan(self, scene, method: str) -> tuple[Path, list[str]]:
+    def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""
         name, _, own = method.partition(':')
         changes = [*self.changes, *filter(None, own.split(','))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError
@@ -29,7 +30,7 @@ def fit(
     checkpoint: str | PathLike | None = None,
     resume: bool = False,
     progress: bool = True,
-    **settings,
+    **settings: Any,
 ) -> Result:
     """Fit a cloud of 3D Gaussians to a scan.
 

@@ -24,13 +24,13 @@ COMMANDS = {
 }
 
 
-def run(command: str):
+def run(command: str) -> None:
     """Run one command with the arguments in `sys.argv`, and exit."""
     module = importlib.import_module(f'lingo_mi.cli.{command.replace("-", "_")}')
     guard(module.main)
 
 
-def main():
+def main() -> None:
     """The console command `lingo-mi`."""
     wanted = sys.argv[1] if len(sys.argv) > 1 else '--help'
     if wanted in ('-h', '--help'):

@@ -17,7 +17,7 @@ from lingo_mi.cli.common import Parser, docs_arguments, docs_of
 from lingo_mi.runtime import use_variant
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
@@ -26,7 +26,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     document, figures = docs_of(args)
     use_variant(args.variant)

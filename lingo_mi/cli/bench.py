@@ -23,7 +23,7 @@ from lingo_mi.runtime import use_variant
 MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--gaussians', type=int, default=50_000)
     p.add_argument('--size', type=int, default=512, help='pixels along a side of the square panel')
@@ -46,7 +46,7 @@ def arguments():
     return args
 
 
-def main():
+def main() -> None:
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.studies.benchmarks.integrator import TREE, Bench, Work, describe_times, describe_tree

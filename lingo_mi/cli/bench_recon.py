@@ -25,7 +25,7 @@ from lingo_mi.runtime import use_variant
 os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # idle threads of one package must not slow the next one's
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--size', type=int, default=256, metavar='N', help='voxels and pixels along a side (default: 256)')
     p.add_argument('--views', type=int, default=100, metavar='N', help='(default: 100)')
@@ -34,7 +34,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     if min(args.size, args.views, args.repeats) < 1 or args.size < 8:
         raise InputError('--size must be at least 8, --views and --repeats at least 1')

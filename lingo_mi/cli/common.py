@@ -7,7 +7,9 @@ import os
 import shlex
 import sys
 import warnings
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
+from typing import Any, NoReturn
 
 from lingo_mi.errors import InputError
 
@@ -15,11 +17,11 @@ from lingo_mi.errors import InputError
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, like any other bad input."""
 
-    def error(self, message):
+    def error(self, message: str) -> NoReturn:
         self.exit(2, f'error: {message} (see --help)\n')
 
 
-def guard(main) -> None:
+def guard(main: Callable[[], int | None]) -> None:
     """Run a command's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
 
     Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
@@ -46,7 +48,7 @@ def guard(main) -> None:
         sys.exit(130)
 
 
-def command_line(*options: str, without=()) -> str:
+def command_line(*options: str, without: Collection[str] = ()) -> str:
     """The command that runs now, to be typed again: with further options, and without some."""
     program = f'python {sys.argv[0]}' if sys.argv[0].endswith('.py') else sys.argv[0]
     return ' '.join([program, shlex.join([*(a for a in sys.argv[1:] if a not in without), *options])])
@@ -80,7 +82,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_input(args) -> None:
+def check_input(args: argparse.Namespace) -> None:
     """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
     for name in ('projections', 'volume'):
         if getattr(args, name) == '':  # an unset variable of the shell's
@@ -93,7 +95,7 @@ def check_input(args) -> None:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
 
 
-def read_input(args, scene, views: int | None, seed: int = 0):
+def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0) -> Any:
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
     scene   the `LoadedScene` of args.scene
@@ -135,7 +137,7 @@ def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str)
     parser.set_defaults(in_docs=(document, figures))
 
 
-def docs_of(args) -> tuple[Path | None, Path]:
+def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
     """The page to renew, if any, and the folder of the pictures, of the arguments that `docs_arguments` added.
 
     Raises InputError where --docs is no folder, or where the results in --out might overwrite the page.
@@ -152,7 +154,7 @@ def docs_of(args) -> tuple[Path | None, Path]:
     return document, figures
 
 
-def definitions(pairs) -> dict[str, str]:
+def definitions(pairs: Iterable[str]) -> dict[str, str]:
     """The NAME=VALUE arguments of -D as a dictionary."""
     out = {}
     for pair in pairs:

@@ -17,7 +17,7 @@ from lingo_mi.cli.common import Parser, docs_arguments, docs_of
 from lingo_mi.runtime import use_variant
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument(
         '--only', nargs='+', metavar='NAME', help='these effects, by the names of their scenes (default: all)'
@@ -28,7 +28,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     document, figures = docs_of(args)
     use_variant(args.variant)

@@ -30,7 +30,7 @@ from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument(
@@ -64,7 +64,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS

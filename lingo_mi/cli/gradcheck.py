@@ -13,7 +13,7 @@ from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument(
         'scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray, or the name of a shipped one'
@@ -37,7 +37,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> int:
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.studies.gradient_check import TOLERANCE, check_gradients, load_scene_file, table

@@ -16,14 +16,14 @@ from lingo_mi.cli.common import Parser
 from lingo_mi.runtime import use_variant
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--markdown', type=Path, metavar='F', help='write the table there, too')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
 
-def main():
+def main() -> int:
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.studies.hard_cases.cases import all_cases

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from lingo_mi import phantoms
 from lingo_mi.cli.common import Parser
@@ -37,7 +38,7 @@ SUMMARY = {
 }
 
 
-def arguments():
+def arguments() -> tuple[argparse.Namespace, str]:
     listing = '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
     parser = Parser(
         description=__doc__, epilog=EPILOG.format(list=listing), formatter_class=argparse.RawDescriptionHelpFormatter
@@ -74,7 +75,7 @@ def arguments():
     return parser.parse_args(), listing
 
 
-def check(args):
+def check(args: argparse.Namespace) -> None:
     """Everything that can be refused before the work begins."""
     if args.name is None:
         raise InputError(f'name a phantom: one of {", ".join(phantoms.names())}')
@@ -84,8 +85,10 @@ def check(args):
         raise InputError(f'--views must be at least 1, not {args.views}')
     if args.projections and args.kind == 'naf' and args.projections.suffix not in ('.pickle', '.pkl'):
         raise InputError(f'{args.projections}: --kind naf writes a pickle; give a name that ends in .pickle')
-    meshes = args.name == 'mesh' and args.out is not None and args.out.suffix == '.ply'
-    for path in filter(None, (args.out, bolts_beside(args.out) if meshes else None, args.projections)):
+    beside = None
+    if args.name == 'mesh' and args.out is not None and args.out.suffix == '.ply':
+        beside = bolts_beside(args.out)
+    for path in filter(None, (args.out, beside, args.projections)):
         if path.is_dir() and path == args.out:
             raise InputError(f'{path}: is a folder; give a file name that ends in .nii.gz')
         if path.exists() and not (args.force and path.is_file()):
@@ -104,28 +107,28 @@ def check(args):
             )
 
 
-def bolts_beside(path):
+def bolts_beside(path: Path) -> Path:
     """Where the bolts of a flange in `path` go."""
     return path.with_stem(path.stem + '_bolts')
 
 
-def write_ply(path, phantom):
+def write_ply(path: Path, phantom: phantoms.Phantom) -> None:
     """The phantom's own form: Gaussians, or the flange and its bolts."""
+    analytic: Any = phantom.analytic  # of the class of its own module
     if phantom.name == 'gaussians':
         from lingo_mi.files.ply import write_ply
 
-        cloud = phantom.analytic
-        write_ply(path, cloud.centres, cloud.scales, cloud.quaternions, cloud.density)
-        print(f'{path}: {len(cloud)} Gaussians')
+        write_ply(path, analytic.centres, analytic.scales, analytic.quaternions, analytic.density)
+        print(f'{path}: {len(analytic)} Gaussians')
         return
     from lingo_mi.phantoms.mesh import bolts
 
-    for name, mesh in ((path, phantom.analytic.mesh), (bolts_beside(path), bolts())):
+    for name, mesh in ((path, analytic.mesh), (bolts_beside(path), bolts())):
         mesh.export(name)
         print(f'{name}: {len(mesh.faces)} triangles')
 
 
-def main():
+def main() -> None:
     args, listing = arguments()
     if args.list:
         print(listing)

@@ -19,7 +19,7 @@ from lingo_mi.cli.common import Parser
 from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scenes', nargs='+', type=Path, metavar='SCENE', help='a scene file, or the name of a shipped one')
     p.add_argument(
@@ -44,7 +44,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     from lingo_mi.studies.provenance import write_provenance
     from lingo_mi.studies.recipes import Comparison, draw, table

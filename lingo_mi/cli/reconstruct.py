@@ -39,7 +39,7 @@ from lingo_mi.scene.shipped import scene_path
 FROM_CLOUD = 'refined', 'voxelize'  # algorithms that nothing can be done by without a cloud
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument('--algorithm', choices=(*ALGORITHMS, 'voxelize'), default='fdk', help='(default: fdk)')
@@ -86,7 +86,7 @@ def output(path: Path, force: bool) -> Path:
     return writable_file(path, force)
 
 
-def check_arguments(args):
+def check_arguments(args: argparse.Namespace) -> None:
     """Raises InputError where the arguments contradict each other."""
     check_input(args)
     if args.seed is not None and args.seed < 0:
@@ -119,7 +119,7 @@ def algorithm_of(name: str, given: dict[str, str]) -> Algorithm | None:
     return made(**options) if made else None
 
 
-def main():
+def main() -> None:
     args = arguments()
     use_variant(args.variant)
     check_arguments(args)

@@ -30,7 +30,7 @@ ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer'
 PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
 
 
-def arguments():
+def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('table', choices=('views', 'ct', 'ablation'))
     p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: those of the scale)')
@@ -73,7 +73,7 @@ def arguments():
     return p.parse_args()
 
 
-def main():
+def main() -> None:
     args = arguments()
     use_variant(args.variant)
     from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells

@@ -14,6 +14,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.effects.spectrum import compound, library
 from lingo_mi.errors import InputError
@@ -28,7 +29,7 @@ _LEAST_Q = 1.1e-3  # 1/Angstrom, lower end of xraylib's tables of S; there S is 
 _HC = 12.398420  # keV Angstrom
 
 
-def klein_nishina(cosine, energy: float, response: str = 'count') -> np.ndarray:
+def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> np.ndarray:
     """d sigma / d Omega of a free electron, divided by r_e^2, 1/sr, float64. cosine: of the scattering angle, any shape.
 
     energy     keV

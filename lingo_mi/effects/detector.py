@@ -18,13 +18,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import convolve
 
 from lingo_mi.effects.focal_spot import checked_order
 from lingo_mi.errors import InputError
+from lingo_mi.projectors.view import View
 
 RESPONSES = 'energy', 'count'
 MOST_PHOTONS = 1e15
@@ -66,7 +68,7 @@ class Detector:
     corrected: bool = True
 
     @staticmethod
-    def of(**given) -> Detector:
+    def of(**given: Any) -> Detector:
         """Checked parameters. Raises InputError."""
         ranges = dict(
             photons=MOST_PHOTONS,
@@ -118,7 +120,7 @@ class Detector:
     def _step(self) -> float:
         return self._top / (2**self.bits - 1) if self.bits else 0.0
 
-    def signal(self, transmission, view: int, seed: int = 0) -> np.ndarray:
+    def signal(self, transmission: ArrayLike, view: int, seed: int = 0) -> np.ndarray:
         """The signal of a view, in units of the open beam's, float64 [v, u], without correction of gains and dead pixels.
 
         transmission   expected I / I0, [v, u], finite and not negative
@@ -138,7 +140,7 @@ class Detector:
             light = np.round(np.maximum(light, 0) / self._step) * self._step
         return np.where(dead, 0, light)
 
-    def measure(self, transmission, view: int, seed: int = 0) -> np.ndarray:
+    def measure(self, transmission: ArrayLike, view: int, seed: int = 0) -> np.ndarray:
         """Line integrals -ln(I / I0) as a scanner reports them, float32 [v, u], finite. Arguments as for `signal`."""
         light = self.signal(transmission, view, seed)
         if self.corrected:
@@ -146,12 +148,12 @@ class Detector:
             light = _filled(light / gains, dead)
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
 
-    def least(self, shape) -> np.ndarray:
+    def least(self, shape: tuple[int, int]) -> np.ndarray:
         """The line integrals at which pixels saturate, float64 [v, u]: the smallest that the detector can report."""
         gains = self.maps(shape)[0] if self.corrected else 1
         return np.broadcast_to(-np.log(self.saturation / gains), shape)
 
-    def deviation(self, transmission) -> np.ndarray:
+    def deviation(self, transmission: ArrayLike) -> np.ndarray:
         """Standard deviation of a line integral -ln(N / I0) from counting noise and rounding to `bits`, to first order.
 
         transmission   any shape; values below the floor count as the floor
@@ -162,11 +164,11 @@ class Detector:
             variance = variance + light / self.photons + (self.electronic_noise / self.photons) ** 2
         return np.sqrt(variance) / light
 
-    def maps(self, shape):
+    def maps(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Gains, float64, and dead pixels, bool, [v, u]: the same for all views."""
         return _maps(self.seed, self.gain, self.dead, tuple(shape))
 
-    def blurred(self, image, view):
+    def blurred(self, image: Any, view: View) -> Any:
         """The intensity, Float [height * width], spread by the scintillator; differentiable.
 
         A Gaussian, sampled at the pixels: right for widths from one pixel on. Beyond the panel the light is that of its

@@ -12,12 +12,14 @@ points is a projection of its own, with the source and the pixels moved: blur va
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.projectors.view import View
 
 MOST_ORDER = 16
 
@@ -30,7 +32,7 @@ class FocalSpot:
     order: int = 3
 
     @staticmethod
-    def of(size, order) -> FocalSpot:
+    def of(size: Any, order: Any) -> FocalSpot:
         """From plugin parameters: '1.2, 0.8' or one number. Raises InputError."""
         try:
             numbers = [float(x) for x in str(size).replace(',', ' ').split()]
@@ -40,7 +42,7 @@ class FocalSpot:
             raise InputError(f'focal_spot must be one or two lengths in mm, not {size!r}')
         return FocalSpot((numbers[0], numbers[-1]), checked_order(order, 'focal_order'))
 
-    def views(self, view) -> list:
+    def views(self, view: View) -> list:
         """(weight, View) of every point of the focal spot; the view itself for a point source."""
         if self.size == (0.0, 0.0):
             return [(1.0, view)]
@@ -54,7 +56,7 @@ class FocalSpot:
         """The same spot with lengths multiplied by `factor`."""
         return replace(self, size=(factor * self.size[0], factor * self.size[1]))
 
-    def check(self, distance: float | None):
+    def check(self, distance: float | None) -> None:
         """Raises InputError unless the spot is smaller than its distance to the axis, mm (None: a parallel beam)."""
         if max(self.size) > 0 and distance is None:
             raise InputError('focal_spot: a parallel beam has no focal spot')
@@ -67,7 +69,7 @@ class FocalSpot:
         return f'focal_spot = {self.size[0]:g} x {self.size[1]:g} mm, {self.order} x {self.order} points'
 
 
-def aperture_views(view, share: float, order: int) -> list:
+def aperture_views(view: View, share: float, order: int) -> list:
     """(weight, View) of n x n points in the middle `share` of every pixel; the view itself for a share of 0."""
     if share == 0:
         return [(1.0, view)]
@@ -85,7 +87,7 @@ def square(order: int, wide: bool = True, high: bool = True) -> list:
     return [(float(wx * wy), float(x), float(y)) for wy, y in down for wx, x in across]
 
 
-def checked_order(order, name: str) -> int:
+def checked_order(order: Any, name: str) -> int:
     """Raises InputError unless the number of quadrature points is an integer from 1 to 16."""
     if isinstance(order, bool) or not isinstance(order, int) or not 1 <= order <= MOST_ORDER:
         raise InputError(f'{name} must be a whole number from 1 to {MOST_ORDER}, not {order!r}')

@@ -143,7 +143,7 @@ class Effects:
             projections = np.stack([bands.precorrected(view) for view in projections])  # one by one, for memory
         return replace(scan, projections=projections, effects=None)
 
-    def measured(self, integrals: Any, view: View, seed: int):
+    def measured(self, integrals: Any, view: View, seed: int) -> Any:
         """Line integrals as the detector reports them, with noise, from expected ones. Not differentiable."""
         if not (self.detector and self.detector.measures):
             return integrals
@@ -151,7 +151,7 @@ class Effects:
         return mi.Float(self.detector.measure(light, self.index, seed).ravel())
 
 
-def find_effects(scene, sensor) -> Effects | None:
+def find_effects(scene: Any, sensor: Any) -> Effects | None:
     """The effects of a scene with a sensor; None without any. Raises InputError for impossible ones."""
     tubes = [e for e in scene.emitters() if hasattr(e, 'tube')]
     detector = getattr(sensor, 'detector', None) or getattr(sensor.film(), 'detector', None)

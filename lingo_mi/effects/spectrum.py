@@ -13,8 +13,10 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 
@@ -92,7 +94,7 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     return spectrum
 
 
-def attenuation(material: str, energies) -> np.ndarray:
+def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
     """Linear attenuation coefficients, 1/mm, at energies in keV, with coherent scattering (xraylib).
 
     material   a short name of `NAMES`, a compound of the NIST database as xraylib spells it, an element's symbol, or a
@@ -144,7 +146,7 @@ def _filters(text: str) -> list[tuple[str, float]]:
     return out
 
 
-def library(name: str):
+def library(name: str) -> Any:
     """The module spekpy or xraylib. Raises InputError if it is not installed."""
     try:
         return importlib.import_module(name)

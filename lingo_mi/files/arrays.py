@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from os import PathLike
+
 import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.paths import one_line, reading, replacing
 
 
-def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> np.ndarray:
+def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:
     """`array`, after a check that it is real, finite unless it need not be, not empty and has `ndim` dimensions
     (None: any); else InputError."""
     if array.dtype.kind not in 'buif':
@@ -24,13 +26,13 @@ def numeric(array: np.ndarray, where, ndim: int | None, finite: bool = True) -> 
     return array
 
 
-def load(path, ndim: int | None, finite: bool = True) -> np.ndarray:
+def load(path: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:
     """The array of a .npy file. Raises InputError if it is missing, damaged, pickled, not finite (unless it need
     not be) or not `ndim`-D (None: any)."""
     return numeric(_numpy_load(path, np.ndarray), path, ndim, finite)
 
 
-def load_many(path) -> dict[str, np.ndarray]:
+def load_many(path: PathLike | str) -> dict[str, np.ndarray]:
     """The arrays of a .npz file by name. Raises InputError if it is missing, damaged or holds pickled
     objects."""
     return _numpy_load(path, dict)
@@ -54,7 +56,7 @@ def _numpy_load(path, kind):
     return loaded
 
 
-def save(path, array: np.ndarray) -> None:
+def save(path: PathLike | str, array: np.ndarray) -> None:
     """Writes a .npy file, whole or not at all. Raises InputError if that is impossible."""
     with replacing(path) as temporary, open(temporary, 'wb') as stream:
         np.save(stream, array, allow_pickle=False)

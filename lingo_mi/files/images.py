@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from os import PathLike
+
 import numpy as np
 import OpenEXR
 
@@ -10,7 +12,7 @@ from lingo_mi.files.arrays import numeric
 from lingo_mi.paths import one_line, reading, replacing
 
 
-def write_exr(path, image) -> None:
+def write_exr(path: PathLike | str, image: np.ndarray) -> None:
     """Writes `image` [v, u] as the float32 channel Y (luminance), whole or not at all.
 
     Raises InputError if the image is not 2D, empty or not finite, or the file cannot be written.
@@ -22,7 +24,7 @@ def write_exr(path, image) -> None:
         OpenEXR.File(header, {'Y': OpenEXR.Channel(image)}).write(str(temporary))
 
 
-def read_exr(path) -> np.ndarray:
+def read_exr(path: PathLike | str) -> np.ndarray:
     """Reads the channel Y, or the only channel, of an OpenEXR file: float32 [v, u].
 
     Raises InputError if the file is missing, damaged, has several channels and no Y, or is not finite.

@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import math
 import pickle
-from typing import Literal
+from os import PathLike
+from typing import Any, Literal
 
 import numpy as np
 
@@ -178,7 +179,7 @@ def _resolve(value, depth=0):
     raise _Refused(f'a value of type {type(value).__name__}')
 
 
-def load_pickle(path):
+def load_pickle(path: PathLike | str) -> Any:
     """The plain data in a pickle, protocols 0 to 5 of Python 3, written by NumPy 1 or 2.
 
     Raises InputError if the file is missing, truncated, or holds anything but dictionaries, lists, tuples,
@@ -226,7 +227,7 @@ def _split(data, name, where):
     return projections, angles
 
 
-def read(path) -> Dataset:
+def read(path: PathLike | str) -> Dataset:
     """Reads a NAF / SAX-NeRF pickle.
 
     Required: DSO, DSD (cone beam), nDetector, dDetector or sDetector, nVoxel, dVoxel or sVoxel (mm), and
@@ -260,7 +261,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write(path, dataset: Dataset) -> None:
+def write(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
 
     Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v).

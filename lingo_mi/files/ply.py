@@ -15,7 +15,10 @@ Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes 
 
 from __future__ import annotations
 
+from os import PathLike
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.paths import reading, replacing
@@ -69,7 +72,14 @@ def _check(where, centres, scales, quaternions, density, name='density'):
         )
 
 
-def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
+def write_ply(
+    path: PathLike | str,
+    centres: ArrayLike,
+    scales: ArrayLike,
+    quaternions: np.ndarray,
+    density: ArrayLike,
+    second: ArrayLike | None = None,
+) -> None:
     """Writes a cloud, whole or not at all.
 
     centres [N, 3] and scales [N, 3] (standard deviations, > 0) in one unit of length, quaternions [N, 4] (x,
@@ -96,7 +106,15 @@ def write_ply(path, centres, scales, quaternions, density, second=None) -> None:
     _write(path, names, table)
 
 
-def write_radiance_ply(path, centres, scales, quaternions, opacity, radiance, harmonics) -> None:
+def write_radiance_ply(
+    path: PathLike | str,
+    centres: ArrayLike,
+    scales: ArrayLike,
+    quaternions: np.ndarray,
+    opacity: ArrayLike,
+    radiance: ArrayLike,
+    harmonics: ArrayLike,
+) -> None:
     """Writes a grey cloud as 3DGS does, for its viewers, whole or not at all.
 
     centres, scales, quaternions as for `write_ply`; opacity [N] in [0, 1]; radiance [N] and harmonics [N, 0, 3, 8 or 15]:
@@ -177,7 +195,7 @@ def _header(stream, where):
     return int(elements[0][2]), np.dtype([(f[2], _TYPES[f[1]]) for f in fields])
 
 
-def read_ply(path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Reads a cloud: (centres [N, 3], scales [N, 3], quaternions [N, 4] (x, y, z, w), density [N]), float32.
 
     Properties may come in any order; all but centre, scale, rot and density are ignored. Raises InputError if

@@ -7,9 +7,11 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
@@ -18,7 +20,13 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.paths import one_line, reading
 
 
-def read_poses(path, nDetector, dDetector=None, parallel: bool = False, towards=(0.0, 0.0, 0.0)) -> Rays:
+def read_poses(
+    path: PathLike | str,
+    nDetector: tuple[int, int],
+    dDetector: tuple[float, float] | None = None,
+    parallel: bool = False,
+    towards: ArrayLike = (0.0, 0.0, 0.0),
+) -> Rays:
     """The views of a file of poses, in mm.
 
     nDetector   (v, u) pixels

@@ -11,6 +11,7 @@ and offOrigin (x, y, z); angles are radians. offDetector is (u, v) and reaches T
 from __future__ import annotations
 
 import json
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def _views(meta, split, folder, where):
     return make_scan(geometry, np.stack(projections), where)
 
 
-def read(path) -> Dataset:
+def read(path: PathLike | str) -> Dataset:
     """Reads an R2-Gaussian folder.
 
     Returns a Dataset; the test views and the volume are None where the folder has none. Raises InputError if
@@ -76,7 +77,7 @@ def read(path) -> Dataset:
     return make_dataset(train, _views(meta, 'test', folder, where), volume, where)
 
 
-def write(path, dataset: Dataset) -> None:
+def write(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a new R2-Gaussian folder, whole or not at all; lengths and projections stay in mm.
 
     R2-Gaussian itself cannot read a folder without a volume. Raises InputError if the folder exists and is

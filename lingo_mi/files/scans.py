@@ -40,6 +40,7 @@ cone beam with one row.
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -343,7 +344,7 @@ def _read_htc(path, name):
 # ---- any format --------------------------------------------------------------------------------------------
 
 
-def read_scan(path, geometry=None, name: str = 'ta') -> Dataset:
+def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Dataset:
     """Reads a scan; the format follows from the path.
 
     path       .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: Helsinki
@@ -382,7 +383,7 @@ def read_scan(path, geometry=None, name: str = 'ta') -> Dataset:
 _WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _write_npy}
 
 
-def write_scan(path, dataset: Dataset | Scan, kind: str) -> None:
+def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str) -> None:
     """Writes a scan that `read_scan` reads back, whole or not at all.
 
     kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`

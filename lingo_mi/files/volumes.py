@@ -19,11 +19,14 @@ from __future__ import annotations
 import gzip
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
@@ -56,7 +59,7 @@ class Volume:
     unit: str
 
 
-def centred_affine(shape, spacing) -> np.ndarray:
+def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:
     """The affine [4, 4] of a volume of `shape` voxels of `spacing` mm whose middle is the world's origin."""
     spacing = np.asarray(spacing, float)
     affine = np.diag([*spacing, 1.0])
@@ -296,7 +299,12 @@ def _stack_dicom(folder, slices):
 
 
 def read_volume(
-    path, mu_water: float | None = None, shape=None, dtype=None, spacing=None, hu: bool | None = None
+    path: PathLike | str,
+    mu_water: float | None = None,
+    shape: Sequence[int] | None = None,
+    dtype: Any = None,
+    spacing: ArrayLike | None = None,
+    hu: bool | None = None,
 ) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
@@ -368,7 +376,13 @@ def read_volume(
     return Volume(np.ascontiguousarray(density, np.float32), (x, y, z), affine, unit)
 
 
-def write_volume(path, data, spacing, origin=None, description: str = 'normalised') -> None:
+def write_volume(
+    path: PathLike | str,
+    data: np.ndarray,
+    spacing: ArrayLike,
+    origin: ArrayLike | None = None,
+    description: str = 'normalised',
+) -> None:
     """Writes a float32 NIfTI file, whole or not at all, that `read_volume` returns unchanged.
 
     path          .nii or .nii.gz

@@ -24,7 +24,7 @@ class Average:
     def __init__(self, decay: float):
         self.decay, self.values = decay, None
 
-    def add(self, state: DeviceState):
+    def add(self, state: DeviceState) -> None:
         """Add a step's parameters to the mean."""
         if self.decay == 0:
             return
@@ -34,7 +34,7 @@ class Average:
         self.values = {k: keep * self.values[k] + (1 - keep) * dr.detach(v) for k, v in state.values.items()}
         dr.eval(self.values)
 
-    def restart(self):
+    def restart(self) -> None:
         """Discard the mean."""
         self.values = None
 
@@ -50,7 +50,7 @@ class Average:
         """The mean by name, float32 [N, components], for a checkpoint."""
         return {PREFIX + k: v for k, v in download(self.values or {}).items()}
 
-    def restore(self, arrays: dict):
+    def restore(self, arrays: dict) -> None:
         """Restore the output of `arrays`."""
         self.values = upload(values_of(arrays)) or None
 

@@ -29,7 +29,14 @@ APART = 0.7  # distance of a half's centre from its parent's, in the parent's st
 SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over their parent's
 
 
-def densify(state: State, settings: Settings, half, rng, flat: bool = False, largest: float = np.inf) -> State:
+def densify(
+    state: State,
+    settings: Settings,
+    half: np.ndarray,
+    rng: np.random.Generator,
+    flat: bool = False,
+    largest: float = np.inf,
+) -> State:
     """Clone and split, or halve, and prune once, then clear the statistic.
 
     half      half the volume's sides, [3]; Gaussians centred outside are removed
@@ -55,13 +62,13 @@ def densify(state: State, settings: Settings, half, rng, flat: bool = False, lar
     return prune(state, settings, half, largest)
 
 
-def clone(state: State, chosen, settings: Settings) -> State:
+def clone(state: State, chosen: np.ndarray, settings: Settings) -> State:
     """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
     halved = _shared(state, chosen, 0.5, settings)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
-def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> State:
+def split(state: State, chosen: np.ndarray, settings: Settings, rng: np.random.Generator, flat: bool = False) -> State:
     """Replace each chosen Gaussian [N] by two smaller ones, at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
@@ -77,7 +84,7 @@ def split(state: State, chosen, settings: Settings, rng, flat: bool = False) -> 
     return _append(_take(state, ~chosen), children)
 
 
-def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State:
+def halve(state: State, chosen: np.ndarray, settings: Settings, flat: bool = False) -> State:
     """Replace each chosen Gaussian [N] by two, side by side along its longest axis. The pair has its mass and covariance."""
     parents = np.flatnonzero(chosen)
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
@@ -93,7 +100,7 @@ def halve(state: State, chosen, settings: Settings, flat: bool = False) -> State
     return _append(_take(state, ~chosen), children)
 
 
-def prune(state: State, settings: Settings, half, largest: float = np.inf) -> State:
+def prune(state: State, settings: Settings, half: np.ndarray, largest: float = np.inf) -> State:
     """Remove faint Gaussians (density or opacity below `prune_density`) and stray ones: centre outside the volume or, for alpha
     compositing, a scale above `largest`. Clear the statistic."""
     centre, scale, _, amount = activate(state, settings)

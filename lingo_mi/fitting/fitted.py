@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -75,7 +76,7 @@ class Fitted:
         """The geometry with corrected poses; `geometry` itself if the fit has not corrected them."""
         return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
-    def render(self, geometry: Geometry, progress=None) -> np.ndarray:
+    def render(self, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
         """Projections in the views of a geometry, float32 [view, v, u]; see `CloudModel.render`."""
         return self.model.render(DeviceState(self.state), geometry, progress)
 

@@ -31,13 +31,13 @@ REACH = len(WINDOW) // 2
 TAPS = range(-REACH, TILE + REACH)
 
 
-def l1(image, truth):
+def l1(image: Any, truth: Any) -> Any:
     """Mean absolute error of two arrays Float [N], in their own unit. Subgradient 0 where they agree."""
     difference = image - truth
     return dr.mean(difference * dr.detach(_sign(difference)))
 
 
-def ssim(image, truth, height: int, width: int):
+def ssim(image: Any, truth: Any, height: int, width: int) -> Any:
     """Mean SSIM of an image with its truth, both Float [height * width], row by row; full scale is 1.
 
     Wang et al. (IEEE TIP 2004) in the form of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5,
@@ -47,7 +47,7 @@ def ssim(image, truth, height: int, width: int):
     return 1 - _photometric(image, truth, height, width, 0.0, 1.0)
 
 
-def combined(image, truth, height: int, width: int, lambda_ssim: float = 0.25):
+def combined(image: Any, truth: Any, height: int, width: int, lambda_ssim: float = 0.25) -> Any:
     """L1 + lambda_ssim (1 - SSIM) in one operation, with the arguments of `ssim`.
 
     Differentiable in the image, in reverse mode; InputError as for `ssim`.
@@ -55,7 +55,7 @@ def combined(image, truth, height: int, width: int, lambda_ssim: float = 0.25):
     return _photometric(image, truth, height, width, 1.0, lambda_ssim)
 
 
-def tv(volume, shape: tuple[int, int, int]):
+def tv(volume: Any, shape: tuple[int, int, int]) -> Any:
     """Mean absolute difference of neighbouring voxels along the three axes.
 
     volume : Float [nz * ny * nx], x fastest

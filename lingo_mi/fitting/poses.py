@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from lingo_mi.fitting.settings import AdamSettings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.projectors.view import vector64
+from lingo_mi.projectors.view import View, vector64
 
 _NAMES = ('source', 'corner', 'u', 'v')
 
@@ -45,7 +45,7 @@ class Poses:
         """All numbers by name, for a checkpoint."""
         return {f'poses.{k}': getattr(self, k) for k in ('turn', 'shift', 'first', 'second', 'steps')}
 
-    def restore(self, arrays: dict):
+    def restore(self, arrays: dict) -> None:
         """Restore the output of `arrays`."""
         for name in self.arrays():
             setattr(self, name.removeprefix('poses.'), np.array(arrays[name]))
@@ -69,7 +69,7 @@ class Poses:
         back.turn, back.shift = -self.turn, -Rotation.from_rotvec(-self.turn).apply(self.shift)
         return back
 
-    def step(self, view: int, rays: Rays, gradient: dict, rate: float, adam: AdamSettings):
+    def step(self, view: int, rays: Rays, gradient: dict, rate: float, adam: AdamSettings) -> None:
         """Move a view by one Adam step, then subtract the mean motion of all views.
 
         rays       the view with the corrections so far, [1]
@@ -94,7 +94,7 @@ class Poses:
         self.shift -= self.shift.mean(0)
 
 
-def place(view, rays: Rays):
+def place(view: View, rays: Rays) -> None:
     """Set a `View`'s pose to that of `rays` [1] and enable its gradients."""
     for name in _NAMES:
         vector = vector64(getattr(rays, name)[0])
@@ -102,6 +102,6 @@ def place(view, rays: Rays):
         setattr(view, name, vector)
 
 
-def gathered(view) -> dict:
+def gathered(view: View) -> dict:
     """The accumulated derivatives by a view's vectors, [3] each, by name. Waits for the device."""
     return {name: np.array([float(c[0]) for c in dr.grad(getattr(view, name))]) for name in _NAMES}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.lingo.initialise import InitialCloud
@@ -13,7 +14,12 @@ from lingo_mi.lingo.voxel_filter import voxel_centres
 
 
 def r2_initialise(
-    volume, half, rng=None, n_points: int = 50_000, threshold: float = 0.05, rescale: float = 0.15
+    volume: ArrayLike,
+    half: ArrayLike,
+    rng: np.random.Generator | None = None,
+    n_points: int = 50_000,
+    threshold: float = 0.05,
+    rescale: float = 0.15,
 ) -> InitialCloud:
     """Random voxels of an FDK volume (R2-Gaussian, section 4.1 and its released settings).
 

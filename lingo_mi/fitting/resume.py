@@ -19,7 +19,7 @@ def extensible(settings: Settings) -> bool:
     return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.adam.average == 0
 
 
-def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict, seed: int, path: Path):
+def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:
     """Raise InputError if a checkpoint belongs to another fit, or is inconsistent."""
     damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
     if (

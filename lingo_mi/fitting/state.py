@@ -33,7 +33,7 @@ class State:
         return len(self.born)
 
 
-def start(points, spacing, density, settings: Settings) -> State:
+def start(points: np.ndarray, spacing: np.ndarray, density: np.ndarray | None, settings: Settings) -> State:
     """The state at the start of a fit: isotropic Gaussians, unrotated, with zero moments.
 
     points [N, 3]; spacing [N], standard deviations; density [N] at the centres, in the fit's unit (None for alpha

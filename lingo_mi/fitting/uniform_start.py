@@ -10,7 +10,7 @@ from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.voxel_filter import voxel_centres
 
 
-def random_points(half, flat: bool, n_points: int, rng) -> InitialCloud:
+def random_points(half: np.ndarray, flat: bool, n_points: int, rng: np.random.Generator) -> InitialCloud:
     """Points drawn uniformly from the volume (3DGS without given points draws them from a cube around the scene).
 
     half       half the volume's sides in the normalised frame, [3]
@@ -21,7 +21,7 @@ def random_points(half, flat: bool, n_points: int, rng) -> InitialCloud:
     return _cloud('random', points, np.min(half))
 
 
-def cuboid(shape, half, step: int) -> InitialCloud:
+def cuboid(shape: tuple[int, int, int], half: np.ndarray, step: int) -> InitialCloud:
     """The centres of every `step`-th voxel along the three axes, from the first on (X-Gaussian).
 
     shape, half   voxels of the volume, and half its sides in the normalised frame, [3] each

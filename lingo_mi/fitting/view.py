@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,23 +43,23 @@ class Target:
     scattered: Any = None
 
     @staticmethod
-    def of(scan: Scan, index: int, unit: float, weights=None) -> Target:
+    def of(scan: Scan, index: int, unit: float, weights: np.ndarray | None = None) -> Target:
         """View `index` of a scan; weights float32 [view, v, u] or None."""
         height, width = scan.geometry.nDetector
         rays = scan.geometry.normalised_rays()[[index]]
         pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
-        valid = None
+        valid = on_device = None
         if weights is not None:
-            weights = weights[index].ravel()
-            pixels, weights = pixels * weights, uploaded(weights)
+            own = weights[index].ravel()
+            pixels, on_device = pixels * own, uploaded(own)
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)
         # The object lies between source and panel, so integrals need not end at the panel. If they did, a Gaussian that
         # grows to the panel would leave the fast path.
-        return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), weights, valid, rays)
+        return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), on_device, valid, rays)
 
-    def masked(self, image):
+    def masked(self, image: Any) -> Any:
         """The image prepared for comparison: weighted, invalid pixels zero (as in `pixels`).
 
         SSIM treats invalid pixels like the outside of the panel. Their derivatives vanish.
@@ -68,7 +69,9 @@ class Target:
         return image if self.valid is None else dr.select(self.valid, image, 0)
 
 
-def differentiate(gaussians, target: Target, settings: Settings, batch: int, signal=None, share=None):
+def differentiate(
+    gaussians: tuple, target: Target, settings: Settings, batch: int, signal: Any = None, share: Any = None
+) -> tuple[Any, Any, Any]:
     """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
 
     batch   views per step; the loss is their mean
@@ -107,7 +110,7 @@ def differentiate(gaussians, target: Target, settings: Settings, batch: int, sig
     return dr.detach(loss) * (1 / batch), norm, visible
 
 
-def differentiate_replayed(gaussians, target: Target, settings: Settings, batch: int):
+def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings, batch: int) -> list:
     """`differentiate` for plain line integrals, replayed from a recording. The view's pose is constant."""
     view = target.view
     *found, gradients = _REPLAY(
@@ -135,12 +138,12 @@ def _differentiated(*arrays, height, width, parallel, panel, settings, batch):
     *gaussians, source, corner, u, v, pixels, weights, valid = arrays
     dr.enable_grad(gaussians)
     target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)
-    return *differentiate(gaussians, target, settings, batch), [dr.grad(x) for x in gaussians]
+    return *differentiate(tuple(gaussians), target, settings, batch), [dr.grad(x) for x in gaussians]
 
 
 _REPLAY = Replay(_differentiated)
 
 
-def evaluate(values):
+def evaluate(values: Iterable) -> None:
     """Evaluate all derivatives in one kernel: separate kernels would repeat their common work."""
     dr.eval([dr.grad(value) for value in values])

@@ -5,6 +5,9 @@ Neither PyTorch nor JAX is a dependency: arrays of theirs cannot come from a cal
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -17,7 +20,7 @@ NAMES = 'means', 'scales', 'quaternions', 'density'
 COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian
 
 
-def call(function, arrays, shape, name: str):
+def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...], name: str) -> Any:
     """function(centre, scale, rotation, density), which is Dr.Jit's, of a caller's arrays; a result of the caller's kind.
 
     function   takes Point3f, Vector3f, Vector4f and Float [N], returns Float [prod(shape)]; differentiable

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,15 +36,15 @@ from lingo_mi.projectors.view import View, vector64
 
 
 def project(
-    means,
-    scales,
-    quaternions,
-    density,
+    means: Any,
+    scales: Any,
+    quaternions: Any,
+    density: Any,
     geometry: Geometry,
     *,
     extent: float = cutoff.RENDER,
     views: Iterable[int] | None = None,
-):
+) -> Any:
     """Line integrals of a cloud of Gaussians along the rays of a scan: images [n, v, u], float32, of the caller's kind.
 
     means        [N, 3] centres, mm, in the world frame of `lingo_mi.geometry`
@@ -84,7 +85,9 @@ def project(
     )
 
 
-def voxelize(means, scales, quaternions, density, geometry: Geometry, *, extent: float = cutoff.RENDER):
+def voxelize(
+    means: Any, scales: Any, quaternions: Any, density: Any, geometry: Geometry, *, extent: float = cutoff.RENDER
+) -> Any:
     """Densities of a cloud of Gaussians at the centres of the scan's voxels: a grid [x, y, z], float32, of the caller's kind.
 
     Arguments and errors are those of `project`. Differentiable in all four arrays, in reverse mode.

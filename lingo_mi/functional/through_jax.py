@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import drjit as dr
 import jax
 import jax.numpy as jnp
@@ -11,7 +14,7 @@ from jax.core import Tracer
 from lingo_mi.projectors.upload import uploaded_tensor
 
 
-def call_jax(function, arrays, shape):
+def call_jax(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...]) -> Any:
     """A function of Dr.Jit's tensors, of JAX's arrays: float32 of that shape, differentiable in reverse mode."""
     arrays = [a.astype(jnp.float32) for a in arrays]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import drjit as dr
 import torch
 
@@ -9,7 +12,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.runtime import ensure_variant
 
 
-def call_torch(function, arrays, name: str):
+def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any:
     """A function of Dr.Jit's tensors, of PyTorch's: float32 on their device, with gradients."""
     devices = {a.device for a in arrays}
     if len(devices) > 1 or next(iter(devices)).type not in ('cpu', 'cuda'):

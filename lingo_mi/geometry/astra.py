@@ -15,6 +15,7 @@ ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.cre
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.rays import Rays
@@ -23,12 +24,12 @@ CIRCLES = {'cone': 'cone', 'parallel3d': 'parallel'}  # ASTRA's types of scans o
 VECTORS = {'cone_vec': 'cone', 'parallel3d_vec': 'parallel'}  # of scans with a pose for every view
 
 
-def to_vectors(rays: Rays, nDetector) -> np.ndarray:
+def to_vectors(rays: Rays, nDetector: tuple[int, int]) -> np.ndarray:
     """ASTRA's vectors of the views, float64 [n, 12]; nDetector is (v, u) pixels."""
     return np.concatenate([rays.source, rays.centre(nDetector), rays.u, rays.v], 1)
 
 
-def from_vectors(vectors, nDetector, parallel: bool) -> Rays:
+def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool) -> Rays:
     """The views of ASTRA's vectors [n, 12]; nDetector is (v, u) pixels. InputError where they are no poses."""
     try:
         vectors = np.asarray(vectors, float)

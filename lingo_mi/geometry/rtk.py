@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -47,7 +48,7 @@ _IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', '
 _AXES = [2, 0, 1]  # our x, y, z in RTK's
 
 
-def read(source, nDetector, dDetector) -> Rays:
+def read(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, float]) -> Rays:
     """The views of RTK's geometry, in mm, rows down.
 
     source                 the path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`
@@ -77,7 +78,7 @@ def read(source, nDetector, dDetector) -> Rays:
         raise InputError(f'{where}: {error}') from None
 
 
-def write(path, rays: Rays, nDetector) -> None:
+def write(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
 
     Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between

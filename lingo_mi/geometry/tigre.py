@@ -9,13 +9,15 @@ and COR for every view when it projects, so that each may hold one value or n. T
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 
 
-def numbers(geo, angles) -> tuple[dict, bool]:
+def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
     """What `geo` says, in this package's order and by its names, with the angles; and whether a view leaves the circle.
 
     geo      an object or a dict with TIGRE's names, lengths in mm

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def add_lengths(image, corners, faces, rays):
+def add_lengths(
+    image: np.ndarray, corners: np.ndarray, faces: np.ndarray, rays: Callable[..., tuple[np.ndarray, np.ndarray]]
+) -> None:
     """Adds to image [nv, nu] the signed distances along rays to triangles.
 
     corners  [n, 3, 2], pixel positions; faces [n, 3, 3], world; rays(x, y) -> origins, directions
@@ -33,7 +38,7 @@ def add_lengths(image, corners, faces, rays):
             part[inside] += np.sign(along) * t
 
 
-def voxelize(triangles, low, step, shape) -> np.ndarray:
+def voxelize(triangles: np.ndarray, low: ArrayLike, step: ArrayLike, shape: tuple[int, int, int]) -> np.ndarray:
     """The share of every voxel that lies inside closed meshes of triangles [n, 3, 3]: float32 [x, y, z].
 
     low [3], step [3]   corner of the grid and voxel size, the unit of the triangles

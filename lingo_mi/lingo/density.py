@@ -13,6 +13,7 @@ chosen here:
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lingo_mi.geometry.camera import camera_matrices
@@ -26,7 +27,7 @@ FAINTEST = (
 )
 
 
-def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
+def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
     rays         n views in the normalised frame
@@ -48,7 +49,7 @@ def mean_pixel(rays: Rays, projections, points, valid=None) -> np.ndarray:
     return total / np.maximum(seen, 1)
 
 
-def trilinear(volume: np.ndarray, points, half) -> np.ndarray:
+def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """Trilinear interpolation of a volume at points, [N]; constant beyond the outermost voxel centres.
 
     volume  [x, y, z]
@@ -58,12 +59,12 @@ def trilinear(volume: np.ndarray, points, half) -> np.ndarray:
     return ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')
 
 
-def sampled(volume: np.ndarray, points, half) -> np.ndarray:
+def sampled(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """`trilinear` values of a volume of densities, raised to at least FAINTEST times its largest value."""
     return np.maximum(trilinear(volume, points, half), FAINTEST * volume.max())
 
 
-def least_squares_factor(measured, rendered) -> float:
+def least_squares_factor(measured: np.ndarray, rendered: np.ndarray) -> float:
     """alpha = <I, Ihat> / <Ihat, Ihat>, which minimises |I - alpha Ihat|^2; 1 for an empty rendering.
 
     The sums are in float64. A negative factor (for mostly negative projections) is also replaced by 1.

@@ -85,7 +85,7 @@ class LingoSettings:
             raise InputError(f'init_density {self.init_density!r} is unknown: use one of {", ".join(MODES)}')
 
 
-def draw(cells, count: int, rng):
+def draw(cells: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Draw `count` of the cells, without replacement while they last: (cells [count], whether each is a repeat [count]).
 
     If there are fewer cells than points, cells are repeated as evenly as possible.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 
-def ipsd(initial, structural) -> float:
+def ipsd(initial: np.ndarray, structural: np.ndarray) -> float:
     """IPSD = 1/N sum over initial points of the distance to the closest structural point.
 
     initial     P, [N, 3]: the points the fit started from
@@ -20,7 +21,7 @@ def ipsd(initial, structural) -> float:
     return float(KDTree(structural).query(initial)[0].mean())
 
 
-def reverse_distance(initial, structural) -> float:
+def reverse_distance(initial: np.ndarray, structural: np.ndarray) -> float:
     """The mean distance from the structural points to the closest initial point: IPSD with exchanged roles.
 
     IPSD alone is small if Gaussians split everywhere. This number shows how much structure the initial points
@@ -29,7 +30,7 @@ def reverse_distance(initial, structural) -> float:
     return ipsd(structural, initial)
 
 
-def neighbour_distance(points, fallback: float) -> np.ndarray:
+def neighbour_distance(points: ArrayLike, fallback: float) -> np.ndarray:
     """Root mean square distance to the three nearest neighbours, [N] (R2-Gaussian's initial scale).
 
     With fewer than four points, all others are neighbours. A single point gets `fallback`.

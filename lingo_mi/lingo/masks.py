@@ -25,7 +25,7 @@ class Masks:
     valid: np.ndarray | None = None
 
 
-def masks(projections, low_factor: float = 0.1, valid=None) -> Masks:
+def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | None = None) -> Masks:
     """M_h = I > T_h with T_h = Otsu(I), and M_l = I > T_l with T_l = `low_factor` T_h, per view.
 
     projections  [n, v, u] line integrals (the object is bright)

@@ -8,7 +8,7 @@ from skimage.filters import threshold_otsu
 BINS = 256
 
 
-def otsu(image) -> float:
+def otsu(image: np.ndarray) -> float:
     """The threshold t* = Otsu(I) that maximises the between-class variance, in the image's own units.
 
     The histogram has 256 bins between the image's smallest and largest value. The threshold is a bin centre,

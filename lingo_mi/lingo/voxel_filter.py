@@ -6,7 +6,10 @@ would do). Pure NumPy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.camera import camera_matrices
@@ -17,19 +20,19 @@ CHUNK = 1 << 15  # points projected at once, so that they stay in the cache
 BLOCK = 8  # cells along the side of a block, which is tested as a whole
 
 
-def voxel_centres(grid, half, index=None) -> np.ndarray:
+def voxel_centres(grid: Sequence[int] | np.ndarray, half: ArrayLike, index: np.ndarray | None = None) -> np.ndarray:
     """Centres [N, 3] of the cells `index` (flat, z fastest; default all) of a grid over [-half, half].
 
     grid   cells (x, y, z)
     half   half the volume's sides in the normalised frame, [3]
     """
-    grid, half = np.asarray(grid, int), np.asarray(half, float)
-    index = np.arange(grid.prod()) if index is None else index
-    ijk = np.stack(np.unravel_index(index, tuple(grid)), -1)
-    return (ijk + 0.5) * (2 * half / grid) - half
+    cells, half = np.asarray(grid, int), np.asarray(half, float)
+    index = np.arange(cells.prod()) if index is None else index
+    ijk = np.stack(np.unravel_index(index, tuple(cells)), -1)
+    return (ijk + 0.5) * (2 * half / cells) - half
 
 
-def pixels(matrix, points, shape):
+def pixels(matrix: np.ndarray, points: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """P^I = floor(clip(M P)): flat pixel indices [N], and whether each point projects into the image, [N].
 
     matrix  [3, 4], see `camera_matrices`
@@ -93,7 +96,14 @@ def _over_corners(function, values):
     return values
 
 
-def valid_voxels(rays: Rays, masks: Masks, grid, half, misses: int = 0, outside: str = 'invalid'):
+def valid_voxels(
+    rays: Rays,
+    masks: Masks,
+    grid: Sequence[int] | np.ndarray,
+    half: ArrayLike,
+    misses: int = 0,
+    outside: str = 'invalid',
+) -> tuple[np.ndarray, np.ndarray]:
     """The intersections of all views: flat cell indices (z fastest) of the low and the high valid set, sorted.
 
     rays     n views in the normalised frame

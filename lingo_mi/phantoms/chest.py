@@ -9,6 +9,7 @@ is exactly 0. A voxel holds its average to first order; textures are fixed in sp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -36,7 +37,7 @@ _COARSE = 96  # lattice of the smooth fields, for all sizes
 _SIDES = (1, -1)
 
 
-def density(hu):
+def density(hu: Any) -> Any:
     """Hounsfield units to [0, 1]: (clip(hu, -1000, 2000) + 1000) / 3000."""
     return (np.clip(hu, -1000, 2000) + 1000) / 3000
 
@@ -50,13 +51,13 @@ class Stack:
 
     rows: tuple
 
-    def at(self, z):
+    def at(self, z: np.ndarray) -> list[np.ndarray]:
         """Half width, half depth and centre's y at heights z, constant beyond the rows."""
         rows = np.array(self.rows, float)
         z = np.clip(z, rows[0, 0], rows[-1, 0])
         return [PchipInterpolator(rows[:, 0], rows[:, i])(z).astype(np.float32) for i in (1, 2, 3)]
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         a, b, c = self.at(z)
         y = y - c
         u, v = (np.abs(x) / a) ** 2.4, (np.abs(y) / b) ** 2.4
@@ -255,7 +256,7 @@ def _trees(rng, is_lung):
     return vessels, airways
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     """Data float32 [size]^3 in [0, 1], side in mm, and no analytic form (see `phantoms.make`)."""
     rng = np.random.default_rng(seed)
     grid, coarse = (Grid(n, SIDE, np.full(3, -SIDE / 2)) for n in (size, _COARSE))

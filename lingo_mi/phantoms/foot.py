@@ -374,7 +374,7 @@ def _vessels(rng):
     return out
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     """Data float32 [size]^3 in [0, 1], side in mm, and no analytic form (see `phantoms.make`)."""
     rng = np.random.default_rng(seed)
     side = SIDE / _SCALE

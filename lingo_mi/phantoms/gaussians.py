@@ -11,6 +11,7 @@ closed form along whole lines, in float64:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -155,7 +156,7 @@ def cloud(n: int = 2000, seed: int = 0) -> Cloud:
     return Cloud(centres, scales, quaternions, density)
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
     """Data float32 [size]^3, side in mm, and the cloud (see `phantoms.make`)."""
     analytic = cloud(seed=seed)
     return analytic.voxels(size), SIDE, analytic

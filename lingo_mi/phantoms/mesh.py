@@ -12,6 +12,7 @@ Mitsuba's `ply` and `obj` shapes:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -142,9 +143,9 @@ class Mesh:
         return out.astype(np.float32)
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
     """Data float32 [size]^3 in [0, 1], side in mm, and the mesh (see `phantoms.make`). The seed is not
     used."""
     analytic = Mesh(flange())
     step = SIDE / size
-    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size,) * 3), SIDE, analytic
+    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size, size, size)), SIDE, analytic

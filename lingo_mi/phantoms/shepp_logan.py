@@ -13,6 +13,7 @@ Data are voxel averages: voxels that an ellipsoid's surface crosses are sampled 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -90,7 +91,7 @@ def ellipsoids() -> Ellipsoids:
     return Ellipsoids(TABLE[:, 0].copy(), TABLE[:, 4:7] * half, whiten)
 
 
-def build(size: int, seed: int):
+def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
     """Data float32 [size]^3 in [0, 1], side in mm, and the ellipsoids (see `phantoms.make`). The seed is not
     used."""
     analytic = ellipsoids()

@@ -9,7 +9,7 @@ to first order.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -36,11 +36,11 @@ class Cone:
     rb: float
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         low = [min(a - self.ra, b - self.rb) for a, b in zip(self.a, self.b)]
         return np.array([low, [max(a + self.ra, b + self.rb) for a, b in zip(self.a, self.b)]])
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         a, ab = _f(self.a), _f(self.b) - _f(self.a)
         x, y, z = x - a[0], y - a[1], z - a[2]
         t = np.clip((x * ab[0] + y * ab[1] + z * ab[2]) / max(ab @ ab, 1e-12), 0, 1)
@@ -60,12 +60,12 @@ class Ellipsoid:
     axes: np.ndarray | None = None
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         axes = np.eye(3) if self.axes is None else self.axes
         half = np.sqrt(((axes * np.array(self.radii)[:, None]) ** 2).sum(0))
         return np.stack([self.centre - half, self.centre + half])
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         q0 = q1 = np.float32(0)
         for p, r in zip(local(x, y, z, self.centre, self.axes), self.radii):
             p = p / np.float32(r)
@@ -86,12 +86,12 @@ class Block:
     axes: np.ndarray | None = None
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         axes = np.eye(3) if self.axes is None else self.axes
         half = np.abs(axes * np.array(self.half)[:, None]).sum(0)
         return np.stack([self.centre - half, self.centre + half])
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         q = [np.abs(p) - np.float32(h - self.edge) for p, h in zip(local(x, y, z, self.centre, self.axes), self.half)]
         outside = np.sqrt(sum(np.maximum(p, 0) ** 2 for p in q))
         return outside + np.minimum(np.maximum(np.maximum(q[0], q[1]), q[2]), 0) - np.float32(self.edge)
@@ -108,12 +108,12 @@ class Cylinder:
     axis: int = 0
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         half = np.full(3, self.radius)
         half[self.axis] = self.half
         return np.stack([self.centre - half, self.centre + half])
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         p = local(x, y, z, self.centre, None)
         along = np.abs(p.pop(self.axis)) - np.float32(self.half - self.edge)
         across = np.sqrt(p[0] ** 2 + p[1] ** 2) - np.float32(self.radius - self.edge)
@@ -129,11 +129,11 @@ class Blend:
     k: float = 0.0
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         b = np.stack([p.bounds for p in self.parts])
         return np.stack([b[:, 0].min(0), b[:, 1].max(0)])
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         d = self.parts[0](x, y, z)
         for part in self.parts[1:]:
             d = smooth_min(d, part(x, y, z), self.k)
@@ -150,52 +150,52 @@ class Cut:
     k: float = 0.0
 
     @property
-    def bounds(self):
+    def bounds(self) -> np.ndarray:
         return self.solid.bounds
 
-    def __call__(self, x, y, z):
+    def __call__(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         behind = -sum(q * np.float32(n) for q, n in zip(local(x, y, z, self.point, None), self.normal))
         return smooth_max(self.solid(x, y, z), behind, self.k)
 
 
-def tube(points, radii, k=0.0, smooth=0) -> Blend:
+def tube(points: Sequence | np.ndarray, radii: Sequence[float] | np.ndarray, k: float = 0.0, smooth: int = 0) -> Blend:
     """A chain of cones through `points` with the given radii.
 
     smooth  cones per stretch of a monotone cubic through the points; 0: straight stretches
     """
-    points, radii = np.asarray(points, float), np.asarray(radii, float)
+    places, thick = np.asarray(points, float), np.asarray(radii, float)
     if smooth:
-        knots = np.arange(len(points))
+        knots = np.arange(len(places))
         fine = np.linspace(0, knots[-1], smooth * knots[-1] + 1)
-        points, radii = (PchipInterpolator(knots, v)(fine) for v in (points, radii))
+        places, thick = (PchipInterpolator(knots, v)(fine) for v in (places, thick))
     return Blend(
-        tuple(Cone(tuple(a), tuple(b), ra, rb) for a, b, ra, rb in zip(points[:-1], points[1:], radii[:-1], radii[1:])),
+        tuple(Cone(tuple(a), tuple(b), ra, rb) for a, b, ra, rb in zip(places[:-1], places[1:], thick[:-1], thick[1:])),
         k,
     )
 
 
-def smooth_min(a, b, k):
+def smooth_min(a: Any, b: Any, k: float) -> Any:
     """Polynomial smooth minimum: rounds the crease where |a - b| < k."""
     if k == 0:
         return np.minimum(a, b)
-    k = np.float32(k)
-    h = np.maximum(k - np.abs(a - b), 0)
-    return np.minimum(a, b) - h * h / (4 * k)
+    width = np.float32(k)
+    h = np.maximum(width - np.abs(a - b), 0)
+    return np.minimum(a, b) - h * h / (4 * width)
 
 
-def smooth_max(a, b, k):
+def smooth_max(a: Any, b: Any, k: float) -> Any:
     """Polynomial smooth maximum: rounds the edge where |a - b| < k."""
     return -smooth_min(-a, -b, k)
 
 
-def local(x, y, z, centre, axes):
+def local(x: np.ndarray, y: np.ndarray, z: np.ndarray, centre: Point, axes: np.ndarray | None) -> list[np.ndarray]:
     """Coordinates relative to `centre` along the rows of `axes`."""
     c = _f(centre)
     p = [x - c[0], y - c[1], z - c[2]]
     return p if axes is None else [r[0] * p[0] + r[1] * p[1] + r[2] * p[2] for r in _f(axes)]
 
 
-def rotation(yaw=0.0, pitch=0.0, roll=0.0) -> np.ndarray:
+def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
     """Axes [3, 3] (rows) turned by yaw about z, then pitch about x, then roll about y, in degrees."""
     angles = np.radians([yaw, pitch, roll])
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
@@ -209,7 +209,7 @@ class Grid:
     """Voxel centres of a cube of `size`^3 voxels whose side `side` starts at `origin` (anatomical
     coordinates)."""
 
-    def __init__(self, size: int, side: float, origin):
+    def __init__(self, size: int, side: float, origin: Sequence[float] | np.ndarray):
         self.size, self.h = size, side / size
         self.shape = (size, size, size)
         self.axes = [
@@ -217,7 +217,9 @@ class Grid:
         ]
         self.origin = np.array(origin, float)
 
-    def near(self, solid, pad):
+    def near(
+        self, solid: Any, pad: float
+    ) -> tuple[tuple[slice, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] | None:
         """Slices of the voxels within `pad` of a solid's bounds, and their coordinates; None without any."""
         where = []
         for lo, hi, start in zip(*solid.bounds, self.origin):
@@ -228,16 +230,16 @@ class Grid:
             where.append(slice(first, last))
         return tuple(where), self.at(where)
 
-    def at(self, where):
+    def at(self, where: Sequence[slice]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Broadcastable coordinates of a box of voxels."""
         x, y, z = (a[s] for a, s in zip(self.axes, where))
         return x[:, None, None], y[None, :, None], z[None, None, :]
 
-    def cover(self, distance):
+    def cover(self, distance: np.ndarray) -> np.ndarray:
         """The covered fraction of a voxel whose centre is at a signed distance from a surface."""
         return np.clip(np.float32(0.5) - distance / np.float32(self.h), 0, 1)
 
-    def paint(self, image, solid, value, soft=0.0):
+    def paint(self, image: np.ndarray, solid: Any, value: Any, soft: float = 0.0) -> None:
         """Blend `value` (a number or a function of the box's slices) into `image` inside a solid.
 
         soft  width over which the solid's edge fades, at least a voxel
@@ -250,7 +252,7 @@ class Grid:
         image[where] += c * ((value(where) if callable(value) else np.float32(value)) - image[where])
 
 
-def union(grid: Grid, solids, k: float, pad: float) -> np.ndarray:
+def union(grid: Grid, solids: Iterable, k: float, pad: float) -> np.ndarray:
     """Smooth union of many solids over a whole grid, each evaluated within `pad` of its bounds; `pad`
     elsewhere."""
     d = np.full(grid.shape, pad, np.float32)
@@ -298,7 +300,7 @@ class Texture:
     A voxel receives the average of the noise over its extent, so coarse grids are averages of fine ones.
     """
 
-    def __init__(self, rng, period: float, step: float, scales):
+    def __init__(self, rng: np.random.Generator, period: float, step: float, scales: ArrayLike):
         n = round(period / step)
         self.step = step
         noise = rng.standard_normal((n, n, n), dtype=np.float32)
@@ -307,7 +309,7 @@ class Texture:
         noise = fine - ndimage.gaussian_filter(fine, 1.8 * sigma, mode='wrap', truncate=3)
         self.noise = noise / noise.std()
 
-    def __call__(self, grid: Grid, where=None) -> np.ndarray:
+    def __call__(self, grid: Grid, where: Sequence[slice] | None = None) -> np.ndarray:
         out = self.noise
         where = where or (slice(0, grid.size),) * 3
         for axis, s in enumerate(where):

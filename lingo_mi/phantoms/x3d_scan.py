@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
@@ -13,7 +14,7 @@ from lingo_mi.phantoms import Phantom
 from lingo_mi.scan import Dataset, Scan
 
 
-def default_geometry(phantom: Phantom, angles, pixels: int = 512) -> Geometry:
+def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = 512) -> Geometry:
     """X3D's scanner about a phantom.
 
     DSD 1500 and DSO 1000 mm. The panel of `pixels` x `pixels` is twice as wide as the phantom's longest side (512
@@ -27,7 +28,7 @@ def default_geometry(phantom: Phantom, angles, pixels: int = 512) -> Geometry:
         dDetector=(pixel, pixel),
         nVoxel=phantom.data.shape,
         dVoxel=phantom.spacing,
-        angles=angles,
+        angles=np.asarray(angles, float),
     )
 
 

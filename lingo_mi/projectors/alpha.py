@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.view import View
 
 TILE, PACKET = 8, 4
 LANES = TILE * TILE // PACKET  # per tile
@@ -53,12 +54,12 @@ class Discs:
     count: tuple
 
     @property
-    def visible(self):
+    def visible(self) -> Any:
         """Whether a Gaussian touches the image, Bool [N]."""
         return self.count[0] * self.count[1] > 0
 
 
-def flatten(centre, scale, rotation, opacity, radiance, view) -> Discs:
+def flatten(centre: Any, scale: Any, rotation: Any, opacity: Any, radiance: Any, view: View) -> Discs:
     """Project Gaussians to a view by the affine (EWA) model; differentiable in all of them and in the view's pose.
 
     centre, scale       Point3f, Vector3f [N], standard deviations
@@ -105,7 +106,7 @@ def _tiles(position, half, size, drawn):
     return first, dr.select(drawn, dr.minimum(tile(high) + 1, tiles) - dr.minimum(first, tiles), 0)
 
 
-def composite(discs: Discs, height: int, width: int):
+def composite(discs: Discs, height: int, width: int) -> Any:
     """The image of projected Gaussians, Float [height * width], row by row, over black.
 
     Differentiable in `discs.values`, in reverse mode only.

@@ -8,6 +8,8 @@ different numbers, and their rounding errors cancel: RANDOM times as many cause 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,17 +20,17 @@ CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by number of axes: cells per axis a
 SAMPLE = 16384  # items counted at most
 
 
-def hashed(i):
+def hashed(i: Any) -> Any:
     """Knuth's multiplicative hash, UInt32: an irregular sample, because clouds may be periodic."""
     return i * 2654435761 // 65536
 
 
-def parts_of(depth) -> int:
+def parts_of(depth: Any) -> int:
     """Number of partial sums for a depth that `deepest` returned. Waits for the device."""
     return max(-(-int(depth[0]) // DEEP), 1)
 
 
-def deepest(places, covered, shape):
+def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
     """The largest number of items that overlap in one element of a grid: Float [1], 0 for few items.
 
     places    Int32 [N] for each axis, an item's element; it may lie outside the grid

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import gc
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 
@@ -25,10 +27,10 @@ class Replay:
     `dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False)` traces every call instead.
     """
 
-    def __init__(self, function):
+    def __init__(self, function: Callable[..., Any]):
         self.function, self.recordings = function, OrderedDict()
 
-    def __call__(self, *arrays, **settings):
+    def __call__(self, *arrays: Any, **settings: Any) -> Any:
         key = tuple(map(dr.width, arrays)), tuple(settings.items()), dr.thread_count()
         function = self.function
         recording = self.recordings.pop(key, None) or dr.freeze(lambda *arrays: function(*arrays, **settings))

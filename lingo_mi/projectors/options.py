@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ import mitsuba as mi
 from lingo_mi.errors import InputError
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.balance import SHARING, Sharing
+from lingo_mi.projectors.view import View
 
 FOOTPRINTS = 'exact', 'affine'
 MOST_SUBPIXELS = 16
@@ -35,7 +37,9 @@ class RenderOptions:
     sharing: Sharing = SHARING
 
     @staticmethod
-    def of(accuracy='default', extent=None, footprint='exact', pixel='centre') -> RenderOptions:
+    def of(
+        accuracy: Any = 'default', extent: Any = None, footprint: Any = 'exact', pixel: Any = 'centre'
+    ) -> RenderOptions:
         """The options from plugin parameters. extent=None: that of the preset `accuracy`. Raises InputError."""
         if accuracy not in cutoff.PRESETS:
             raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
@@ -46,12 +50,12 @@ class RenderOptions:
             raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')
         return RenderOptions(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')
 
-    def subdivided(self, view):
+    def subdivided(self, view: View) -> View:
         """The view with every pixel divided into n x n parts."""
         n = self.pixel
         return replace(view, u=view.u / n, v=view.v / n, width=view.width * n, height=view.height * n)
 
-    def averaged(self, image, view):
+    def averaged(self, image: Any, view: View) -> Any:
         """The image of `view` from an image of `subdivided(view)`: the mean over each pixel's parts."""
         n = self.pixel
         if n == 1:

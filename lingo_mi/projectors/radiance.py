@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.projectors.view import View
 
-def radiance_towards(centre, view, radiance, harmonics=None):
+
+def radiance_towards(centre: Any, view: View, radiance: Any, harmonics: Any = None) -> Any:
     """Radiance of N Gaussians along the rays of a view, Float [N]. Differentiable in all inputs, including the view's pose.
 
     centre      Point3f [N]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import drjit as dr
 
 
-def rows_of(q, Vector) -> tuple:
+def rows_of(q: Any, Vector: Any) -> tuple:
     """The rows of the rotation matrix R of a quaternion (x, y, z, w), normalised here: three of the type `Vector`."""
     x, y, z, w = q
     twice = 2 / dr.squared_norm(q)
@@ -20,6 +23,6 @@ def rows_of(q, Vector) -> tuple:
     )
 
 
-def rotate_inverse(rows, v):
+def rotate_inverse(rows: Sequence, v: Any) -> Any:
     """R^T v, from the rows of R."""
     return dr.fma(rows[2], v[2], dr.fma(rows[1], v[1], rows[0] * v[0]))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,7 +18,13 @@ from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
 
-def on_grid(thing, corner, step, shape, extent: float = cutoff.SAMPLE) -> np.ndarray:
+def on_grid(
+    thing: Any,
+    corner: np.ndarray,
+    step: Sequence[float] | np.ndarray,
+    shape: tuple[int, int, int],
+    extent: float = cutoff.SAMPLE,
+) -> np.ndarray:
     """Density of one of a scene's objects (see `objects`) on a grid, float32 [x, y, z].
 
     corner, step   [3] the outer corner of the first voxel, and the voxel size, mm
@@ -25,8 +34,9 @@ def on_grid(thing, corner, step, shape, extent: float = cutoff.SAMPLE) -> np.nda
     Gaussians are sampled at the voxel centres. A mesh is weighted by the share of each voxel that it fills. A grid is
     interpolated trilinearly, and averaged over voxels larger than its own; on its own voxels it is returned unchanged.
     """
+    nx, ny, nz = shape
     if isinstance(thing, Ellipsoids):
-        cells = Grid(vector64(corner), vector64(step), tuple(shape))
+        cells = Grid(vector64(corner), vector64(step), (nx, ny, nz))
         return cells.volume(
             voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent, deep=True)
         )
@@ -37,7 +47,7 @@ def on_grid(thing, corner, step, shape, extent: float = cutoff.SAMPLE) -> np.nda
     low, high = _box(thing)
     own = (high - low) / values.shape
     if (
-        values.shape == tuple(shape)
+        values.shape == (nx, ny, nz)
         and np.allclose(low, corner, atol=1e-4 * own.min())
         and np.allclose(own, step, rtol=1e-4)
     ):
@@ -57,7 +67,7 @@ def grid_values(thing: GridInCube) -> np.ndarray:
     return thing.data.numpy().reshape(thing.size[::-1]).transpose(2, 1, 0) * np.float32(np.ravel(thing.scale)[0])
 
 
-def bounds(objects) -> tuple[np.ndarray, np.ndarray]:
+def bounds(objects: Iterable) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner, float64 [3], of the objects' bounding box; Gaussians extend to 4 standard deviations."""
     boxes = [_box(thing) for thing in objects]
     return np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)

@@ -16,6 +16,7 @@ on the ridge, less a fraction.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,7 +49,9 @@ from lingo_mi.projectors.footprint import DOUBLE, NAMES, Footprints
 SETUP = 6  # cost of a team's visit to eight rows, in packets
 
 
-def splat(footprints: Footprints, height: int, width: int, extent: float, parts: int = 1, sharing: Sharing = SHARING):
+def splat(
+    footprints: Footprints, height: int, width: int, extent: float, parts: int = 1, sharing: Sharing = SHARING
+) -> Any:
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
     extent    cut-off in standard deviations
@@ -67,7 +70,8 @@ class _Splat(dr.CustomOp):
         return self.plan.image(parts)
 
     def forward(self):
-        self.set_grad_out(self.plan.tangent(self.grad_in('values'), self.shear, self.parts))
+        tangents: Any = self.grad_in('values')
+        self.set_grad_out(self.plan.tangent(tangents, self.shear, self.parts))
 
     def backward(self):
         self.set_grad_in('values', by_values(self.plan.gradient(self.grad_out()), self.shear))
@@ -76,7 +80,7 @@ class _Splat(dr.CustomOp):
         return 'splat'
 
 
-def prepare(values, rest, sharing: Sharing):
+def prepare(values: Sequence, rest: Footprints, sharing: Sharing) -> tuple:
     """Pack footprints into the evaluated arrays that `Plan` takes. Evaluates the arrays of `rest` with them."""
     amplitude, mx, my, shear, e1, e2, e11, e12, e22, x, y = values
     ridge = x + shear * y
@@ -114,17 +118,17 @@ class _Packed:
 class Plan:
     """The work of one image: footprints that `prepare` packed, shared out by their pixels."""
 
-    def __init__(self, prepared, height: int, width: int, extent: float, sharing: Sharing):
+    def __init__(self, prepared: Sequence, height: int, width: int, extent: float, sharing: Sharing):
         packed, places, *work = prepared
         self.height, self.width, self.work = height, width, Work(*work, sharing=sharing)
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(width))
         self.packed = _Packed(packed, places, extent2, packets)
 
-    def image(self, parts: int = 1):
+    def image(self, parts: int = 1) -> Any:
         """Float [height * width]."""
         return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed)
 
-    def tangent(self, tangents, shear, parts: int = 1):
+    def tangent(self, tangents: Sequence, shear: Any, parts: int = 1) -> Any:
         """The image's derivative along `tangents` of `Footprints.values`. shear: one of these values."""
         *others, x, y = tangents
         # In float64: a needle that moves along itself must not move its ridge by rounding.
@@ -134,7 +138,7 @@ class Plan:
         dr.eval(moved)
         return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed, moved=moved)
 
-    def gradient(self, grad_image):
+    def gradient(self, grad_image: Any) -> list:
         """Derivatives by the footprints' numbers, Float [N] each, from the derivative by the image.
 
         The last, by y, is taken with the ridge fixed; `by_values` converts it.
@@ -146,7 +150,7 @@ class Plan:
         return out
 
 
-def by_values(found, shear):
+def by_values(found: Sequence, shear: Any) -> tuple:
     """Convert the result of `Plan.gradient` to derivatives by `Footprints.values`. shear: one of these values."""
     *others, x, y = found
     y = type(shear)(y) + shear * type(shear)(x)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def uploaded(values):
+def uploaded(values: np.ndarray) -> Any:
     """A copy of NumPy's values, Float [N], that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
 
     Dr.Jit uses NumPy's memory in place and compiles its alignment into kernels. Without this copy, each densification would
@@ -22,6 +25,6 @@ def uploaded(values):
     return out
 
 
-def uploaded_tensor(values):
+def uploaded_tensor(values: ArrayLike) -> Any:
     """A copy of NumPy's values of any shape, TensorXf."""
     return mi.TensorXf(uploaded(np.ravel(values)), np.shape(values))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -17,7 +18,7 @@ from lingo_mi.scene.checks import check_memory
 
 
 def reconstruct(
-    scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs
+    scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs: Any
 ) -> Reconstruction:
     """Reconstruct a scan with an algorithm, after checks of the memory and of the scan.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -104,7 +105,7 @@ class System:
         return volume
 
 
-def evaluated(x) -> mi.Float:
+def evaluated(x: Any) -> mi.Float:
     """The array, evaluated on the device."""
     dr.eval(x)
     return x

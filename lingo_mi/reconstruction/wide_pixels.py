@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp, sqrt
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -52,11 +53,11 @@ class Between:
     """
 
     @classmethod
-    def of(cls, geometry: Geometry, A, views: np.ndarray) -> Between | None:
+    def of(cls, geometry: Geometry, A: Any, views: np.ndarray) -> Between | None:
         """None if rays are too close for such voxels."""
         return cls(geometry, A, views) if leave_voxels_out(geometry) else None
 
-    def __init__(self, geometry: Geometry, A, views: np.ndarray):
+    def __init__(self, geometry: Geometry, A: Any, views: np.ndarray):
         self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
         weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
         self.crossed = weight > LEAST * blurred(weight, self.size, self.deviations)

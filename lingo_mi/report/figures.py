@@ -10,11 +10,12 @@ Orientation of slices: x to the right and y up (axial), x to the right and z up 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 PLANES = {2: ('Axial', 'x', 'y', 'z'), 1: ('Coronal', 'x', 'z', 'y'), 0: ('Sagittal', 'y', 'z', 'x')}
 DIFFERENCE = 'RdBu_r'
@@ -45,17 +46,19 @@ def plane(volume: np.ndarray, axis: int, index: int) -> np.ndarray:
     return np.take(volume, index, axis).T
 
 
-def plane_extent(shape, spacing, centre, axis: int) -> tuple[float, float, float, float]:
+def plane_extent(
+    shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike, axis: int
+) -> tuple[float, float, float, float]:
     """(left, right, bottom, top) of a slice across `axis`, in mm: the outer edges of its voxels."""
     low, high = bounds(shape, spacing, centre)
     a, b = (i for i in range(3) if i != axis)
     return low[a], high[a], low[b], high[b]
 
 
-def bounds(shape, spacing, centre):
+def bounds(shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike) -> Any:
     """The corners (low, high) of a volume, each [3], mm."""
-    half = np.array(shape) * spacing / 2
-    return centre - half, centre + half
+    half, middle = np.array(shape) * np.asarray(spacing) / 2, np.asarray(centre)
+    return middle - half, middle + half
 
 
 def richest(volume: np.ndarray, axis: int) -> int:
@@ -65,7 +68,7 @@ def richest(volume: np.ndarray, axis: int) -> int:
     return int(best[len(best) // 2])
 
 
-def planes(shape) -> list[int]:
+def planes(shape: Sequence[int]) -> list[int]:
     """The axes across which slices are images, not lines. For a single-slice volume, only its thin axis."""
     return [axis for axis in (2, 1, 0) if min(n for i, n in enumerate(shape) if i != axis) > 1] or [2]
 
@@ -78,7 +81,7 @@ def series(history: list[dict], x: str, y: str) -> tuple[np.ndarray, np.ndarray]
     return points[:, 0], points[:, 1]
 
 
-def grey_range(*arrays) -> tuple[float, float]:
+def grey_range(*arrays: Any) -> tuple[float, float]:
     """A common grey scale: from 0 (or lower) to the 99.9th percentile, both of the last array."""
     reference = arrays[-1]
     low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))
@@ -99,7 +102,7 @@ class Section:
     wide: bool = False  # takes a whole row of the overview
 
 
-def sections(data) -> list[Section]:
+def sections(data: Any) -> list[Section]:
     """The sections for which `data` has content, top to bottom."""
     out = []
     single = len(planes(data.shape)) == 1
@@ -151,7 +154,7 @@ def sections(data) -> list[Section]:
     return out
 
 
-def draw_slices(fig, data):
+def draw_slices(fig: Any, data: Any) -> None:
     """Orthogonal slices, in rows: reconstruction, truth, difference. A single-slice volume takes one row."""
     shape, axes = data.shape, planes(data.shape)
     reference = data.volume if data.truth is None else data.truth
@@ -202,7 +205,7 @@ def draw_slices(fig, data):
         _bar(fig, drawn, list(grid[row]), 'Δ density [1/mm]' if kind == 'Difference' else 'density [1/mm]')
 
 
-def draw_views(fig, data):
+def draw_views(fig: Any, data: Any) -> None:
     """Held-out views, in columns: rendered, measured, difference. Line plots for a detector of one row."""
     chosen = _spread(len(data.views), 3)
     titles = [f'View at {data.views_angles[i]:.4g}°' for i in chosen]
@@ -273,7 +276,7 @@ def _draw_lines(fig, data, chosen, titles):
         grid[0, 0].legend(loc='best', frameon=False)
 
 
-def draw_cloud(fig, data):
+def draw_cloud(fig: Any, data: Any) -> None:
     """The Gaussians' centres, seen along z and along y (only along z for a single-slice volume)."""
     centres, density = data.cloud_centres, data.cloud_density
     if len(centres) > MOST_POINTS:
@@ -315,7 +318,7 @@ def draw_cloud(fig, data):
     _bar(fig, drawn, list(grid), data.cloud_unit)
 
 
-def draw_curves(fig, data):
+def draw_curves(fig: Any, data: Any) -> None:
     """Loss, PSNR and number of Gaussians against iterations and against seconds, if known."""
     rows = [('Loss', ['loss']), ('PSNR [dB]', ['psnr_2d', 'psnr_3d']), ('Gaussians', ['gaussians'])]
     names = {'psnr_2d': '2D, held-out views', 'psnr_3d': '3D, volume'}
@@ -362,7 +365,7 @@ def draw_curves(fig, data):
 # ---- Sheets --------------------------------------------------------------------------------------
 
 
-def sheet(data, section: Section, width: float = 10.0, dpi: int = 130) -> bytes:
+def sheet(data: Any, section: Section, width: float = 10.0, dpi: int = 130) -> bytes:
     """One section as a PNG, `width` inches wide."""
 
     def draw(fig):
@@ -371,7 +374,7 @@ def sheet(data, section: Section, width: float = 10.0, dpi: int = 130) -> bytes:
     return _png(draw, width, section.height(width), dpi)
 
 
-def overview(data, headline: str, width: float = 19.0, dpi: int = 100) -> bytes:
+def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> bytes:
     """All sections as one PNG, two beside each other, under the title and the line `headline`."""
     rows: list[list[Section]] = []
     for section in sections(data):

@@ -6,6 +6,7 @@ import base64
 import html
 import math
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,7 @@ class ReportData:
         object.__setattr__(self, 'history', list(self.metrics.get('history') or []))
 
 
-def write_report(folder, data: ReportData) -> Path:
+def write_report(folder: PathLike | str, data: ReportData) -> Path:
     """Write report.png and report.html into `folder`, which is created if missing. Returns the path of report.html.
 
     The page embeds its pictures and loads nothing, so it can be mailed or opened without a network.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from lingo_mi.lingo.ipsd import ipsd, reverse_distance
 from lingo_mi.scan import Dataset, Scan
 
 
-def quick_measure(dataset: Dataset, most: int = 4):
+def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
     """A function for `fitting.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where there is a truth."""
     test = dataset.test
     if test is not None and len(test) > most:

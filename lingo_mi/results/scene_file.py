@@ -6,10 +6,12 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.scene.description import describe
 
 
-def write_scene(path: Path, geometry, extent: float, effects=None):
+def write_scene(path: Path, geometry: Geometry, extent: float, effects: Effects | None = None) -> None:
     """Write a scene that renders the fitted cloud with the scan's own scanner. It needs only `import lingo_mi`.
 
     effects   the scan's effects that the fit has modelled. The scene then has their tube and a noise-free detector, so that
@@ -31,7 +33,9 @@ def write_scene(path: Path, geometry, extent: float, effects=None):
         lines += ['        <film type="ct_detector">', *_parameters(given, 12), '        </film>']
     lines += ['    </sensor>']
     if effects is not None and effects.tube:
-        spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
+        spot = {}
+        if effects.spot is not None:
+            spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
         given = {k: v for k, v in effects.tube.given.items() if not (v is None or v == '' or k.startswith('material'))}
         if effects.tube.hardens or effects.scatter:  # the cloud stands for all shapes
             given['material'] = ' + '.join(effects.tube.fitted())

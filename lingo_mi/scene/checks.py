@@ -12,7 +12,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.memory import room
 
 
-def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0):
+def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0) -> None:
     """Raises InputError, before anything is allocated, for a scan that does not fit into this process's memory.
 
     views    of all geometries together (0: the views that they have)
@@ -31,7 +31,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
         )
 
 
-def warn_if_truncated(geometry: Geometry):
+def warn_if_truncated(geometry: Geometry) -> None:
     """Warn if the volume's midplane is wider than the panels' field of view."""
     rays, centre = geometry.rays(), np.array(geometry.offOrigin)
     widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]

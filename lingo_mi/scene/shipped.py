@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 
 from lingo_mi.errors import InputError
@@ -14,7 +15,7 @@ def scenes() -> dict[str, Path]:
     return {path.relative_to(root).with_suffix('').as_posix(): path for path in sorted(root.rglob('*.xml'))}
 
 
-def scene_path(scene) -> Path:
+def scene_path(scene: PathLike | str) -> Path:
     """The file of a scene: `scene` itself if it is a file, else the shipped scene of that name.
 
     Folders do not count: a result folder `x3d_foot` does not hide the scene of that name.

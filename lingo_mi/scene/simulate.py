@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import Volume
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.progress import Progress
 from lingo_mi.projectors import cutoff, grid
@@ -21,7 +24,7 @@ from lingo_mi.scene.load import LoadedScene
 from lingo_mi.scene.truth import ScannedVolume, fills_grid, true_volume
 
 
-def take_scan(loaded: LoadedScene, views: int = 0, volume=None, seed: int = 0) -> Dataset:
+def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None, seed: int = 0) -> Dataset:
     """The scan of a scene: its measured projections if the scanner has any; otherwise all views are rendered.
 
     views    number of views to fit, evenly spaced among the scanner's (0: all)
@@ -89,7 +92,7 @@ def choose_views(dataset: Dataset, views: int) -> Dataset:
     return Dataset(train.subset(chosen), test if test is not None else train.subset(rest), volume)
 
 
-def render_objects(objects, geometry, extent: float = cutoff.SIMULATE) -> np.ndarray:
+def render_objects(objects: Sequence, geometry: Geometry, extent: float = cutoff.SIMULATE) -> np.ndarray:
     """Line integrals of all objects in all views, float32 [view, v, u]; Gaussians end at `extent` standard deviations."""
     total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
     with Progress('Scan', len(geometry) * len(objects)) as bar:
@@ -112,7 +115,14 @@ def render_objects(objects, geometry, extent: float = cutoff.SIMULATE) -> np.nda
     return total
 
 
-def render_with(effects: Effects, objects, geometry, keys, seed, extent: float = cutoff.SIMULATE) -> np.ndarray:
+def render_with(
+    effects: Effects,
+    objects: Sequence,
+    geometry: Geometry,
+    keys: np.ndarray,
+    seed: int,
+    extent: float = cutoff.SIMULATE,
+) -> np.ndarray:
     """`render_objects` as measured by a detector. keys: keys of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 
 from lingo_mi.geometry.base import Geometry
@@ -10,7 +12,7 @@ from lingo_mi.projectors.objects import Ellipsoids, GridInCube
 from lingo_mi.projectors.sampling import on_grid
 
 
-def true_volume(objects, geometry) -> np.ndarray | None:
+def true_volume(objects: Iterable, geometry: Geometry) -> np.ndarray | None:
     """The true density on the scanner's grid [x, y, z]; None if an object cannot be sampled on it."""
     total = np.zeros(geometry.nVoxel, np.float32)
     corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
@@ -37,10 +39,10 @@ def fills_grid(thing: GridInCube, geometry: Geometry) -> bool:
 class ScannedVolume:
     """A volume on the scan's own grid, to be scanned."""
 
-    def __init__(self, data, geometry):
+    def __init__(self, data: np.ndarray, geometry: Geometry):
         self.data, self.box = data, geometry
 
-    def project(self, geometry, progress):
+    def project(self, geometry: Geometry, progress: Callable[[int, int], None] | None) -> np.ndarray:
         return grid.project(self.data, geometry, progress)
 
     def in_box(self) -> GridInCube:

@@ -12,6 +12,7 @@ import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -56,7 +57,7 @@ def by_function(name: str, work: Workload, function: Callable, differentiable: b
     return Method(name, image, gradients if differentiable else None)
 
 
-def by_integrator(name: str, work: Workload, sharing: Sharing = SHARING, **settings) -> Method:
+def by_integrator(name: str, work: Workload, sharing: Sharing = SHARING, **settings: Any) -> Method:
     """A method from `lingo_xray` with these parameters, through `mi.render` and `dr.backward`.
 
     sharing   how its work is shared out
@@ -86,7 +87,7 @@ def by_integrator(name: str, work: Workload, sharing: Sharing = SHARING, **setti
     return Method(name, image, gradients)
 
 
-def split(data, density):
+def split(data: Any, density: Any) -> Any:
     """Derivatives by the four parameters from those by the rows of `ellipsoids`."""
     data = data.numpy().reshape(-1, 10)
     return data[:, :3].T, data[:, 3:6].T, data[:, 6:].T, density
@@ -111,7 +112,7 @@ def compare(work: Workload, list_of_methods: list[Method], sizes: Sizes) -> list
     return rows
 
 
-def deviation(found, expected) -> tuple[float, float]:
+def deviation(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """Relative L2 and maximum error."""
     found, expected = np.ravel(np.asarray(found, float)), np.ravel(expected)
     error = found - expected
@@ -158,7 +159,7 @@ def statistics(times: dict) -> dict:
     return out
 
 
-def peak_memory(function: Callable):
+def peak_memory(function: Callable[[], Any]) -> tuple[Any, float]:
     """What a call gives, and the MB that Dr.Jit holds at most during it, above what it held before."""
     gc.collect()
     dr.sync_thread()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 
@@ -76,11 +78,11 @@ class Workload:
         """The image [v, u] and the derivatives by name."""
         if self._truth is None:
             self._truth = image_and_gradients(
-                self.columns, self.geometry.rays(), (self.pixels,) * 2, self.weights, self.order
+                self.columns, self.geometry.rays(), (self.pixels, self.pixels), self.weights, self.order
             )
         return self._truth
 
-    def gaussians(self):
+    def gaussians(self) -> tuple[Any, Any, Any, Any]:
         """Centre, scale, rotation and density as new Dr.Jit arrays."""
         centre, scale, rotation = ([mi.Float(c) for c in x.T] for x in self.columns[:3])
         return mi.Point3f(*centre), mi.Vector3f(*scale), mi.Vector4f(*rotation), mi.Float(self.columns[3])

@@ -17,6 +17,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def _timed(function, *arguments):
     return out, 1e3 * (time.perf_counter() - begun)
 
 
-def build_limit(folder) -> Path | None:
+def build_limit(folder: PathLike | str) -> Path | None:
     """Compile limit.cpp into a folder; None where there is no compiler for it."""
     program = Path(folder) / 'limit'
     source = Path(str(resources.files('lingo_mi.studies.benchmarks') / 'limit.cpp'))

@@ -17,7 +17,7 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
-def gantry(geometry: Geometry, itk: Any):
+def gantry(geometry: Geometry, itk: Any) -> Any:
     """RTK's geometry object. Raises InputError for a scan that is not on a circle."""
     if not isinstance(geometry, CircularGeometry):
         raise InputError('RTK is compared with on circles only; this scan has other poses')
@@ -27,7 +27,7 @@ def gantry(geometry: Geometry, itk: Any):
     return out
 
 
-def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any):
+def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any) -> Any:
     """A volume [x, y, z] as an ITK image (y, z, x)."""
     image = itk.image_from_array(np.ascontiguousarray(volume.transpose(0, 2, 1), np.float32))
     order = [1, 2, 0]
@@ -37,7 +37,7 @@ def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any):
     return image
 
 
-def projection_image(projections: np.ndarray, geometry: Geometry, itk: Any):
+def projection_image(projections: np.ndarray, geometry: Geometry, itk: Any) -> Any:
     """Projections [view, v, u] as an ITK stack; rows upwards."""
     image = itk.image_from_array(np.ascontiguousarray(projections[:, ::-1], np.float32))
     (dv, du), (nv, nu) = geometry.dDetector, geometry.nDetector
@@ -46,12 +46,12 @@ def projection_image(projections: np.ndarray, geometry: Geometry, itk: Any):
     return image
 
 
-def array(image, itk: Any) -> np.ndarray:
+def array(image: Any, itk: Any) -> np.ndarray:
     """A volume image as [x, y, z]."""
     return itk.array_from_image(image).transpose(0, 2, 1)
 
 
-def reconstruct(kind: str, scan: Scan, itk: Any, **settings) -> np.ndarray:
+def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     """Volume [x, y, z] of one of RTK's filters.
 
     kind       'FDK', 'SART' or 'ConjugateGradient'

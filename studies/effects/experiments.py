@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -75,7 +76,7 @@ def experiment_of(name: str) -> Experiment:
     return EXPERIMENTS[name]
 
 
-def measure(name: str, parameters: dict | None = None, settings=SETTINGS, seed: int = 0) -> dict:
+def measure(name: str, parameters: dict | None = None, settings: Any = SETTINGS, seed: int = 0) -> dict:
     """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
 
     parameters   of the scene file (`<default>` names)
@@ -133,7 +134,7 @@ def scans(name: str, parameters: dict, seed: int) -> dict:
     return dict(clean=clean, scan=scan, truth=dataset.volume)
 
 
-def middle(volume, shape):
+def middle(volume: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     """The middle of a volume [x, y, z] of at least a shape."""
     first = [(n - m) // 2 for n, m in zip(volume.shape, shape)]
     return volume[tuple(slice(a, a + m) for a, m in zip(first, shape))]
@@ -148,14 +149,14 @@ def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geom
     return Geometry.from_poses(rays, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
 
 
-def quality(volume, truth) -> dict:
+def quality(volume: np.ndarray, truth: np.ndarray) -> dict:
     """PSNR in dB of a volume [x, y, z] against the truth, whose maximum is full scale: as it is, and after the factor that
     makes the error least."""
     gain = np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
     return dict(psnr_3d=psnr_3d_absolute(volume, truth), psnr_3d_gain=psnr_3d_absolute(gain * volume, truth))
 
 
-def pace(history) -> float:
+def pace(history: list[dict]) -> float:
     """Milliseconds a step, over about the second half of a fit's steps."""
     last = history[-1]
     first = next(h for h in history if 2 * h['iteration'] >= last['iteration'] or h is history[-2])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.geometry.base import CircularGeometry
@@ -20,7 +22,13 @@ def in_views() -> Iterator[ViewCase]:
         yield from cases()
 
 
-def scanner(mode: str = 'cone', shape=(24, 32), angle: float = 33.0, size=(3.2, 3.0), **changes) -> tuple[Rays, tuple]:
+def scanner(
+    mode: str = 'cone',
+    shape: tuple[int, int] = (24, 32),
+    angle: float = 33.0,
+    size: tuple[float, float] = (3.2, 3.0),
+    **changes: Any,
+) -> tuple[Rays, tuple]:
     """Rays of one view of a scanner around [-1, 1]^3, and the panel's shape (v, u).
 
     angle     in degrees
@@ -34,7 +42,7 @@ def scanner(mode: str = 'cone', shape=(24, 32), angle: float = 33.0, size=(3.2, 
     return CircularGeometry(**{**settings, 'mode': mode, **changes}).rays(), shape
 
 
-def turned(rng, n: int) -> np.ndarray:
+def turned(rng: np.random.Generator, n: int) -> np.ndarray:
     """n random orientations, and among the first the axes and diagonals of the world."""
     special = Rotation.from_euler(
         'zyx', [(0, 0, 0), (90, 0, 0), (0, 90, 0), (45, 0, 0), (0, 45, 0), (45, 45, 0)], degrees=True
@@ -42,7 +50,15 @@ def turned(rng, n: int) -> np.ndarray:
     return np.concatenate([special.as_quat(), Rotation.random(n, rng).as_quat()])
 
 
-def through_view(rng, scale, rays: Rays, shape, rotation, reach: float = 1.5, depth: float = 0.3) -> Cloud:
+def through_view(
+    rng: np.random.Generator,
+    scale: ArrayLike,
+    rays: Rays,
+    shape: tuple[int, int],
+    rotation: np.ndarray,
+    reach: float = 1.5,
+    depth: float = 0.3,
+) -> Cloud:
     """Gaussians that all reach into the view but whose centres may lie far outside.
 
     Each has a point that projects into the panel, up to `reach` standard deviations from its centre along each axis.
@@ -61,7 +77,7 @@ def through_view(rng, scale, rays: Rays, shape, rotation, reach: float = 1.5, de
     return Cloud(point + Rotation.from_quat(rotation).apply(off), scale, rotation, rng.uniform(0.2, 1, n))
 
 
-def close_up(mode: str, shape=(24, 32), pixel: float = 1.5e-4, **changes) -> tuple[Rays, tuple]:
+def close_up(mode: str, shape: tuple[int, int] = (24, 32), pixel: float = 1.5e-4, **changes: Any) -> tuple[Rays, tuple]:
     """A panel of tiny pixels that sees the middle of the scene under a magnifying glass."""
     return scanner(mode, shape, size=(shape[0] * pixel, shape[1] * pixel), **changes)
 

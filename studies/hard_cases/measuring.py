@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -78,13 +79,15 @@ def on_device(cloud: Cloud) -> tuple[mi.Point3f, mi.Vector3f, mi.Vector4f, mi.Fl
     return arrays
 
 
-def host(value):
+def host(value: Any) -> Any:
     """A Dr.Jit array as NumPy [N, ...]."""
     array = np.array(value, float)
     return array.T if array.ndim > 1 else array
 
 
-def image_and_gradients(cloud: Cloud, rays: Rays, shape, weights, panel: bool = True, extent: float = EXTENT):
+def image_and_gradients(
+    cloud: Cloud, rays: Rays, shape: tuple[int, int], weights: np.ndarray, panel: bool = True, extent: float = EXTENT
+) -> tuple[np.ndarray, dict[str, Any]]:
     """The device's image of a cloud in the first view of `rays`, float64 [pixels], and derivatives of sum(weights * image) by
     name.
 
@@ -100,12 +103,12 @@ def image_and_gradients(cloud: Cloud, rays: Rays, shape, weights, panel: bool = 
     return image.numpy().astype(float), {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)}
 
 
-def weights_of(shape) -> np.ndarray:
+def weights_of(shape: tuple[int, int]) -> np.ndarray:
     """The weights of the loss, normal about zero, [pixels]."""
     return np.float32(np.random.default_rng(0).normal(size=shape[0] * shape[1])).astype(float)
 
 
-def natural(cloud, gradients):
+def natural(cloud: Cloud, gradients: dict[str, Any]) -> dict[str, Any]:
     """Derivatives in the units that the module's docstring explains, [N, components] by name."""
     low, high = cloud.scale.min(1), cloud.scale.max(1)
     turn = np.linalg.norm(cloud.rotation, axis=1) * low / high
@@ -117,7 +120,14 @@ def natural(cloud, gradients):
     )
 
 
-def errors(cloud: Cloud, image, gradients: dict, expected, expected_gradients: dict, thickness=None) -> Result:
+def errors(
+    cloud: Cloud,
+    image: np.ndarray,
+    gradients: dict,
+    expected: np.ndarray,
+    expected_gradients: dict,
+    thickness: Any = None,
+) -> Result:
     """Errors of an image and of derivatives, as the module's docstring counts them.
 
     expected, expected_gradients   the same in float64

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from lingo_mi.studies.hard_cases.measuring import PARAMETERS
 
 INTRODUCTION = """# Hard cases
@@ -13,7 +15,7 @@ unit (`lingo_mi.studies.hard_cases.measuring` says how). *At most* is what the t
 """
 
 
-def markdown(results) -> str:
+def markdown(results: Iterable[tuple]) -> str:
     """The page. results   pairs of a case and what `measure` found"""
     lines = [
         INTRODUCTION,

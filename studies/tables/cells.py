@@ -256,6 +256,8 @@ class Cells:
         if cell.fit.method != 'none' and self.get(cell.fit) is None:
             raise InputError('there is no fit to complete the views from')
         dataset = self._measured(cell.fit)
+        if dataset.volume is None:
+            raise InputError('there is no true volume to compare with')
         views = dataset.train if cell.fit.method == 'none' else self._completed(cell.fit)
         if isinstance(algorithm, Refined):
             inputs = dict(completed=views, sample=self._cloud(cell.fit).volume)

@@ -62,7 +62,7 @@ VIEWS = {
 
 # PSNR, SSIM by views, algorithm and what completed the views.
 _ORDER = 'none', '3dgs', 'xgaussian', 'r2', 'lingo'
-CT = {
+CT: dict[tuple[int, str], dict[str, tuple[float, float]]] = {
     key: dict(zip(_ORDER, values))
     for key, values in {
         (5, 'fdk'): ((12.63, 0.1183), (20.05, 0.2600), (20.11, 0.2621), (22.98, 0.3986), (23.29, 0.4139)),

@@ -7,7 +7,7 @@ their order rather than their values.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +74,13 @@ class Group:
     columns: tuple[Column, ...]
 
 
-def groups(table: str, views, iterations, methods, algorithms=(*ALGORITHMS, 'voxelize')) -> list[Group]:
+def groups(
+    table: str,
+    views: Sequence[int],
+    iterations: Sequence[int],
+    methods: Sequence[str],
+    algorithms: Sequence[str] = (*ALGORITHMS, 'voxelize'),
+) -> list[Group]:
     """The groups of a table, by rows.
 
     iterations   of the fits; the last one counts for `ct` and `ablation`
@@ -134,7 +140,7 @@ def _volume(views, method, iterations, algorithm):
     return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 
 
-def plan(table_groups: list[Group], objects) -> list[Fit | Volume]:
+def plan(table_groups: list[Group], objects: Iterable[str]) -> list[Fit | Volume]:
     """All cells of a table in the order to compute them: object by object, fits before what is made of them."""
     cells = {}
     for name in objects:
@@ -148,7 +154,7 @@ def plan(table_groups: list[Group], objects) -> list[Fit | Volume]:
     return list(cells)
 
 
-def results(table_groups: list[Group], objects, cells: Cells) -> list[dict]:
+def results(table_groups: list[Group], objects: Iterable[str], cells: Cells) -> list[dict]:
     """One dictionary a row: views, second, object and, by column, the numbers or None.
 
     Below the objects of a group stand 'mean', over those that have all of the group's cells (None where there are none), and
@@ -204,7 +210,7 @@ def markdown(table: str, table_groups: list[Group], rows: list[dict]) -> str:
     return '\n'.join(lines)
 
 
-def write(table: str, table_groups: list[Group], objects, cells: Cells, name: str) -> str:
+def write(table: str, table_groups: list[Group], objects: Iterable[str], cells: Cells, name: str) -> str:
     """Write TABLE.json, TABLE.md and TABLE.provenance.json, of the cells that there are, into their folder; returns the Markdown.
 
     Each cell keeps its own provenance in its own file.

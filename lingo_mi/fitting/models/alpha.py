@@ -6,6 +6,7 @@ It has no densities and no volume. The grey images are the projections divided b
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,8 +16,9 @@ from lingo_mi.fitting.activations import inverse_sigmoid, sigmoid
 from lingo_mi.fitting.models.base import SHAPE, ForwardModel
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.alpha import composite, flatten
+from lingo_mi.projectors.alpha import Discs, composite, flatten
 from lingo_mi.projectors.radiance import radiance_towards
+from lingo_mi.projectors.view import View
 
 OPACITY = 0.1  # of all Gaussians at the start of a fit (3DGS)
 
@@ -36,19 +38,19 @@ class AlphaCompositing(ForwardModel):
         harmonics = {'harmonics': (degree + 1) ** 2 - 1} if degree else {}
         return SHAPE | {'opacity': 1, 'radiance': 1} | harmonics
 
-    def initial(self, n, density):
+    def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
         """Opacity 0.1 and half grey for all Gaussians (3DGS). The density is not used."""
         own = {k: np.zeros((n, size)) for k, size in self.parameters.items() if k not in SHAPE}
         return own | {'opacity': np.full((n, 1), inverse_sigmoid(OPACITY))}
 
-    def amount(self, values):
+    def amount(self, values: dict[str, np.ndarray]) -> np.ndarray:
         return sigmoid(values['opacity'][:, 0].astype(float))
 
-    def shared(self, values, chosen, factor):
+    def shared(self, values: dict[str, np.ndarray], chosen: np.ndarray, factor: float) -> dict[str, np.ndarray]:
         """Unchanged: duplicates keep the opacity."""
         return values
 
-    def may_stay(self, centre, scale, half, largest):
+    def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
         """Gaussians that are not too large, inside the volume or not (3DGS)."""
         return scale.max(1) <= largest
 
@@ -61,20 +63,20 @@ class AlphaCompositing(ForwardModel):
             prune_size=radius * s.densification.prune_size,
         )
 
-    def gaussians(self, values):
+    def gaussians(self, values: dict) -> tuple:
         """As in `ForwardModel`; the further arguments are those of `projectors.radiance.radiance_towards`."""
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
         return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
 
-    def footprints(self, gaussians, rays):
+    def footprints(self, gaussians: tuple, rays: View) -> Discs:
         centre, scale, rotation, opacity, *radiance = gaussians
         return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
 
-    def integrals(self, footprints, rays, share=None):
+    def integrals(self, footprints: Discs, rays: View, share: Any = None) -> list:
         """The grey image, in place of line integrals."""
         return [composite(footprints, rays.height, rays.width)]
 
-    def hold_back(self, gradients, iteration):
+    def hold_back(self, gradients: dict, iteration: int) -> None:
         """Harmonics of degrees that have not started stay zero (3DGS)."""
         if 'harmonics' not in gradients:
             return

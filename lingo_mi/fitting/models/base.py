@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -80,13 +81,13 @@ class ForwardModel(ABC):
         """Footprints of a cloud on a view's panel. The last two `values` are x and y in pixels. Differentiable."""
 
     @abstractmethod
-    def integrals(self, footprints, rays: View, share=None) -> list:
+    def integrals(self, footprints: Any, rays: View, share: Any = None) -> list:
         """Line integrals along the rays of a view: a list of Float [height * width], one for each material. Differentiable.
 
         share   of the second of two materials in every Gaussian, Float [N]; None: one material
         """
 
-    def hold_back(self, gradients: dict, iteration: int):  # noqa: B027 - most models hold nothing back
+    def hold_back(self, gradients: dict, iteration: int) -> None:  # noqa: B027 - most models hold nothing back
         """Set the gradients of parameters to zero that are not fitted yet at this iteration."""
 
     def _shape(self, values: dict):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from lingo_mi.fitting.activations import inverse_softplus, softplus
 from lingo_mi.fitting.models.base import SHAPE, ForwardModel
-from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.footprint import Footprints, project
 from lingo_mi.projectors.splat import splat
+from lingo_mi.projectors.view import View
 
 PARAMETERS = SHAPE | {'density': 1}
 
@@ -24,29 +26,29 @@ class LineIntegrals(ForwardModel):
     def parameters(self) -> dict[str, int]:
         return PARAMETERS
 
-    def initial(self, n, density):
+    def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
         return {'density': inverse_softplus(np.asarray(density))[:, None]}
 
-    def amount(self, values):
+    def amount(self, values: dict[str, np.ndarray]) -> np.ndarray:
         return softplus(values['density'][:, 0].astype(float))
 
-    def shared(self, values, chosen, factor):
+    def shared(self, values: dict[str, np.ndarray], chosen: np.ndarray, factor: float) -> dict[str, np.ndarray]:
         """The chosen densities are multiplied by `factor`."""
         raw = values['density'].astype(float)
         raw[chosen] = inverse_softplus(softplus(raw[chosen]) * factor)
         return values | {'density': raw.astype(np.float32)}
 
-    def may_stay(self, centre, scale, half, largest):
+    def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
         """Gaussians centred inside the volume."""
-        return (np.abs(centre) <= np.asarray(half)).all(1)
+        return np.all(np.abs(centre) <= np.asarray(half), axis=1)
 
-    def gaussians(self, values):
+    def gaussians(self, values: dict) -> tuple:
         return *self._shape(values), _softplus(values['density'])
 
-    def footprints(self, gaussians, rays):
+    def footprints(self, gaussians: tuple, rays: View) -> Footprints:
         return project(*gaussians, view=rays, extent=self.settings.model.extent)
 
-    def integrals(self, footprints, rays, share=None):
+    def integrals(self, footprints: Footprints, rays: View, share: Any = None) -> list:
         amplitude, *others = footprints.values
         parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
         extent = self.settings.model.extent
