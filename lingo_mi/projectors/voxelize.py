@@ -127,9 +127,7 @@ class _Voxelize(dr.CustomOp):
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
         lanes = grid.sharing.lanes
         blocks, cost = (mi.UInt32(rest[3]) + (lanes - 1)) // lanes, length // PACKET + SETUP
-        dr.eval(
-            packed, places, blocks, cost, rest, covered
-        )  # in one kernel: otherwise each would compute all Gaussians again
+        dr.eval(packed, places, blocks, cost, rest, covered)  # in one kernel: each alone would compute all Gaussians
         self.work = Work.of(blocks, cost, grid.sharing)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(nx))
