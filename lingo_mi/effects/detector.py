@@ -169,10 +169,10 @@ class Detector:
         return _maps(self.seed, self.gain, self.dead, tuple(shape))
 
     def blurred(self, image: Any, view: View) -> Any:
-        """The intensity, Float [height * width], spread by the scintillator; differentiable.
+        """The intensity, Float [height * width], blurred by the scintillator. Differentiable.
 
-        A Gaussian, sampled at the pixels: right for widths from one pixel on. Beyond the panel the light is that of its
-        edge.
+        The blur is a Gaussian sampled at the pixels, accurate for widths of at least one pixel. The panel's edge values
+        continue outside.
         """
         import drjit as dr
         import mitsuba as mi

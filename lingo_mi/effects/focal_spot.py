@@ -5,8 +5,8 @@ The signal of a pixel is the mean intensity over all rays from a point of the fo
     I(x) = 1 / (|F| |A|)  \int_F \int_A  I(s + f, x + a)  da df
 
 For a uniform rectangle the Gauss-Legendre rule of n x n points integrates polynomials of degree 2 n - 1, so the error
-falls exponentially with n wherever intensities are smooth; at an edge the blur is a staircase of n steps. Every pair of
-points is a projection of its own, with the source and the pixels moved: blur varies with depth as it should.
+falls exponentially with n where intensities are smooth; at an edge the blur is a staircase of n steps. Every pair of
+points is a separate projection, with source and pixels moved, so that blur varies correctly with depth.
 """
 
 from __future__ import annotations

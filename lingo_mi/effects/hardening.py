@@ -111,7 +111,7 @@ class Tube:
         return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
 
     def made_of(self, name: str) -> tuple[str, ...]:
-        """The materials of a shape. Raises InputError if the scene does not say."""
+        """The materials of a shape. Raises InputError if the scene does not name them."""
         names = self.materials.get(name, self.material)
         if not names:
             raise InputError(

@@ -100,7 +100,7 @@ def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
     material   a short name of `NAMES`, a compound of the NIST database as xraylib spells it, an element's symbol, or a
                chemical formula with its density in g/cm3: 'CsI @ 4.51'
 
-    Raises InputError for an unknown material or where xraylib is not installed.
+    Raises InputError for an unknown material, or if xraylib is not installed.
     """
     xraylib = library('xraylib')
     formula, density = compound(material)

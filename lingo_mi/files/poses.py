@@ -34,7 +34,7 @@ def read_poses(
     parallel    whether a .npy, .txt or .csv has a parallel beam; an .xml contains it
     towards     a point in front of every source, such as the volume's centre; determines the sign of a matrix
 
-    Raises InputError if the file is missing, damaged, or of no known kind, or dDetector is wanted and missing.
+    Raises InputError if the file is missing, damaged or of unknown kind, or if it needs dDetector and that is missing.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -154,7 +154,7 @@ class _Packed:
 def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """The paths through a Mitsuba mesh (`ply`, `obj`, `cube`, `mi.Mesh` ...), in the scene's unit.
 
-    Raises InputError if the shape is no mesh, or as `MeshPaths` does.
+    Raises InputError if the shape is not a mesh, and as `MeshPaths` does.
     """
     name = shape.id()
     if not shape.is_mesh():

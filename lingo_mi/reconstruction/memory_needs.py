@@ -10,9 +10,9 @@ from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 
 
 class Need(NamedTuple):
-    """volumes       at the peak of what works on volumes
-    wide_pixels   the same where rays leave voxels out
-    projections   sets of all projections at the peak of what works on these
+    """volumes       peak of work on volumes, in volumes
+    wide_pixels   the same if rays leave voxels out
+    projections   peak of work on projections, in sets of all projections
     """
 
     volumes: float

@@ -62,7 +62,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
 
 
 def defaults(path: PathLike | str) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no XML."""
+    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or not XML."""
     if not Path(path).is_file():
         raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')
     try:

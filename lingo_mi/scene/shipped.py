@@ -20,7 +20,7 @@ def scene_path(scene: PathLike | str) -> Path:
 
     Folders do not count: a result folder `x3d_foot` does not hide the scene of that name.
 
-    Raises InputError if there is neither; a folder of another name is left to whoever reads it to refuse.
+    Raises InputError if there is neither. A folder of another name is returned unchanged; reading it fails later.
     """
     path = Path(scene)
     if path.is_file():

@@ -37,7 +37,7 @@ def fills_grid(thing: GridInCube, geometry: Geometry) -> bool:
 
 
 class ScannedVolume:
-    """A volume on the scan's own grid, to be scanned."""
+    """A volume on the scan's own grid, as an object to scan."""
 
     def __init__(self, data: np.ndarray, geometry: Geometry):
         self.data, self.box = data, geometry
@@ -46,7 +46,7 @@ class ScannedVolume:
         return grid.project(self.data, geometry, progress)
 
     def in_box(self) -> GridInCube:
-        """The same as an object of a scene."""
+        """The volume as an object of a scene."""
         centre, half = np.array(self.box.offOrigin), np.array(self.box.sVoxel) / 2
         return GridInCube.of(self.data, centre - half, centre + half, 'volume')
 
