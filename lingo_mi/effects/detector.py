@@ -154,8 +154,10 @@ class Detector:
         return np.broadcast_to(-np.log(self.saturation / gains), shape)
 
     def deviation(self, transmission: ArrayLike) -> np.ndarray:
-        """Standard deviation of a line integral -ln(N / I0) by the noise of its counts and the rounding to `bits`, to first
-        order, for transmissions of any shape; at least that of the floor."""
+        """Standard deviation of a line integral -ln(N / I0) from counting noise and rounding to `bits`, to first order.
+
+        transmission   any shape; values below the floor count as the floor
+        """
         light = np.maximum(transmission, self.floor)
         variance = self._step**2 / 12
         if self.photons:

@@ -55,8 +55,8 @@ class Target:
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)
-        # The object lies between source and panel, so integrals need not end there; a Gaussian that grew to reach the
-        # panel would otherwise leave the fast path.
+        # The object lies between source and panel, so integrals need not end at the panel. If they did, a Gaussian that
+        # grows to the panel would leave the fast path.
         return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), on_device, valid, rays)
 
     def masked(self, image: Any) -> Any:

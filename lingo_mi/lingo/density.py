@@ -65,7 +65,7 @@ def sampled(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarr
 
 
 def least_squares_factor(measured: np.ndarray, rendered: np.ndarray) -> float:
-    """alpha = <I, Ihat> / <Ihat, Ihat>, which minimises |I - alpha Ihat|^2; 1 where the rendering is empty.
+    """alpha = <I, Ihat> / <Ihat, Ihat>, which minimises |I - alpha Ihat|^2; 1 for an empty rendering.
 
     The sums are in float64. A negative factor (for mostly negative projections) is also replaced by 1.
     """

@@ -26,12 +26,12 @@ def hashed(i: Any) -> Any:
 
 
 def parts_of(depth: Any) -> int:
-    """In how many parts to add up items that lie so `deepest`. Waits for the device."""
+    """Number of partial sums for a depth that `deepest` returned. Waits for the device."""
     return max(-(-int(depth[0]) // DEEP), 1)
 
 
 def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
-    """How many items lie on top of each other where they do most, on a grid of elements: Float [1], 0 where few are there.
+    """The largest number of items that overlap in one element of a grid: Float [1], 0 for few items.
 
     places    Int32 [N] for each axis, an item's element; it may lie outside the grid
     covered   Float [N], elements that an item covers

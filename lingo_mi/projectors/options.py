@@ -56,7 +56,7 @@ class RenderOptions:
         return replace(view, u=view.u / n, v=view.v / n, width=view.width * n, height=view.height * n)
 
     def averaged(self, image: Any, view: View) -> Any:
-        """The mean over the parts of each pixel of `view`, from an image of `subdivided(view)`."""
+        """The image of `view` from an image of `subdivided(view)`: the mean over each pixel's parts."""
         n = self.pixel
         if n == 1:
             return image

@@ -51,7 +51,7 @@ class AlphaCompositing(ForwardModel):
         return values
 
     def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
-        """Those that are not too large, in the volume or not (3DGS)."""
+        """Gaussians that are not too large, inside the volume or not (3DGS)."""
         return scale.max(1) <= largest
 
     def with_lengths(self, geometry: Geometry) -> Settings:
@@ -77,7 +77,7 @@ class AlphaCompositing(ForwardModel):
         return [composite(footprints, rays.height, rays.width)]
 
     def hold_back(self, gradients: dict, iteration: int) -> None:
-        """Harmonics of a degree that has not joined in stay at zero (3DGS)."""
+        """Harmonics of degrees that have not started stay zero (3DGS)."""
         if 'harmonics' not in gradients:
             return
         model = self.settings.model

@@ -87,7 +87,7 @@ class ForwardModel(ABC):
         share   of the second of two materials in every Gaussian, Float [N]; None: one material
         """
 
-    def hold_back(self, gradients: dict, iteration: int) -> None:  # noqa: B027  (most models hold nothing back)
+    def hold_back(self, gradients: dict, iteration: int) -> None:  # noqa: B027 - most models hold nothing back
         """Set the gradients of parameters to zero that are not fitted yet at this iteration."""
 
     def _shape(self, values: dict):
