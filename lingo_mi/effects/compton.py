@@ -21,9 +21,8 @@ from lingo_mi.errors import InputError
 
 ELECTRON = 510.99895  # m c^2, keV
 LEAST_ENERGY, MOST_ENERGY = 1.0, 800.0  # keV
-CELLS = (
-    8192  # of a table over cos theta from -1 to 1: error 2e-6 for a free electron; 1.3 degrees wide at forward angles
-)
+# Cells of a table over cos theta from -1 to 1. The error is 2e-6 for a free electron; forward cells are 1.3 degrees wide.
+CELLS = 8192
 _FINE = 4096  # angles at which xraylib is evaluated
 _LEAST_Q = 1.1e-3  # 1/Angstrom, lower end of xraylib's tables of S; there S is almost 0 and F almost at its maximum
 _HC = 12.398420  # keV Angstrom

@@ -158,7 +158,7 @@ def hardened(integrals: Sequence, bands: energy_bands.Bands) -> Any:
     least = exponents[0]
     for e in exponents[1:]:
         least = dr.minimum(least, e)
-    least = dr.detach(least)  # any constant will do; this one keeps the largest term at its weight
+    least = dr.detach(least)  # any constant is valid; this one avoids underflow of the largest term
     total: Any = sum(float(w) * dr.exp(least - e) for w, e in zip(bands.weights, exponents))
     return least - dr.log(total)
 

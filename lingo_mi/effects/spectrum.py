@@ -174,9 +174,7 @@ def _cache_folder() -> Path:
 
 def _store(path: Path, spectrum: Spectrum):
     """Cache a spectrum. If the folder cannot be written, only time is lost."""
-    part = path.with_name(
-        f'{path.stem}.{os.getpid()}.npz'
-    )  # renamed when complete, so that other processes never read a part
+    part = path.with_name(f'{path.stem}.{os.getpid()}.npz')  # renamed when complete: other processes never read a part
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(part, energies=spectrum.energies, photons=spectrum.photons)

@@ -22,9 +22,8 @@ from lingo_mi.lingo.voxel_filter import pixels
 
 FACTORS = {'paper': 0.15, 'raw': 1.0}
 MODES = (*FACTORS, 'lsq', 'fdk')
-FAINTEST = (
-    0.02  # least initial density, relative to the FDK volume's largest: its noise must not start Gaussians at zero
-)
+# Least initial density, relative to the FDK volume's largest: the volume's noise must not start Gaussians at zero.
+FAINTEST = 0.02
 
 
 def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:

@@ -22,7 +22,7 @@ from lingo_mi.projectors.depth import hashed
 
 while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable
 
-PACKET = 4  # consecutive elements that a lane reads and writes at a time
+PACKET = 4  # consecutive elements that a lane reads or writes at once
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
 
 

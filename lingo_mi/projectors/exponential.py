@@ -22,7 +22,7 @@ ROUNDER = 1.5 * 2**23  # near it, float32 has no fraction; the last bits hold th
 
 def exp2_of_negative(x: Any) -> Any:
     """2^x for x <= 0, to float32's rounding; at least 2^-126."""
-    if dr.backend_v(x) == dr.JitBackend.CUDA:  # has an instruction
+    if dr.backend_v(x) == dr.JitBackend.CUDA:  # a hardware instruction
         return dr.exp2(x)
     x = dr.maximum(x, -126)
     rounded = x + ROUNDER

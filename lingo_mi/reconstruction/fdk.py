@@ -42,7 +42,7 @@ WINDOWS = {
 }
 
 NAME = 'filtered backprojection'  # in messages
-BATCH = 4  # views a launch: shares the index arithmetic and the volume's memory traffic
+BATCH = 4  # views per launch, which share the index arithmetic and the volume's memory traffic
 
 
 def window_of(filter: str) -> Callable[[np.ndarray], np.ndarray]:
