@@ -12,9 +12,11 @@ the panel, ours by the matched transpose.
 
 from __future__ import annotations
 
+import importlib
 import os
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -102,8 +104,7 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
 def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
     """RTK's operations, or None where it is not installed."""
     try:
-        import itk  # pyright: ignore[reportMissingImports] - optional
-
+        itk: Any = importlib.import_module('itk')
         itk.RTK  # noqa: B018 - loads it
     except (ImportError, AttributeError):
         return None
