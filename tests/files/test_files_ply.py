@@ -1,7 +1,6 @@
 """The Gaussian cloud in PLY: round trip, Mitsuba's reading of it, and bad input."""
 
-import importlib.util
-
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -36,28 +35,14 @@ def test_quaternions_are_normalised_and_density_may_be_a_column(tmp_path):
 
 
 def test_mitsuba_reads_the_same_cloud(tmp_path):
-    if importlib.util.find_spec('mitsuba') is None:
-        pytest.skip('Mitsuba is not installed')
-    import mitsuba as mi
-
-    import lingo_mi  # noqa: F401  (finds libLLVM)
-
-    if 'llvm_ad_mono' not in mi.variants():
-        pytest.skip('this Mitsuba has no llvm_ad_mono')
-    before = mi.variant()
-    mi.set_variant('llvm_ad_mono')
-    try:
-        path = tmp_path / 'a.ply'
-        write_ply(path, *cloud())
-        params = mi.traverse(mi.load_dict({'type': 'ellipsoids', 'filename': str(path)}))
-        centres, scales, q, density = cloud()
-        data = np.array(params['data']).reshape(-1, 10)
-        np.testing.assert_allclose(data, np.concatenate([centres, scales, q], 1), rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(np.array(params['density']), density, rtol=1e-6)
-        assert 'opacities' not in params  # would mean that it was taken for a 3DGS file
-    finally:
-        if before is not None:
-            mi.set_variant(before)
+    path = tmp_path / 'a.ply'
+    write_ply(path, *cloud())
+    params = mi.traverse(mi.load_dict({'type': 'ellipsoids', 'filename': str(path)}))
+    centres, scales, q, density = cloud()
+    data = np.array(params['data']).reshape(-1, 10)
+    np.testing.assert_allclose(data, np.concatenate([centres, scales, q], 1), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(np.array(params['density']), density, rtol=1e-6)
+    assert 'opacities' not in params  # would mean that it was taken for a 3DGS file
 
 
 def test_viewers_opacity_is_that_of_the_ray_through_the_centre(tmp_path):
