@@ -9,13 +9,12 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
 from typing import Any
 
 LABELS = {
     'psnr': 'PSNR {:.2f} dB',
     'psnr_2d': 'PSNR {:.2f} dB',
-    'psnr_3d': '3D {:.2f} dB',
+    'psnr_3d_absolute': '3D {:.2f} dB',
     'gaussians': '{:,} Gaussians',
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal
@@ -91,17 +90,6 @@ class Progress:
         if self.start < self._done < self.total:
             parts.append(f'{_clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
         print(f'{self.description}: {", ".join(parts)}', file=self._file, flush=True)
-
-
-def track(iterable: Iterable, description: str, total: int | None = None) -> Iterator:
-    """The items of `iterable`, with progress shown. `total` is needed where `iterable` has no length."""
-    steps = len(iterable) if total is None and isinstance(iterable, Sized) else total
-    if steps is None:
-        raise TypeError('an iterable without a length needs a total')
-    with Progress(description, steps) as progress:
-        for done, item in enumerate(iterable, 1):
-            yield item
-            progress.update(done)
 
 
 def _bar(file):

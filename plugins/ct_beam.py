@@ -1,5 +1,7 @@
 """The emitter `ct_beam`: the X-rays of one view as light for Mitsuba's own integrators."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import drjit as dr
@@ -36,7 +38,9 @@ class CTBeam(mi.Emitter):
         self.y = mi.Vector3f(dr.cross(across, view.u) / dr.squared_norm(across))
         dr.make_opaque(self.source, self.corner, self.normal, self.x, self.y)
 
-    def sample_direction(self, it, sample, active=True):
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool | bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         p = mi.Vector3f(it.p)
         along = self.source if self.parallel else p - self.source
         behind = dr.dot(self.normal, self.corner - p) / dr.dot(self.normal, along)
@@ -52,19 +56,21 @@ class CTBeam(mi.Emitter):
         ds.emitter = mi.EmitterPtr(self)
         return ds, mi.Spectrum(dr.select(lit, 1 if self.parallel else dr.rcp(dr.square(distance)), 0))
 
-    def eval(self, si, active=True):
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)
 
-    def pdf_direction(self, it, ds, active=True):
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True) -> mi.Float:
         return mi.Float(0)
 
-    def eval_direction(self, it, ds, active=True):
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True
+    ) -> mi.Spectrum:
         return mi.Spectrum(0)
 
-    def traverse(self, callback):
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         pass
 
-    def to_string(self):
+    def to_string(self) -> str:
         return 'CTBeam[]'
 
 

@@ -1,5 +1,10 @@
 """The film `ct_detector`: what a flat panel makes of the photons that reach it."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+
 import mitsuba as mi
 
 from lingo_mi.effects.detector import Detector
@@ -73,31 +78,33 @@ class CTDetector(mi.Film):
             )
         )
 
-    def base_channels_count(self):
+    def base_channels_count(self) -> int:
         return self.film.base_channels_count()
 
-    def prepare(self, aovs):
+    def prepare(self, aovs: Sequence[str]) -> int:
         return self.film.prepare(aovs)
 
-    def put_block(self, block):
+    def put_block(self, block: mi.ImageBlock) -> None:
         self.film.put_block(block)
 
-    def clear(self):
+    def clear(self) -> None:
         self.film.clear()
 
-    def develop(self, raw=False):
+    def develop(self, raw: bool = False) -> mi.TensorXf:
         return self.film.develop(raw)
 
-    def bitmap(self, raw=False):
+    def bitmap(self, raw: bool = False) -> mi.Bitmap:
         return self.film.bitmap(raw)
 
-    def write(self, path):
+    def write(self, path: str | PathLike) -> None:
         self.film.write(path)
 
-    def create_block(self, size=None, normalize=False, borders=False):
+    def create_block(
+        self, size: mi.ScalarVector2u | None = None, normalize: bool = False, borders: bool = False
+    ) -> mi.ImageBlock:
         return self.film.create_block(*([] if size is None else [size]), normalize=normalize, borders=borders)
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f'CTDetector[{self.detector}]'
 
 

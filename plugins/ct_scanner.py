@@ -1,5 +1,7 @@
 """The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import drjit as dr
@@ -124,7 +126,14 @@ class CTScanner(mi.Sensor):
         sensor.detector = self.detector
         return sensor
 
-    def sample_ray(self, time, wavelength_sample, position_sample, aperture_sample, active: Any = True):
+    def sample_ray(
+        self,
+        time: mi.Float,
+        wavelength_sample: mi.Float,
+        position_sample: mi.Point2f,
+        aperture_sample: mi.Point2f,
+        active: mi.Bool | bool = True,
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
         f = self.frame
         Vector3f = mi.Vector3f
         point = (
@@ -139,14 +148,21 @@ class CTScanner(mi.Sensor):
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), wavelength_sample, active)
         return mi.Ray3f(mi.Point3f(start), direction, time, wavelengths), weight
 
-    def sample_ray_differential(self, time, wavelength_sample, position_sample, aperture_sample, active: Any = True):
+    def sample_ray_differential(
+        self,
+        time: mi.Float,
+        wavelength_sample: mi.Float,
+        position_sample: mi.Point2f,
+        aperture_sample: mi.Point2f,
+        active: mi.Bool | bool = True,
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, wavelength_sample, position_sample, aperture_sample, active)
         return mi.RayDifferential3f(ray), weight
 
-    def bbox(self):
+    def bbox(self) -> mi.BoundingBox3f:
         return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*np.array(self.frame.source).ravel()))
 
-    def to_string(self):
+    def to_string(self) -> str:
         g = self.geometry
         circle = isinstance(g, CircularGeometry)
         way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if circle else 'a pose a view'

@@ -1,5 +1,7 @@
 """The medium `ct_volume`: a CT volume or a phantom as Mitsuba's own heterogeneous medium."""
 
+from __future__ import annotations
+
 import mitsuba as mi
 import numpy as np
 
@@ -9,7 +11,7 @@ from lingo_mi.phantoms import make
 from lingo_mi.scene.data_files import data_file
 
 
-def create(props):
+def create(props: mi.Properties) -> mi.Object:
     r"""
     .. _medium-ct_volume:
 

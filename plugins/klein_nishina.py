@@ -1,12 +1,14 @@
 """The phase function `klein_nishina`: Compton scattering of X-rays."""
 
+from __future__ import annotations
+
 import mitsuba as mi
 
 from lingo_mi.effects.compton import scattering
 from lingo_mi.errors import InputError
 
 
-def create(props):
+def create(props: mi.Properties) -> mi.PhaseFunction:
     r"""
     .. _phase-klein_nishina:
 

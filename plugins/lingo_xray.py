@@ -1,5 +1,9 @@
 """The integrator `lingo_xray`: exact X-ray line integrals, forward and backward."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -88,7 +92,15 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         if self.output not in ('line_integral', 'transmission'):
             raise InputError(f"lingo_xray: output is 'line_integral' or 'transmission', not {self.output!r}")
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
         if not develop:
             raise InputError('lingo_xray renders with develop=True only: there are no samples to accumulate')
         with dr.suspend_grad():
@@ -97,12 +109,22 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
                 dr.eval(image)
             return image
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(
+        self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0
+    ) -> mi.TensorXf:
         image = self._image(scene, sensor)
         dr.forward_to(image)
         return dr.grad(image)
 
-    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: mi.TensorXf,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+    ) -> None:
         # A line integral is linear in what was splatted, so its image need not be computed again.
         image = self._image(scene, sensor, primal=self.output == 'transmission')
         dr.backward_from(image * grad_in)
@@ -136,7 +158,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
             total = dr.exp(-total)
         return self.options.averaged(total, view)
 
-    def to_string(self):
+    def to_string(self) -> str:
         o = self.options
         pixel = 'area' if o.area else f'{o.pixel} x {o.pixel}'
         return f'LingoXray[extent = {o.extent:g}, footprint = {o.footprint}, pixel = {pixel}, output = {self.output}]'

@@ -1,5 +1,7 @@
 """The emitter `xray_tube`: the photons of a scan, by energy, the focal spot that they come from, and how they scatter."""
 
+from __future__ import annotations
+
 from dataclasses import fields
 from typing import Any
 
@@ -105,22 +107,26 @@ class XRayTube(mi.Emitter):
         self.tube, self.spot, self.scatter = tube, spot, scatter
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
-    def eval(self, si, active=True):
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Spectrum:
         return mi.Spectrum(0)
 
-    def sample_direction(self, it, sample, active=True):
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool | bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
 
-    def sample_ray(self, time, sample1, sample2, sample3, active=True):
+    def sample_ray(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f, active: mi.Bool | bool = True
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
         return dr.zeros(mi.Ray3f), mi.Spectrum(0)
 
-    def pdf_direction(self, it, ds, active=True):
+    def pdf_direction(self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True) -> mi.Float:
         return mi.Float(0)
 
-    def traverse(self, callback):
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         pass
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f'XRayTube[\n  {self.tube},\n  {self.spot},\n  {self.scatter or "no scatter"}\n]'
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from lingo_mi.errors import InputError
-from lingo_mi.paths import reading, replacing
+from lingo_mi.file_access import reading, replacing
 
 Column = tuple[str, Callable[[dict], str]]  # the title, and the cell of a row
 

@@ -11,7 +11,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from lingo_mi.paths import replacing
+from lingo_mi.file_access import replacing
 from lingo_mi.results.save import versions
 
 ROOT = Path(str(resources.files('lingo_mi'))).resolve().parent  # of the checkout, or site-packages

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from lingo_mi import progress
-from lingo_mi.progress import Progress, track
+from lingo_mi.progress import Progress
 
 
 class Terminal(io.StringIO):
@@ -123,11 +123,3 @@ def test_an_error_in_the_loop_passes_through(capsys):
         p.update(3)
         raise ZeroDivisionError
     assert capsys.readouterr().err.startswith('Fit: 3/100 (3%)')
-
-
-def test_track(capsys):
-    assert list(track(range(20), 'Views')) == list(range(20))
-    assert list(track((i for i in range(3)), 'Rows', 3)) == [0, 1, 2]
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith('Views: 20/20 (100%)') and lines[-1].startswith('Rows: 3/3')
-    assert list(track([], 'None')) == []

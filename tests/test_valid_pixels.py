@@ -14,7 +14,7 @@ from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import METHODS
-from lingo_mi.fitting.view import Target
+from lingo_mi.fitting.view_loss import Target
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import LingoSettings, initialise
 from lingo_mi.lingo.masks import masks, truncated

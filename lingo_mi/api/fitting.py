@@ -25,7 +25,6 @@ def fit(
     scan: Scan | Dataset,
     recipe: str | Settings = 'fast',
     *,
-    iterations: int | None = None,
     seed: int = 0,
     checkpoint: str | PathLike | None = None,
     resume: bool = False,
@@ -38,12 +37,11 @@ def fit(
                  measured on the way
     recipe       'fast' (this project's own), 'lingo' or 'r2' (the published ones), '3dgs' or 'xgaussian' (baselines that
                  composite opacities: they make views, but no volume), with changes as in 'lingo:V_S=1'; or `Settings`
-    iterations   Adam steps (default: the recipe's)
     seed         of every random choice
     checkpoint   a file (.npz) written every 30 s and at the end; what `resume` goes on from
     resume       go on from the checkpoint, as if it had never stopped; the scan and all settings must be the same
     progress     whether to show a progress bar on standard error
-    settings     any setting of the fit by name, such as n_points=20_000 or lambda_tv=0.1 (see `Settings`)
+    settings     any setting of the fit by name, such as iterations=800, n_points=20_000 or lambda_tv=0.1 (see `Settings`)
 
     Returns a `Result`. Ctrl-C stops between two steps and leaves a checkpoint, where one is named. Raises InputError for an
     unknown recipe or setting, a scan without signal, a checkpoint of another fit, and a fit that diverges.
@@ -60,8 +58,6 @@ def fit(
         name, chosen = 'settings', recipe.changed(**settings)
     else:
         name, chosen = recipe, settings_of(recipe, **settings)
-    if iterations is not None:
-        chosen = chosen.changed(iterations=iterations)
     path = None if checkpoint is None else Path(checkpoint)
     if resume and path is None:
         raise InputError('resume=True needs the checkpoint to go on from: give checkpoint=FILE')

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import replacing
 from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry import Geometry
-from lingo_mi.paths import replacing
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import Measured, measure

@@ -7,7 +7,7 @@ from os import PathLike
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.paths import one_line, reading, replacing
+from lingo_mi.file_access import one_line, reading, replacing
 
 
 def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:

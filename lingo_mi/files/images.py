@@ -8,8 +8,8 @@ import numpy as np
 import OpenEXR
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import one_line, reading, replacing
 from lingo_mi.files.arrays import numeric
-from lingo_mi.paths import one_line, reading, replacing
 
 
 def write_exr(path: PathLike | str, image: np.ndarray) -> None:

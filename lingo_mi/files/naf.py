@@ -26,9 +26,9 @@ from typing import Any, Literal
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import one_line, reading, replacing
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.scanner import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
-from lingo_mi.paths import one_line, reading, replacing
+from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.scan import Dataset
 
 

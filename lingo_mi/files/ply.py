@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
-from lingo_mi.paths import reading, replacing
+from lingo_mi.file_access import reading, replacing
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'

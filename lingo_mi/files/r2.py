@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import new_folder, one_line, reading
 from lingo_mi.files import arrays
-from lingo_mi.files.scanner import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
-from lingo_mi.paths import new_folder, one_line, reading
+from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.scan import Dataset
 
 META = 'meta_data.json'

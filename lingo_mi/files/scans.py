@@ -47,10 +47,11 @@ import numpy as np
 import yaml
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import new_folder, one_line, reading, replacing
 from lingo_mi.files import arrays, naf, r2
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
-from lingo_mi.files.scanner import (
+from lingo_mi.files.scanner_dict import (
     MOTION,
     check_one_scanner,
     from_geometry,
@@ -63,7 +64,6 @@ from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.paths import new_folder, one_line, reading, replacing
 from lingo_mi.scan import Dataset, Scan
 
 _KEYS = {

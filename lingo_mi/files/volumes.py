@@ -30,10 +30,10 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import one_line, optional, reading, replacing
 from lingo_mi.files import arrays
 from lingo_mi.files.arrays import numeric
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.paths import one_line, optional, reading, replacing
 
 _OURS = 'lingo_mi: '
 _TO_MM = {'meter': 1000.0, 'mm': 1.0, 'micron': 1e-3, 'unknown': 1.0}

@@ -7,7 +7,7 @@ import copy
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.fitting.device import DeviceState, download, upload
+from lingo_mi.fitting.device_state import DeviceState, download, upload
 
 PREFIX = 'average.'  # of its names in a checkpoint
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.expected_signal import ExpectedSignal
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.scattered_light import light_at_pixels

@@ -13,7 +13,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import average, checkpoint
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.poses import Poses
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State, activate

@@ -9,7 +9,7 @@ import numpy as np
 
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, linearised
 from lingo_mi.fitting.r2_start import r2_initialise
 from lingo_mi.fitting.settings import Settings

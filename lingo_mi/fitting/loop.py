@@ -15,7 +15,7 @@ from lingo_mi.fitting.average import Average
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.densify import densify, reset_opacity
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.resume import require_same_fit
 from lingo_mi.fitting.settings import Settings
@@ -121,7 +121,7 @@ def run(
             history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
             clock = time.perf_counter()  # excludes the time of `measure`
         if progress is not None:
-            last = {k: v for k, v in history[-1].items() if k.startswith('psnr')} if history else {}
+            last = {k: history[-1].get(k) for k in ('psnr_2d', 'psnr_3d_absolute')} if history else {}
             try:
                 progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
             except KeyboardInterrupt:

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, modelled_effects, trusted, weights_of
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.poses import Poses, gathered, place
@@ -18,7 +18,7 @@ from lingo_mi.fitting.scattered_light import RENEWED as LIGHT_RENEWED
 from lingo_mi.fitting.scattered_light import light_at_pixels
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.total_variation import random_cube_variation
-from lingo_mi.fitting.view import Target, differentiate, differentiate_replayed
+from lingo_mi.fitting.view_loss import Target, differentiate, differentiate_replayed
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.upload import uploaded

@@ -11,7 +11,7 @@ import numpy as np
 
 from lingo_mi.fitting import losses
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.fitting.view import evaluate
+from lingo_mi.fitting.view_loss import evaluate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize

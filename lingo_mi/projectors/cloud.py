@@ -14,8 +14,8 @@ from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project
-from lingo_mi.projectors.frozen import Replay
 from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.segment import add_straddling
 from lingo_mi.projectors.splat import Plan, by_values, prepare, splat
 from lingo_mi.projectors.view import View

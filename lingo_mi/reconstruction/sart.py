@@ -28,6 +28,7 @@ OrderStrategy has that of TIGRE for MATLAB.
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import ClassVar
@@ -108,8 +109,44 @@ def sweep(
     return evaluated(dr.maximum(start + change, 0) if noneg else start + change)
 
 
+class Sweeps(Algorithm):
+    """SART, OS-SART and SIRT: sweeps over all views in blocks; they differ in the size and the order of the blocks."""
+
+    @abstractmethod
+    def _by_blocks(self, views: int) -> OSSART:
+        """The same sweeps of a scan with so many views as `OSSART`."""
+
+    def run(
+        self,
+        scan: Scan,
+        *,
+        start: ArrayLike | None = None,
+        progress: Progress | None = None,
+        weights: ArrayLike | None = None,
+        blur: Sequence[float] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct the volume of a scan, see `Algorithm.run`.
+
+        weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
+        blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
+        """
+        began, how = time.perf_counter(), self._by_blocks(len(scan))
+        order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
+        system = System(scan, weights, blur)
+        x = system.start(start)
+        residuals = [system.residual(x)[1]]
+        for k in range(how.niter):
+            if residuals[-1] <= how.tol:
+                break
+            x = sweep(system, x, how.lmbda * how.lmbda_red**k, next(order), how.noneg)
+            residuals.append(system.residual(x)[1])
+            if progress:
+                progress(k + 1, how.niter, residuals[-1])
+        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+
+
 @dataclass(frozen=True)
-class OSSART(Algorithm):
+class OSSART(Sweeps):
     """Ordered-subset SART: the volume is updated after every block of views.
 
     For the rows A_b of a block, with element-wise divisions,
@@ -156,37 +193,12 @@ class OSSART(Algorithm):
         check_order(self.OrderStrategy)
         check_bound('tol', self.tol)
 
-    def run(
-        self,
-        scan: Scan,
-        *,
-        start: ArrayLike | None = None,
-        progress: Progress | None = None,
-        weights: ArrayLike | None = None,
-        blur: Sequence[float] | None = None,
-    ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`.
-
-        weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
-        blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
-        """
-        began = time.perf_counter()
-        order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
-        system = System(scan, weights, blur)
-        x = system.start(start)
-        residuals = [system.residual(x)[1]]
-        for k in range(self.niter):
-            if residuals[-1] <= self.tol:
-                break
-            x = sweep(system, x, self.lmbda * self.lmbda_red**k, next(order), self.noneg)
-            residuals.append(system.residual(x)[1])
-            if progress:
-                progress(k + 1, self.niter, residuals[-1])
-        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+    def _by_blocks(self, views: int) -> OSSART:
+        return self
 
 
 @dataclass(frozen=True)
-class SART(Algorithm):
+class SART(Sweeps):
     """Simultaneous algebraic reconstruction: the volume is updated after every view.
 
     The rule is that of `OSSART`, with the rows A_b of one view,
@@ -225,26 +237,14 @@ class SART(Algorithm):
     seed: int = 0
 
     def __post_init__(self):
-        self._by_views()  # checks the options
+        self._by_blocks(1)  # checks the options
 
-    def run(
-        self,
-        scan: Scan,
-        *,
-        start: ArrayLike | None = None,
-        progress: Progress | None = None,
-        weights: ArrayLike | None = None,
-        blur: Sequence[float] | None = None,
-    ) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `OSSART.run` says."""
-        return self._by_views().run(scan, start=start, progress=progress, weights=weights, blur=blur)
-
-    def _by_views(self) -> OSSART:
+    def _by_blocks(self, views: int) -> OSSART:
         return OSSART(blocksize=1, **asdict(self))
 
 
 @dataclass(frozen=True)
-class SIRT(Algorithm):
+class SIRT(Sweeps):
     """Simultaneous iterative reconstruction: each update of the volume uses all views.
 
     The rule is that of `OSSART`, with all rows A,
@@ -279,20 +279,7 @@ class SIRT(Algorithm):
     tol: float = 0.0
 
     def __post_init__(self):
-        self._by_blocks_of(1)  # checks the options
+        self._by_blocks(1)  # checks the options
 
-    def run(
-        self,
-        scan: Scan,
-        *,
-        start: ArrayLike | None = None,
-        progress: Progress | None = None,
-        weights: ArrayLike | None = None,
-        blur: Sequence[float] | None = None,
-    ) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `OSSART.run` says."""
-        whole = self._by_blocks_of(len(scan))
-        return whole.run(scan, start=start, progress=progress, weights=weights, blur=blur)
-
-    def _by_blocks_of(self, views: int) -> OSSART:
+    def _by_blocks(self, views: int) -> OSSART:
         return OSSART(blocksize=views, OrderStrategy='ordered', **asdict(self))

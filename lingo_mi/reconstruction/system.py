@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.exact import ExactPair
+from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction.parameters import check_bound
 from lingo_mi.reconstruction.preconditions import is_circular
@@ -39,7 +39,7 @@ class System:
 
     def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
         self.geometry = scan.geometry
-        self.A = Joseph(scan.geometry) if is_circular(scan) else ExactPair(scan.geometry, scan.valid)
+        self.A = Joseph(scan.geometry) if is_circular(scan) else GridPair(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.0
@@ -94,7 +94,7 @@ class System:
         exact projector.
         """
         if isinstance(self.A, Joseph):
-            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, ExactPair(self.geometry)))
+            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, GridPair(self.geometry)))
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x: mi.Float) -> np.ndarray:

@@ -44,8 +44,8 @@ SETTINGS = {
     'versions': 'Versions',
 }
 HEADLINE = {
-    'psnr_3d': 'PSNR 3D {}',
-    'ssim_3d': 'SSIM 3D {}',
+    'psnr_3d_absolute': 'PSNR 3D {}',
+    'ssim_3d_absolute': 'SSIM 3D {}',
     'psnr_2d': 'PSNR 2D {}',
     'ssim_2d': 'SSIM 2D {}',
     'gaussians': '{} Gaussians',

@@ -26,6 +26,7 @@ def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None and (volume := model.volume(state)) is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
+            out['psnr_3d_absolute'] = _number(metrics.psnr_3d_absolute(volume, dataset.volume))
         return out
 
     return measure

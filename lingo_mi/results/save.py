@@ -12,13 +12,13 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.file_access import replacing
 from lingo_mi.files.images import write_exr
 from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fitting.checkpoint import METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.models.alpha import harmonics
-from lingo_mi.paths import replacing
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import Measured
 from lingo_mi.results.scene_file import write_scene

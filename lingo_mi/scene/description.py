@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files.poses import read_poses
-from lingo_mi.files.scanner import to_posed
+from lingo_mi.files.scanner_dict import to_posed
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular, helix

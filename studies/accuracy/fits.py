@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi import phantoms
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.measured import density_unit

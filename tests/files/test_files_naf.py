@@ -7,6 +7,7 @@ import pickletools
 import numpy as np
 import pytest
 
+from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
 from lingo_mi.files import naf
 from lingo_mi.geometry.base import CircularGeometry
@@ -153,24 +154,6 @@ def test_held_out_views_may_be_called_test(tmp_path):
     assert len(naf.read(dumped(tmp_path, data)).test) == 2
 
 
-def sample():
-    rng = np.random.default_rng(1)
-    g = CircularGeometry(
-        DSO=900,
-        DSD=1400,
-        nDetector=(4, 6),
-        dDetector=(1.5, 2.5),
-        nVoxel=(5, 6, 7),
-        dVoxel=(1, 2, 3),
-        angles=[0.1, 0.7, 3.0],
-        offOrigin=(1, -2, 3),
-        offDetector=(4, -5),
-    )
-    train = Scan(g, rng.random((3, 4, 6)))
-    test = Scan(g.subset([2, 0]), rng.random((2, 4, 6)))
-    return Dataset(train, test, rng.random((5, 6, 7)).astype(np.float32))
-
-
 def assert_same(a, b):
     for x, y in ((a.train, b.train), (a.test, b.test)):
         assert vars(x.geometry) | {'angles': 0} == vars(y.geometry) | {'angles': 0}
@@ -180,18 +163,18 @@ def assert_same(a, b):
 
 
 def test_round_trip(tmp_path):
-    naf.write(tmp_path / 'a.pickle', sample())
-    assert_same(naf.read(tmp_path / 'a.pickle'), sample())
+    naf.write(tmp_path / 'a.pickle', small_dataset())
+    assert_same(naf.read(tmp_path / 'a.pickle'), small_dataset())
     assert os.listdir(tmp_path) == ['a.pickle']
 
 
 def test_the_written_file_is_an_ordinary_pickle_for_numpy_1_and_2(tmp_path):
     path = tmp_path / 'a.pickle'
-    naf.write(path, sample())
+    naf.write(path, small_dataset())
     raw = path.read_bytes()
     assert b'_core' not in raw and b'numpy.core' not in raw
     data = pickle.loads(raw)
-    np.testing.assert_allclose(data['train']['projections'] * 1000, sample().train.projections, rtol=3e-7)
+    np.testing.assert_allclose(data['train']['projections'] * 1000, small_dataset().train.projections, rtol=3e-7)
     assert data['train']['projections'].flags.writeable
     assert data['nDetector'] == [4, 6] and data['offDetector'] == [-5, 4]
 
@@ -363,7 +346,7 @@ def test_contradictions(tmp_path, name):
 
 
 def test_write_refuses(tmp_path):
-    dataset = sample()
+    dataset = small_dataset()
     with pytest.raises(InputError, match='cannot be written'):
         naf.write(tmp_path / 'no folder' / 'a.pickle', dataset)
     other = Scan(

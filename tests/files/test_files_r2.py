@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
 from lingo_mi.files import r2
-from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -81,31 +81,11 @@ def test_optional_parts(tmp_path):
     assert dataset.test is None and dataset.volume is None and dataset.train.geometry.mode == 'cone'
 
 
-def sample():
-    rng = np.random.default_rng(1)
-    g = CircularGeometry(
-        DSO=900,
-        DSD=1400,
-        nDetector=(4, 6),
-        dDetector=(1.5, 2.5),
-        nVoxel=(5, 6, 7),
-        dVoxel=(1, 2, 3),
-        angles=[0.1, 0.7, 3.0],
-        offOrigin=(1, -2, 3),
-        offDetector=(4, -5),
-    )
-    return Dataset(
-        Scan(g, rng.random((3, 4, 6))),
-        Scan(g.subset([2, 0]), rng.random((2, 4, 6))),
-        rng.random((5, 6, 7)).astype(np.float32),
-    )
-
-
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_round_trip(tmp_path, mode):
     from dataclasses import replace
 
-    a = sample()
+    a = small_dataset()
     a = Dataset(*(Scan(replace(s.geometry, mode=mode), s.projections) for s in (a.train, a.test)), a.volume)
     r2.write(tmp_path / 'scan', a)
     b = r2.read(tmp_path / 'scan')
@@ -118,7 +98,7 @@ def test_round_trip(tmp_path, mode):
 
 
 def test_writes_what_its_reader_looks_up(tmp_path):
-    r2.write(tmp_path / 'scan', sample())
+    r2.write(tmp_path / 'scan', small_dataset())
     meta = json.loads((tmp_path / 'scan' / 'meta_data.json').read_text())
     assert {
         'DSD',
@@ -198,11 +178,11 @@ def test_missing_and_damaged_files(tmp_path):
 
 
 def test_write_refuses_a_folder_in_use(tmp_path):
-    r2.write(tmp_path / 'scan', sample())
+    r2.write(tmp_path / 'scan', small_dataset())
     with pytest.raises(InputError, match='exists already'):
-        r2.write(tmp_path / 'scan', sample())
+        r2.write(tmp_path / 'scan', small_dataset())
     (tmp_path / 'file').touch()
     for path in (tmp_path / 'file', tmp_path / 'file' / 'scan', tmp_path / 'none' / 'scan'):
         with pytest.raises(InputError, match='exists already|cannot be written'):
-            r2.write(path, sample())
+            r2.write(path, small_dataset())
     assert sorted(p.name for p in tmp_path.iterdir()) == ['file', 'scan']

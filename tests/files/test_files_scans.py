@@ -8,31 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
+from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
-from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan
-
-
-def sample(mode='cone'):
-    rng = np.random.default_rng(1)
-    g = CircularGeometry(
-        DSO=900,
-        DSD=1400,
-        nDetector=(4, 6),
-        dDetector=(1.5, 2.5),
-        nVoxel=(5, 6, 7),
-        dVoxel=(1, 2, 3),
-        angles=[0.1, 0.7, 3.0],
-        mode=mode,
-        offOrigin=(1, -2, 3),
-        offDetector=(4, -5),
-    )
-    return Dataset(
-        Scan(g, rng.random((3, 4, 6)) + 1),
-        Scan(g.subset([2, 0]), rng.random((2, 4, 6))),
-        rng.random((5, 6, 7)).astype(np.float32) * 3,
-    )
 
 
 def assert_same_scan(a, b):
@@ -51,7 +30,7 @@ def refused(path, match, **options):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 @pytest.mark.parametrize('kind, name', [('naf', 'a.pickle'), ('r2', 'a'), ('exr', 'a'), ('npy', 'a.npy')])
 def test_round_trip(tmp_path, kind, name, mode):
-    dataset = sample(mode)
+    dataset = small_dataset(mode)
     if kind == 'npy':
         dataset = Dataset(dataset.train)
     write_scan(tmp_path / name, dataset, kind)
@@ -67,7 +46,7 @@ def test_round_trip(tmp_path, kind, name, mode):
 
 @pytest.mark.parametrize('kind, name', [('naf', 'a.pickle'), ('r2', 'a'), ('exr', 'a'), ('npy', 'a.npy')])
 def test_a_scan_alone(tmp_path, kind, name):
-    scan = sample().train
+    scan = small_dataset().train
     write_scan(tmp_path / name, scan.subset([1]), kind)
     back = read_scan(tmp_path / name)
     assert_same_scan(back.train, scan.subset([1]))
@@ -76,12 +55,12 @@ def test_a_scan_alone(tmp_path, kind, name):
 
 def test_write_refuses(tmp_path):
     with pytest.raises(InputError, match='no kind of scan file'):
-        write_scan(tmp_path / 'a', sample(), 'tiff')
+        write_scan(tmp_path / 'a', small_dataset(), 'tiff')
     with pytest.raises(InputError, match='ends in .npy'):
-        write_scan(tmp_path / 'a', Dataset(sample().train), 'npy')
+        write_scan(tmp_path / 'a', Dataset(small_dataset().train), 'npy')
     with pytest.raises(InputError, match='training views alone'):
-        write_scan(tmp_path / 'a.npy', sample(), 'npy')
-    s = sample()
+        write_scan(tmp_path / 'a.npy', small_dataset(), 'npy')
+    s = small_dataset()
     other = Scan(replace(s.test.geometry, DSO=901), s.test.projections)
     for kind in ('naf', 'r2', 'exr'):
         with pytest.raises(InputError, match='one scanner'):
@@ -207,10 +186,10 @@ def test_bad_npy_scans(tmp_path):
 
 
 def test_exr_folder_in_detail(tmp_path):
-    write_scan(tmp_path / 'a', sample(), 'exr')
+    write_scan(tmp_path / 'a', small_dataset(), 'exr')
     from lingo_mi.files.images import read_exr
 
-    np.testing.assert_array_equal(read_exr(tmp_path / 'a' / 'train' / '0002.exr'), sample().train.projections[2])
+    np.testing.assert_array_equal(read_exr(tmp_path / 'a' / 'train' / '0002.exr'), small_dataset().train.projections[2])
     assert sorted(p.name for p in (tmp_path / 'a').iterdir()) == ['geometry.yml', 'test', 'train', 'volume.nii.gz']
     values = yaml.safe_load((tmp_path / 'a' / 'geometry.yml').read_text())
     np.testing.assert_allclose(values['test_angles'], np.degrees([3.0, 0.1]))
@@ -219,7 +198,7 @@ def test_exr_folder_in_detail(tmp_path):
 def test_bad_exr_folders(tmp_path):
     from lingo_mi.files.images import write_exr
 
-    write_scan(tmp_path / 'a', sample(), 'exr')
+    write_scan(tmp_path / 'a', small_dataset(), 'exr')
     folder = tmp_path / 'a'
     last = folder / 'train' / '0002.exr'
     raw = last.read_bytes()

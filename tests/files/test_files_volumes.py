@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lingo_mi import paths
+from lingo_mi import file_access
 from lingo_mi.errors import InputError
 from lingo_mi.files import volumes
 from lingo_mi.files.volumes import centred_affine, first_voxel, git_blob_sha1, read_volume, write_volume
@@ -223,7 +223,7 @@ def test_permissions(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, 'open', denied)
     refused(path, 'Permission denied')
-    with pytest.raises(InputError, match='Permission denied'), paths.replacing(tmp_path / 'w') as temporary:
+    with pytest.raises(InputError, match='Permission denied'), file_access.replacing(tmp_path / 'w') as temporary:
         open(temporary, 'wb')  # noqa: SIM115
 
 

@@ -12,7 +12,7 @@ from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_po
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run

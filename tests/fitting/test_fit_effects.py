@@ -26,7 +26,7 @@ from lingo_mi.fitting.loss_scale import loss_scale
 from lingo_mi.fitting.measured import weights_of
 from lingo_mi.fitting.poses import gathered, place
 from lingo_mi.fitting.step import Stepper
-from lingo_mi.fitting.view import evaluate
+from lingo_mi.fitting.view_loss import evaluate
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.splat import splat

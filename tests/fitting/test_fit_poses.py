@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from helpers.fits import SHORT, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import step
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.poses import Poses, gathered, place
 from lingo_mi.fitting.state import start

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.models.integral import PARAMETERS
 from lingo_mi.fitting.recipes import R2
 from lingo_mi.fitting.state import State, activate, start

@@ -6,7 +6,7 @@ import numpy as np
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.hardening import Tube, TubeParameters
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.state import start
 from lingo_mi.fitting.step import Stepper
 from lingo_mi.scan import Scan

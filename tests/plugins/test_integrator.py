@@ -13,7 +13,7 @@ from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, ren
 from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.recipes import R2
 from lingo_mi.fitting.state import start
 from lingo_mi.geometry.base import CircularGeometry

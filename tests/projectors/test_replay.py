@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.projectors import frozen as replay
+from lingo_mi.projectors import replay
 from lingo_mi.projectors.cloud import columns, line_integrals, line_integrals_of_rows
-from lingo_mi.projectors.frozen import Replay
 from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 

@@ -14,7 +14,7 @@ from helpers.script import run as run_script
 from lingo_mi.errors import AccuracyWarning
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
-from lingo_mi.fitting.device import DeviceState
+from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.loss_scale import loss_scale, otsu
 from lingo_mi.fitting.losses import combined, ssim
 from lingo_mi.fitting.recipes import R2

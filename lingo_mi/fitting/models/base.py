@@ -21,7 +21,7 @@ SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of the shape,
 class ForwardModel(ABC):
     """Gaussians with raw parameters, and their image.
 
-    replayable   whether a view's loss and derivatives can be replayed (`projectors.frozen`)
+    replayable   whether a view's loss and derivatives can be replayed (`projectors.replay`)
 
     Values on the host are NumPy arrays [N, size] by parameter, on the device Dr.Jit arrays of N.
     """

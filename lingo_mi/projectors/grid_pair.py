@@ -18,7 +18,7 @@ from lingo_mi.projectors.grid import gather, scatter, view_table, view_walk, who
 from lingo_mi.projectors.joseph import Stack
 
 
-class ExactPair(Stack):
+class GridPair(Stack):
     """The matrix A of a scan, with zero rows for invalid pixels. `adjoint` is its transpose to rounding.
 
     Each view is one launch of the same kernels.

@@ -17,7 +17,7 @@ from lingo_mi.fitting.loss_scale import loss_scale
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.projectors.backprop import leaves, pass_on
-from lingo_mi.projectors.frozen import Replay
+from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan

@@ -12,8 +12,8 @@ from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from helpers.grids import scan
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular, helix
-from lingo_mi.projectors.exact import ExactPair
 from lingo_mi.projectors.grid import backproject, project
+from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction import ALGORITHMS, SART
 from lingo_mi.reconstruction.system import System
@@ -43,7 +43,7 @@ def test_a_matrix_and_its_transpose(mode, masked):
     geo = laminography(scan(mode, n=3))
     rng, n = np.random.default_rng(0), geo.nDetector
     valid = rng.random((3, *n)) < 0.7 if masked else np.ones((3, *n), bool)
-    A, chosen = ExactPair(geo, valid if masked else None), [2, 0]
+    A, chosen = GridPair(geo, valid if masked else None), [2, 0]
     x, y = rng.random(geo.nVoxel), rng.normal(size=(2, *n)) * valid[chosen]
 
     def images(projections):
@@ -72,8 +72,8 @@ def test_which_projector_a_scan_gets():
     geo = scan(n=3)
     ones = np.ones((3, *geo.nDetector), np.float32)
     assert isinstance(System(Scan(geo, ones)).A, Joseph)
-    assert isinstance(System(Scan(geo, ones, np.arange(ones.size).reshape(ones.shape) > 0)).A, ExactPair)
-    assert isinstance(System(Scan(laminography(geo), ones)).A, ExactPair)
+    assert isinstance(System(Scan(geo, ones, np.arange(ones.size).reshape(ones.shape) > 0)).A, GridPair)
+    assert isinstance(System(Scan(laminography(geo), ones)).A, GridPair)
 
 
 @pytest.mark.parametrize(
