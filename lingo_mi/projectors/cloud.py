@@ -14,6 +14,7 @@ from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.segment import add_straddling
@@ -189,6 +190,7 @@ def _gather(*arrays, panel, options, image, parts):
     return *plan.gradient(upstream * lengths), plan.image(parts) * upstream if image else None
 
 
+@full_float64()
 def _by_inputs(*arrays, wanted, **settings):
     """Derivatives by the inputs. `arrays`: the inputs, then the result of `_gather`."""
     inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]

@@ -1,8 +1,9 @@
 """How many items overlap, and how many partial sums they need.
 
-Adding n equal numbers one by one in float32 leaves a relative error of about n 2e-9. If more than DEEP items lie at one place,
-they are therefore added into several partial sums, and these are added in float64. Items at different places that overlap add
-different numbers, and their rounding errors cancel: RANDOM times as many cause no larger error.
+Adding n equal numbers one by one in float32 leaves a relative error of about n 8e-9; of n 2e-9 on the CPU, where the teams'
+images share them. If more than `deep` items lie at one place, they are therefore added into several partial sums, and these are
+added in float64. Items at different places that overlap add different numbers, and their rounding errors cancel: RANDOM times as
+many cause no larger error.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-DEEP = 1_000  # 2e-6
 RANDOM = 32
 CELLS = {2: (256, 64, 8), 3: (32, 16, 4)}  # by number of axes: cells per axis at the first three levels
 SAMPLE = 16384  # items counted at most
@@ -25,9 +25,14 @@ def hashed(i: Any) -> Any:
     return i * 2654435761 // 65536
 
 
+def deep() -> int:
+    """The items at one place that one sum may hold, for an error of 2e-6."""
+    return 1_000 if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 250
+
+
 def parts_of(depth: Any) -> int:
     """Number of partial sums for a depth that `deepest` returned. Waits for the device."""
-    return max(-(-int(depth[0]) // DEEP), 1)
+    return max(-(-int(depth[0]) // deep()), 1)
 
 
 def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
@@ -41,7 +46,7 @@ def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
     coarser grids; and the whole grid. Large clouds are sampled.
     """
     count = dr.width(covered)
-    if count <= DEEP:
+    if count <= deep():
         return mi.Float(0)
     single, *sides = CELLS[len(shape)]
     levels = [(single, None), *((side, [max(n / side, 1.0) for n in shape]) for side in sides)]

@@ -35,6 +35,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
 from lingo_mi.projectors.view import View
 
@@ -74,6 +75,7 @@ class Footprints:
         return self.row_end > self.row_begin
 
 
+@full_float64()
 def project(
     centre: Any, scale: Any, rotation: Any, density: Any, view: View, extent: float, widen: float = 0.0
 ) -> Footprints:

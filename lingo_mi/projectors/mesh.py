@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.balance import PACKET, SHARING, Share, Sharing, Target, Work, pack, packets_of, repeat
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View, vector64
 
 SETUP = 6  # cost of a team's visit to eight rows, in packets
@@ -87,6 +88,7 @@ class MeshPaths:
                     raise InputError(f'the mesh {self.name!r} reaches through the panel: move the mesh or the panel')
             return self._draw(vertices, view) * mi.Float(scale) * view.lengths()
 
+    @full_float64()
     def _project(self, view):
         """Vertices as Float64 [V * 4], packed (x, y, q, 0); their t, Float64 [V]; the factor from sums to t."""
         Float64 = dr.value_t(mi.Vector3d)

@@ -17,6 +17,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
 from lingo_mi.projectors.view import View
 
@@ -34,6 +35,7 @@ def add_straddling(image: Any, gaussians: tuple, view: View, indices: Any) -> An
     return image
 
 
+@full_float64()
 def _integrate(centre: Any, scale: Any, rotation: Any, density: Any, view: View) -> Any:
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)

@@ -8,9 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.errors import InputError
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View
 
 
+@full_float64()
 def view_of(sensor: Any) -> View:
     """The rays through the pixel centres of the film of a flat `mi.Sensor`.
 

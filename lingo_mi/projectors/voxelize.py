@@ -40,6 +40,7 @@ from lingo_mi.projectors.balance import (
 )
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rows_of
 from lingo_mi.projectors.splat import SETUP
 
@@ -76,6 +77,15 @@ def voxelize(
     extent                             cut-off in standard deviations
     deep                               whether to use partial sums where many Gaussians overlap (see `depth`)
     """
+    values, rest, length, covered, sound = _numbers((centre, scale, rotation, density), grid, extent)
+    out = dr.custom(_Voxelize, values, rest, length, covered, grid, (extent, deep))
+    return out + dr.sum(dr.select(sound, 0, mi.Float(dr.nan)))
+
+
+@full_float64()
+def _numbers(gaussians, grid, extent):
+    """The differentiable numbers of all Gaussians; their places, voxels of a line and voxels, for `_Voxelize`; which are sound."""
+    centre, scale, rotation, density = gaussians
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
@@ -107,8 +117,7 @@ def voxelize(
         s3,
         *(at[i] - (Float64(middle[i]) + 0.5) for i in range(3)),
     )
-    out = dr.custom(_Voxelize, values, rest, mi.UInt32(size[0]), covered, grid, (extent, deep))
-    return out + dr.sum(dr.select(sound, 0, mi.Float(dr.nan)))
+    return values, rest, mi.UInt32(size[0]), covered, sound
 
 
 class _Voxelize(dr.CustomOp):
