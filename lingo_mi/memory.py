@@ -1,15 +1,20 @@
-"""How much memory this process may take."""
+"""How much memory this process may take for the arrays that it computes on."""
 
 from __future__ import annotations
 
 import math
 import os
+import sys
 from pathlib import Path
+
+from lingo_mi.gpu import gpu
 
 
 def room() -> float:
-    """Bytes: the smallest of the machine's memory, the limits of the control groups that this process is in, and what its limit
-    of address space leaves; infinity where none of them is known."""
+    """Bytes: the GPU's memory where a variant for CUDA is active. Else the smallest of the machine's memory, the limits of the
+    control groups that this process is in, and what its limit of address space leaves; infinity where none of them is known."""
+    if sys.modules.get('mitsuba') and (sys.modules['mitsuba'].variant() or '').startswith('cuda'):
+        return gpu().memory
     return min(_machine(), *_control_groups(), _address_space())
 
 

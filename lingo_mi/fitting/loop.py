@@ -121,7 +121,10 @@ def run(
             history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
             clock = time.perf_counter()  # excludes the time of `measure`
         if progress is not None:
-            last = {k: history[-1].get(k) for k in ('psnr_2d', 'psnr_3d_absolute')} if history else {}
+            # But for `psnr_3d`: its full scale is 1, whatever the unit of density.
+            last = {
+                k: v for k, v in (history[-1].items() if history else ()) if k.startswith('psnr') and k != 'psnr_3d'
+            }
             try:
                 progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
             except KeyboardInterrupt:

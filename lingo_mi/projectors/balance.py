@@ -1,12 +1,18 @@
 """Load balancing of uneven work: a fixed number of teams, each with the same share of the total cost.
 
 An *item* (a Gaussian, a triangle) consists of *blocks* of rows. All blocks of an item have the same cost, and a prefix sum
-gives the end of each item's cost. A *team* has as many lanes as a block has rows; it works on one item at a time, one lane per
-row. Each team takes the blocks that begin within its share of the total cost. So all teams share a huge item, an empty
-item costs nothing, and launch size and kernel never change.
+gives the end of each item's cost. A *team* of lanes works on one item at a time, block by block, and in every row step by step.
+Each team takes the blocks that begin within its share of the total cost. So all teams share a huge item, an empty item costs
+nothing, and launch size and kernel never change.
 
-On the CPU, each team adds to its own image without atomics (which would take most of the time), and the copies are summed at
-the end, unless they would be too large. On the GPU there are many teams, one image and atomic additions.
+A `Layout` says which lane works on what. On the CPU a team has eight lanes, one row each, and a step is a packet of four
+elements. Each team adds to its own image without atomics (which would take most of the time), and the copies are summed at the
+end, unless they would be too large.
+
+On a GPU a team is a warp, and all teams add to one image, with atomics. The lanes of a row stand side by side on the eight
+elements of a sector, 32 bytes, which is what memory moves. Sixteen rows of two lanes with four elements each take the least work.
+But before compute capability 9.0 atomics take one element a lane at a time, so that a sector would move four times: to add, there
+are four rows of eight lanes with one element each.
 """
 
 from __future__ import annotations
@@ -18,34 +24,133 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.gpu import gpu, resident_warps
 from lingo_mi.projectors.depth import hashed
 
 while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable
 
-PACKET = 4  # consecutive elements that a lane reads or writes at once
+PACKET = 4  # numbers of an item that a lane loads at once
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The lanes of a team: `rows` rows of `columns` lanes, each with a packet of `size` consecutive elements at a time."""
+
+    rows: int
+    columns: int
+    size: int
+
+    @property
+    def lanes(self) -> int:
+        return self.rows * self.columns
+
+    @property
+    def step(self) -> int:
+        """Elements of a row that a team works on at once."""
+        return self.columns * self.size
+
+    def packets(self, width: int) -> int:
+        """Packets of a row of `width` elements, in whole steps."""
+        return -(-width // self.step) * self.columns
+
+    def pad(self, image: Any, rows: int, width: int) -> Any:
+        """Float [rows * width] with zeros at the end of each row, up to whole steps."""
+        padded = self.packets(width) * self.size
+        if padded == width:
+            return image
+        i = dr.arange(mi.UInt32, rows * padded)
+        pitch, columns = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
+        row, column = i // pitch, i % pitch
+        return dr.gather(mi.Float, image, row * columns + column, column < columns)
+
+    def crop(self, padded: Any, rows: int, width: int) -> Any:
+        """The inverse of `pad`."""
+        pitch = self.packets(width) * self.size
+        if pitch == width:
+            return padded
+        i, columns = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width)
+        return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, pitch) + i % columns)
+
+    def span(self, low: Any, high: Any, offset: Any, column: Any, empty: Any, packets: Any) -> tuple[Any, Any]:
+        """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset.
+
+        `begin` is where a step begins.
+        """
+        far = 1e8  # keeps distant positions within Int32
+        first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
+        last = mi.Int32(dr.clip(dr.floor(high + offset), -far, far)) + column
+        begin = self._step_of(dr.maximum(first, 0))
+        empty |= (last < first) | (last < 0)
+        return begin, dr.select(empty, begin, dr.minimum(last // self.size + 1, packets))
+
+    def around(self, first: Any, last: Any) -> tuple[Any, Any]:
+        """The packets [begin, end) of the elements [first, last) of a row; `begin` is where a step begins."""
+        return self._step_of(first), (last + (self.size - 1)) // self.size
+
+    def _step_of(self, element):
+        """The first packet of the step that an element is in."""
+        packet = element // self.size
+        return packet if self.columns == 1 else packet & -self.columns
+
+    @property
+    def Float(self) -> Any:
+        """The type of a packet."""
+        return mi.Float if self.size == 1 else mi.Vector4f
+
+
+PAIRS, EIGHTS = Layout(16, 2, 4), Layout(4, 8, 1)  # on a GPU
 
 
 @dataclass(frozen=True)
 class Sharing:
     """The number of shares, and the width of the teams that do one share each. Images do not depend on it, but for rounding.
 
-    lanes               lanes of a team, which is the number of rows of a block
-    shares_per_thread   shares per CPU thread; more shares balance better, but each has its own image
-    shares_on_gpu       shares on a GPU
+    lanes    lanes of a team on the CPU; on a GPU it is a warp
+    shares   shares over their usual number, which is two a CPU thread, or as many as a GPU can hold warps. More shares balance
+             better, but on the CPU each has its own image
     """
 
     lanes: int = 8
-    shares_per_thread: float = 2
-    shares_on_gpu: int = 4096
+    shares: float = 1
 
     def scaled(self, factor: float) -> Sharing:
         """`factor` times as many shares."""
-        return replace(
-            self,
-            shares_per_thread=factor * self.shares_per_thread,
-            shares_on_gpu=max(round(factor * self.shares_on_gpu), 1),
-        )
+        return replace(self, shares=factor * self.shares)
+
+    @property
+    def adding(self) -> Layout:
+        """The layout of kernels that add to an image."""
+        if _on_cpu():
+            return Layout(self.lanes, 1, PACKET)
+        return PAIRS if gpu().capability >= 90 else EIGHTS
+
+    @property
+    def reading(self) -> Layout:
+        """The layout of kernels that read from an image. Its steps are as wide as those of `adding`."""
+        return self.adding if _on_cpu() else PAIRS
+
+    @property
+    def teams(self) -> int:
+        return max(round(self.shares * (2 * dr.thread_count() if _on_cpu() else resident_warps())), 1)
+
+    @property
+    def step(self) -> int:
+        """Elements of a step."""
+        return self.adding.step
+
+    @property
+    def block(self) -> int:
+        """Rows of a block: at least those of a team."""
+        return self.reading.rows
+
+    def blocks(self, rows: Any) -> Any:
+        """Blocks of an item with so many rows, UInt32."""
+        return mi.UInt32(rows + (self.block - 1)) // self.block
+
+
+def _on_cpu() -> bool:
+    return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
 SHARING = Sharing()  # as measured: docs/accuracy.md
@@ -58,18 +163,65 @@ class Share:
     lane         UInt32, lane numbers; those of a team are consecutive
     begin, end   of the team's share, as (item, block), UInt32
     blocks       UInt32 [N], blocks of each item
-    lanes        lanes per team
+    layout       of the teams
+    block        rows of a block
     """
 
     lane: Any
     begin: tuple
     end: tuple
     blocks: Any
-    lanes: int
+    layout: Layout
+    block: int
 
-    def row(self, block: Any) -> Any:
-        """The row of an item that a lane works on, in one of its blocks, Int32."""
-        return mi.Int32(block * self.lanes + self.lane % self.lanes)
+    def __post_init__(self):
+        rows, columns = self.layout.rows, self.layout.columns
+        self.row, self.column = self.lane // columns % rows, mi.Int32(self.lane % columns)
+
+    def each_row(self, first: Any, stop: Any, count: Any, visit: Callable[..., Any], *state: Any) -> tuple:
+        """`for row in the lane's rows of blocks [first, stop): state = visit(row, *state)`, of an item with `count` rows.
+
+        On the CPU, where all lanes go on together, there may be rows past the end. Returns the last state.
+        """
+        rows = self.layout.rows
+        if rows == self.block:
+            return repeat(first, stop, lambda block, *state: visit(mi.Int32(block * rows + self.row), *state), *state)
+        begin = mi.Int32(first * self.block + self.row)
+        return repeat(begin, dr.minimum(mi.Int32(stop * self.block), mi.Int32(count)), visit, *state, by=rows)
+
+    def each_packet(self, span: tuple, visit: Callable[..., Any], *state: Any) -> tuple:
+        """`for packet in range(*span): state = visit(packet, *state)`, for lane 0 of a row, in steps. Returns the last state."""
+        return repeat(*span, visit, *state, by=self.layout.columns)
+
+    def beside(self, column: Any, line: Any) -> tuple[Any, Any]:
+        """A column and the first packet of a line, as the lane sees them that counts packets like lane 0 of the row."""
+        if self.layout.columns == 1:
+            return column, line
+        return column - self.column * self.layout.size, line + self.column
+
+    def elements(self, packet: Any, column: Any) -> Any:
+        """Numbers of a packet's elements, counted from `column`: Int32 or Vector4i."""
+        first = packet * self.layout.size - column
+        return first if self.layout.size == 1 else first + mi.Vector4i(0, 1, 2, 3)
+
+    def position(self, packet: Any, column: Any, offset: Any) -> Any:
+        """t of a packet's elements, with full precision near t = 0, which is at the element column + offset."""
+        whole = mi.Float(packet * self.layout.size - column)
+        if self.layout.size == 1:
+            return whole - offset
+        return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)
+
+    def read(self, image: Any, packet: Any) -> Any:
+        """A packet of an image, counted from its start: Float or Vector4f."""
+        return dr.gather(self.layout.Float, image, packet)
+
+    def total(self, elements: Any) -> Any:
+        """The sum of a lane's elements, Float."""
+        return elements if self.layout.size == 1 else dr.sum(elements)
+
+    def dot(self, a: Any, b: Any) -> Any:
+        """The sum of the products of a lane's elements, Float."""
+        return a * b if self.layout.size == 1 else dr.dot(a, b)
 
     def each_item(self, visit: Callable[[Any, Any, Any], None]) -> Any:
         """Call visit(g, block, stop) for each item of the share, with its range of blocks. Returns the kernel's result.
@@ -98,10 +250,40 @@ class Target:
     base: Any
     private: bool
 
-    def add(self, value: Any, index: Any) -> None:
-        """Add a packet, Vector4f. index: counts packets from the start of `values`."""
-        mode = dr.ReduceMode.NoConflicts if self.private else dr.ReduceMode.Auto
-        dr.scatter_add(self.values, value, index, mode=mode)
+    def add(self, value: Any, packet: Any) -> None:
+        """Add a packet, Vector4f or Float, counted from the start of `values`."""
+        # On a GPU no two lanes of a warp meet: there is nothing to add up before the atomics.
+        shared = dr.ReduceMode.Auto if _on_cpu() else dr.ReduceMode.Direct
+        mode = dr.ReduceMode.NoConflicts if self.private else shared
+        dr.scatter_add(self.values, value, packet, mode=mode)
+
+
+class Sums:
+    """`count` sums for each of N items, to which the lanes of all teams add."""
+
+    def __init__(self, items: int, count: int):
+        self.count, self.packed = count, not _on_cpu()
+        # A GPU's lanes add up among themselves before the atomics, four sums at once.
+        shape = [items * PACKET] * -(-count // PACKET) if self.packed else [items] * count
+        self.arrays = [dr.zeros(mi.Float, n) for n in shape]
+        dr.make_opaque(self.arrays)
+
+    def add(self, values: Sequence, item: Any) -> None:
+        if not self.packed:
+            for array, value in zip(self.arrays, values):
+                dr.scatter_add(array, value, item, mode=dr.ReduceMode.Local)
+            return
+        values = [*values, *(mi.Float(0) for _ in range(-len(values) % PACKET))]
+        for j, array in enumerate(self.arrays):
+            dr.scatter_add(array, mi.Vector4f(*values[PACKET * j : PACKET * (j + 1)]), item, mode=dr.ReduceMode.Local)
+
+    def columns(self) -> list:
+        """The sums, Float [N] each."""
+        if not self.packed:
+            return self.arrays
+        i = dr.arange(mi.UInt32, dr.width(self.arrays[0]) // PACKET)
+        found = [x for array in self.arrays for x in dr.gather(mi.Vector4f, array, i)]
+        return found[: self.count]
 
 
 class Work:
@@ -114,10 +296,7 @@ class Work:
 
     def __init__(self, blocks: Any, block_cost: Any, ends: Any, sharing: Sharing):
         self.count = dr.width(blocks)
-        self.on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-        self.sharing = sharing
-        per_cpu = max(round(sharing.shares_per_thread * dr.thread_count()), 1)
-        self.teams = per_cpu if self.on_cpu else sharing.shares_on_gpu
+        self.sharing, self.teams = sharing, sharing.teams
         self.arrays = self.blocks, self.block_cost, self.ends = blocks, block_cost, ends
 
     @classmethod
@@ -126,9 +305,9 @@ class Work:
         dr.eval(blocks, block_cost, ends)
         return cls(blocks, block_cost, ends, sharing)
 
-    def shares(self) -> Share:
+    def shares(self, layout: Layout) -> Share:
         """The work of a kernel's lanes."""
-        lanes = self.sharing.lanes
+        lanes = layout.lanes
         total = dr.gather(mi.UInt64, self.ends, dr.opaque(mi.UInt32, self.count - 1))
         lane = dr.arange(mi.UInt32, self.teams * lanes)
         share = total // self.teams + 1
@@ -137,10 +316,10 @@ class Work:
             _cut(dr.minimum(x, total), self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
             for x in (begin, begin + share)
         )
-        return Share(lane, begin, end, self.blocks, lanes)
+        return Share(lane, begin, end, self.blocks, layout, self.sharing.block)
 
     def add_up(self, kernel: Callable[..., Any], rows: int, width: int, parts: int = 1, /, **arguments: Any) -> Any:
-        """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole packets.
+        """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole steps.
 
         Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts. Each part is
         summed by itself, and the partial sums are added in float64.
@@ -155,13 +334,14 @@ class Work:
                 total += Float64(some.add_up(kernel, rows, width, **arguments))
                 dr.eval(total)
             return mi.Float(total)
-        size = rows * packets_of(width)
-        private = self.on_cpu and self.teams * size <= MOST_COPIED
+        layout = self.sharing.adding
+        size = rows * layout.packets(width)
+        private = _on_cpu() and self.teams * size <= MOST_COPIED
         copies = self.teams if private else 1
-        values = dr.zeros(mi.Float, copies * size * PACKET)
+        values = dr.zeros(mi.Float, copies * size * layout.size)
         dr.make_opaque(values)
-        share, stride = self.shares(), dr.opaque(mi.UInt32, size)
-        base = mi.Int32(share.lane // share.lanes * stride if private else mi.UInt32(0))
+        share, stride = self.shares(layout), dr.opaque(mi.UInt32, size)
+        base = mi.Int32(share.lane // layout.lanes * stride if private else mi.UInt32(0))
         dr.eval(kernel(share, Target(values, base, private), **arguments), values)
         if copies > 1:
             i, total = dr.arange(mi.UInt32, size), dr.zeros(mi.Vector4f, size)
@@ -169,7 +349,7 @@ class Work:
                 total += dr.gather(mi.Vector4f, values, i + copy * stride)
             values = dr.empty(mi.Float, size * PACKET)
             dr.scatter(values, total, i, mode=dr.ReduceMode.Permute)
-        return crop(values, rows, width)
+        return layout.crop(values, rows, width)
 
 
 def _cut(position, ends, block_cost, count):
@@ -187,35 +367,13 @@ def _cut(position, ends, block_cost, count):
     return g, mi.UInt32((position - start + cost - 1) // cost)
 
 
-def repeat(first: Any, last: Any, body: Callable[..., Any], *state: Any) -> tuple:
-    """`for i in range(first, last): state = body(i, *state)` in a kernel. Returns the last state."""
-    return while_loop((first, *state), lambda i, *state: i < last, lambda i, *state: (i + 1, *(body(i, *state) or ())))[
-        1:
-    ]
+def repeat(first: Any, last: Any, body: Callable[..., Any], *state: Any, by: int = 1) -> tuple:
+    """`for i in range(first, last, by): state = body(i, *state)` in a kernel. Returns the last state."""
 
+    def turn(i, *state):
+        return i + by, *(body(i, *state) or ())
 
-def packets_of(width: int) -> int:
-    """Packets of a row of `width` elements."""
-    return -(-width // PACKET)
-
-
-def pad(image: Any, rows: int, width: int) -> Any:
-    """Float [rows * width] with zeros at the end of each row, up to whole packets."""
-    if width % PACKET == 0:
-        return image
-    padded = packets_of(width) * PACKET
-    i = dr.arange(mi.UInt32, rows * padded)
-    pitch, columns = dr.opaque(mi.UInt32, padded), dr.opaque(mi.UInt32, width)
-    row, column = i // pitch, i % pitch
-    return dr.gather(mi.Float, image, row * columns + column, column < columns)
-
-
-def crop(padded: Any, rows: int, width: int) -> Any:
-    """The inverse of `pad`."""
-    if width % PACKET == 0:
-        return padded
-    i, columns, pitch = dr.arange(mi.UInt32, rows * width), dr.opaque(mi.UInt32, width), packets_of(width) * PACKET
-    return dr.gather(mi.Float, padded, i // columns * dr.opaque(mi.UInt32, pitch) + i % columns)
+    return while_loop((first, *state), lambda i, *state: i < last, turn)[1:]
 
 
 def pack(Packet: Any, Element: Any, columns: Sequence) -> Any:
@@ -268,19 +426,3 @@ def unpack_halves(both: Any) -> tuple[Any, Any]:
 def _bits(x: Any) -> Any:
     """The bits of a Float, UInt32."""
     return dr.reinterpret_array(mi.UInt32, x)
-
-
-def span(low: Any, high: Any, offset: Any, column: Any, empty: Any, packets: Any) -> tuple[Any, Any]:
-    """The packets [begin, end) of a row that cover t in [low, high], where t = 0 is at the element column + offset."""
-    far = 1e8  # keeps distant positions within Int32
-    first = mi.Int32(dr.clip(dr.ceil(low + offset), -far, far)) + column
-    last = mi.Int32(dr.clip(dr.floor(high + offset), -far, far)) + column
-    begin = dr.maximum(first, 0) // PACKET
-    empty |= (last < first) | (last < 0)
-    return begin, dr.select(empty, begin, dr.minimum(last // PACKET + 1, packets))
-
-
-def position(packet: Any, column: Any, offset: Any) -> Any:
-    """t of the elements of a packet, with full precision near t = 0."""
-    whole = mi.Float(packet * PACKET - column)
-    return mi.Vector4f(whole - offset, (whole + 1) - offset, (whole + 2) - offset, (whole + 3) - offset)

@@ -1,8 +1,8 @@
 """Float64 on NVIDIA GPUs with all of its digits.
 
-Dr.Jit's `JitFlag.FastMath`, which is on by default, lets CUDA take a float64 reciprocal with 20 bits: not in a scalar `y / x`, but
-in `rcp`, `rsqrt`, `normalize`, a vector over a scalar, `tan`, and in the derivatives of divisions, roots and logarithms. It counts
-when an operation is traced, derivatives included, not when it is compiled.
+With Dr.Jit's `JitFlag.FastMath`, which is on by default, CUDA takes float64 reciprocals with 20 bits: not in a scalar `y / x`,
+but in `rcp`, `rsqrt`, `normalize`, a vector over a scalar, `tan`, and in the derivatives of divisions, roots and logarithms. What
+counts is whether it is on when an operation is traced, not when it is compiled.
 """
 
 from __future__ import annotations

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
-from lingo_mi.projectors.balance import PACKET, SHARING, Share, Sharing, Target, Work, pack, packets_of, repeat
+from lingo_mi.projectors.balance import SHARING, Share, Sharing, Target, Work, pack
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View, vector64
 
-SETUP = 6  # cost of a team's visit to eight rows, in packets
+SETUP = 6  # cost of a team's visit to a block of rows, in steps
 NEAR = 1e-9  # a mesh touches the source if its nearest vertex has at most this share of the farthest vertex's depth
 
 
@@ -115,7 +115,6 @@ class MeshPaths:
 
     def _draw(self, vertices, view):
         """The sum over triangles of sign (t - t0) / t0, or of sign (t - t0) for a parallel beam."""
-        packets = packets_of(view.width)
         height, width = dr.opaque(mi.Int32, view.height), dr.opaque(mi.Int32, view.width)
         triangles, blocks, cost = _plan(vertices, self._faces, height, width, self.sharing)
         drawn: Any = dr.compress(blocks > 0)  # many triangles of fine meshes cover no pixel centre
@@ -124,8 +123,8 @@ class MeshPaths:
         triangles = dr.ravel(dr.gather(mi.Vector4i, triangles, drawn))
         dr.eval(triangles)
         work = Work.of(dr.gather(mi.UInt32, blocks, drawn), dr.gather(mi.UInt32, cost, drawn), self.sharing)
-        packets, bend = dr.opaque(mi.Int32, packets), dr.opaque(mi.Float, 0.0 if view.parallel else 1.0)
-        mesh = _Packed(vertices, triangles, height, width, packets, bend)
+        packets = dr.opaque(mi.Int32, self.sharing.adding.packets(view.width))
+        mesh = _Packed(vertices, triangles, height, width, packets, dr.opaque(mi.Float, 0.0 if view.parallel else 1.0))
         return work.add_up(_fill, view.height, view.width, mesh=mesh)
 
 
@@ -241,9 +240,9 @@ def _plan(vertices, faces, height, width, sharing: Sharing):
         y[j], y[j + 1] = dr.select(swap, y[j + 1], y[j]), dr.select(swap, y[j], y[j + 1])
         i[j], i[j + 1] = dr.select(swap, i[j + 1], i[j]), dr.select(swap, i[j], i[j + 1])
     rows = _first_centre(y[2], height) - _first_centre(y[0], height)
-    blocks = dr.select(reach > 0, (mi.UInt32(rows) + (sharing.lanes - 1)) // sharing.lanes, 0)
+    blocks = dr.select(reach > 0, sharing.blocks(mi.UInt32(rows)), 0)
     mean_width = dr.minimum(0.5 * area / (y[2] - y[0]), Float64(reach))
-    cost = mi.UInt32(dr.select(blocks > 0, mean_width, 0)) // PACKET + SETUP
+    cost = mi.UInt32(dr.select(blocks > 0, mean_width, 0)) // sharing.step + SETUP
     triangles = pack(mi.Vector4i, mi.Int32, (*(mi.Int32(k) for k in i), dr.select(odd, mi.Int32(-1), 1)))
     dr.eval(triangles, blocks, cost)
     return triangles, blocks, cost
@@ -285,24 +284,28 @@ def _row(long, lower, upper, parity, row, row_end, width):
 
 
 def _fill(share: Share, target: Target, mesh: _Packed):
+    layout = share.layout
+
     def draw(g, block, stop):
         i = dr.gather(mi.Vector4i, mesh.triangles, g)
         a, b, c = mesh.corners(i)
         long, lower, upper = _edge(a, c), _edge(a, b), _edge(b, c)
         row_begin, row_end = _first_centre(a.y, mesh.height), _first_centre(c.y, mesh.height)
 
-        def rows(block):
-            row = row_begin + share.row(block)
+        def rows(row):
+            row = row_begin + row
             first, last, sign, anchor, q0, slope = _row(long, lower, upper, i.w, row, row_end, mesh.width)
 
+            origin, line = share.beside(mi.Int32(0), target.base + row * mesh.packets)
+
             def pixels(packet):
-                column = packet * PACKET + mi.Vector4i(0, 1, 2, 3)
-                q: Any = dr.fma(slope, mi.Vector4f(column - anchor), q0)
+                column: Any = share.elements(packet, origin)
+                q: Any = dr.fma(slope, layout.Float(column - anchor), q0)
                 value = dr.select((column >= first) & (column < last), sign * q / dr.fma(-mesh.bend, q, 1), 0)
-                target.add(value, target.base + row * mesh.packets + packet)
+                target.add(value, line + packet)
 
-            repeat(first // PACKET, (last + (PACKET - 1)) // PACKET, pixels)
+            share.each_packet(layout.around(first, last), pixels)
 
-        repeat(block, stop, rows)
+        share.each_row(block, stop, row_end - row_begin, rows)
 
     return share.each_item(draw)

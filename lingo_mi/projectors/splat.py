@@ -1,11 +1,11 @@
 """The balanced splat: footprints to an image and back, with work shared out by pixel count.
 
-Each lane works on one detector row of a Gaussian, four pixels (a packet) per step; `balance` shares the rows out.
+Each lane works on one detector row of a Gaussian, or on an eighth of it on a GPU; `balance` shares the rows out.
 
 The backward pass is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers.
 Only the footprints are stored between the two passes.
 
-Each row of a footprint ends exactly at the cut-off and is then widened to whole packets. Forward, backward and tangent
+Each row of a footprint ends exactly at the cut-off and is then widened to whole steps. Forward, backward and tangent
 visit the same pixels. So backward is the exact adjoint of tangent, and tangent the exact derivative of forward.
 
 t = dx + shear dy suffers cancellation for an oblique needle: thousands of pixels from its centre, t is a fraction of a
@@ -24,21 +24,17 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.balance import (
-    PACKET,
     SHARING,
+    Layout,
     Share,
     Sharing,
+    Sums,
     Target,
     Work,
     high_low,
     load,
     pack,
     pack_halves,
-    packets_of,
-    pad,
-    position,
-    repeat,
-    span,
     times,
     unpack_halves,
     whole,
@@ -46,7 +42,7 @@ from lingo_mi.projectors.balance import (
 from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
 from lingo_mi.projectors.footprint import DOUBLE, NAMES, Footprints
 
-SETUP = 6  # cost of a team's visit to eight rows, in packets
+SETUP = 6  # cost of a team's visit to a block of rows, in steps
 
 
 def splat(
@@ -89,8 +85,8 @@ def prepare(values: Sequence, rest: Footprints, sharing: Sharing) -> tuple:
     columns = (amplitude, mx, my, high, e1, e2, e11, e12, e22, ridge, mi.Float(y), pack_halves(low, ridge_low))
     packed = pack(mi.Vector4f, mi.Float, columns)
     places = pack(mi.Vector4i, mi.Int32, (rest.column + mi.Int32(steps), rest.row, rest.row_begin, rest.row_end))
-    blocks = mi.UInt32(rest.row_end - rest.row_begin + (sharing.lanes - 1)) // sharing.lanes
-    cost = mi.UInt32(rest.width) // PACKET + SETUP
+    blocks = sharing.blocks(rest.row_end - rest.row_begin)
+    cost = mi.UInt32(rest.width) // sharing.step + SETUP
     dr.eval(packed, places, blocks, cost, rest)  # in one kernel: otherwise each would project all Gaussians again
     return packed, places, *Work.of(blocks, cost, sharing).arrays
 
@@ -121,7 +117,7 @@ class Plan:
     def __init__(self, prepared: Sequence, height: int, width: int, extent: float, sharing: Sharing):
         packed, places, *work = prepared
         self.height, self.width, self.work = height, width, Work(*work, sharing=sharing)
-        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(width))
+        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, sharing.adding.packets(width))
         self.packed = _Packed(packed, places, extent2, packets)
 
     def image(self, parts: int = 1) -> Any:
@@ -143,11 +139,12 @@ class Plan:
 
         The last, by y, is taken with the ridge fixed; `by_values` converts it.
         """
-        upstream = pad(grad_image, self.height, self.width)
-        out = [dr.zeros(mi.Float, self.work.count) for _ in NAMES]
-        dr.make_opaque(upstream, out)
-        dr.eval(_gather(self.work.shares(), self.packed, upstream, out), out)
-        return out
+        layout, sums = self.work.sharing.reading, Sums(self.work.count, len(NAMES))
+        upstream = layout.pad(grad_image, self.height, self.width)
+        dr.make_opaque(upstream)
+        packed = replace(self.packed, packets=dr.opaque(mi.Int32, layout.packets(self.width)))
+        dr.eval(_gather(self.work.shares(layout), packed, upstream, sums), sums.arrays)
+        return sums.columns()
 
 
 def by_values(found: Sequence, shear: Any) -> tuple:
@@ -157,35 +154,47 @@ def by_values(found: Sequence, shear: Any) -> tuple:
     return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
 
 
-def _row(c, w, y, f: _Packed):
+class _Item:
+    """A footprint in a kernel: its numbers, and what follows from them for all rows and pixels."""
+
+    def __init__(self, g, f: _Packed):
+        (self.amplitude, self.mx, self.my, self.shear, *e, self.ridge, self.y, low), w = f.load(g)
+        self.e1, self.e2, self.e11, self.e12, self.e22 = e
+        self.shear_low, self.ridge_low = unpack_halves(low)
+        self.column, self.row, self.row_begin, self.row_end = w
+        self.extent2, self.packets = f.extent2, f.packets
+        self.half_extent2, self.twice_e12 = 0.5 * f.extent2, 2 * self.e12
+        self.a = dr.square(self.mx) - f.extent2 * self.e11
+        self.mu = self.mx * HALF_LOG2E**0.5
+
+
+def _row(layout: Layout, i: _Item, y):
     """Constants of row y of a footprint and its packets [begin, end).
 
     Returns dy; m = (my dy)^2; d0 and d1 with den = d0 + t (d1 + e11 t); where t is 0, as a column and a fraction; begin; end.
     """
-    _, mx, my, shear, e1, e2, e11, e12, e22, ridge, fy, low = c
-    shear_low, ridge_low = unpack_halves(low)
-    n = mi.Float(y - w.y)
-    dy = n - fy
-    m = dr.square(my * dy)
-    d0 = dr.fma(dy, dr.fma(e22, dy, e2), 1)
-    d1 = dr.fma(2 * e12, dy, e1)
+    n = mi.Float(y - i.row)
+    dy = n - i.y
+    m = dr.square(i.my * dy)
+    d0 = dr.fma(dy, dr.fma(i.e22, dy, i.e2), 1)
+    d1 = dr.fma(i.twice_e12, dy, i.e1)
     # num <= extent^2 den, a quadratic in t
-    a, b, c0 = dr.square(mx) - f.extent2 * e11, 0.5 * f.extent2 * d1, f.extent2 * d0 - m
-    root = dr.sqrt(dr.maximum(dr.fma(a, c0, b * b), 0))
-    along, along_low = times(shear, shear_low, n)
-    steps = whole(along - ridge)
+    b, c0 = i.half_extent2 * d1, i.extent2 * d0 - m
+    root = dr.sqrt(dr.maximum(dr.fma(i.a, c0, b * b), 0))
+    along, along_low = times(i.shear, i.shear_low, n)
+    steps = whole(along - i.ridge)
     # Near the ridge t needs all its digits; there these differences are exact.
-    offset = (ridge - (along - steps)) + (ridge_low - along_low)
-    column = w.x - mi.Int32(steps)
-    begin, end = span((b - root) / a, (b + root) / a, offset, column, y >= w.w, f.packets)
+    offset = (i.ridge - (along - steps)) + (i.ridge_low - along_low)
+    column = i.column - mi.Int32(steps)
+    begin, end = layout.span((b - root) / i.a, (b + root) / i.a, offset, column, y >= i.row_end, i.packets)
     return dy, m, d0, d1, column, offset, begin, end
 
 
-def _shape(t, c, m, d0, d1):
+def _shape(t, i: _Item, m, d0, d1):
     """The footprint without its amplitude: 1/den, the exponent of 2, which is -num/den log2(e)/2, and the value."""
-    u = c[1] * HALF_LOG2E**0.5 * t
+    u = i.mu * t
     num = dr.fma(-u, u, m * -HALF_LOG2E)
-    root = dr.rsqrt(dr.fma(t, dr.fma(c[6], t, d1), d0))
+    root = dr.rsqrt(dr.fma(t, dr.fma(i.e11, t, d1), d0))
     inverse = root * root
     exponent = num * inverse
     return inverse, exponent, root * exp2_of_negative(exponent)
@@ -195,83 +204,82 @@ def _draw(share: Share, target: Target, f: _Packed, moved=None):
     """Add all footprints to the target; with `moved`, packed like them, their derivatives in that direction."""
 
     def draw(g, block, stop):
-        c, w = f.load(g)
-        dc = None if moved is None else load(moved, g)
+        item, dc = _Item(g, f), None if moved is None else load(moved, g)
 
-        def rows(block):
-            y = w.z + share.row(block)
-            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, f)
-            line = target.base + y * f.packets
+        def rows(row):
+            y = item.row_begin + row
+            dy, m, d0, d1, column, offset, first, last = _row(share.layout, item, y)
+            column, line = share.beside(column, target.base + y * f.packets)
 
             def pixels(packet):
-                t = position(packet, column, offset)
-                inverse, exponent, shape = _shape(t, c, m, d0, d1)
-                factor = c[0] if moved is None else _tangent_factor(c, dc, t, dy, d1, inverse, exponent)
+                t = share.position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, item, m, d0, d1)
+                factor = item.amplitude if moved is None else _tangent_factor(item, dc, t, dy, d1, inverse, exponent)
                 target.add(factor * shape, line + packet)
 
-            repeat(first, last, pixels)
+            share.each_packet((first, last), pixels)
 
-        repeat(block, stop, rows)
+        share.each_row(block, stop, item.row_end - item.row_begin, rows)
 
     return share.each_item(draw)
 
 
-def _gather(share: Share, f: _Packed, upstream, out):
-    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `out`."""
+def _gather(share: Share, f: _Packed, upstream, found: Sums):
+    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `found`."""
 
     def gather(g, block, stop):
-        c, w = f.load(g)
+        item = _Item(g, f)
 
-        def rows(block, *sums):
-            y = w.z + share.row(block)
-            dy, m, d0, d1, column, offset, first, last = _row(c, w, y, f)
-            line = y * f.packets
+        def rows(row, *sums):
+            y = item.row_begin + row
+            dy, m, d0, d1, column, offset, first, last = _row(share.layout, item, y)
+            column, line = share.beside(column, y * f.packets)
+            total, dot = share.total, share.dot
 
             def pixels(packet, *moments):
                 s, n0, n1, n2, q0, q1, q2 = moments
-                t = position(packet, column, offset)
-                inverse, exponent, shape = _shape(t, c, m, d0, d1)
+                t = share.position(packet, column, offset)
+                inverse, exponent, shape = _shape(t, item, m, d0, d1)
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), each times the amplitude
-                value = dr.gather(mi.Vector4f, upstream, line + packet) * shape
+                value = share.read(upstream, line + packet) * shape
                 n = value * inverse
                 q = n * exponent
                 nt, qt = n * t, q * t
                 # Reduce each packet now: packets of sums do not fit into the CPU's registers.
                 return (
-                    s + dr.sum(value),
-                    n0 + dr.sum(n),
-                    n1 + dr.sum(nt),
-                    n2 + dr.dot(nt, t),
-                    q0 + dr.sum(q),
-                    q1 + dr.sum(qt),
-                    q2 + dr.dot(qt, t),
+                    s + total(value),
+                    n0 + total(n),
+                    n1 + total(nt),
+                    n2 + dot(nt, t),
+                    q0 + total(q),
+                    q1 + total(qt),
+                    q2 + dot(qt, t),
                 )
 
-            return _add_row(sums, c, dy, repeat(first, last, pixels, *(mi.Float(0) for _ in range(7))))
+            moments = share.each_packet((first, last), pixels, *(mi.Float(0) for _ in range(7)))
+            return _add_row(sums, item, dy, moments)
 
-        sums = repeat(block, stop, rows, *(mi.Float(0) for _ in NAMES))
-        for target, value in zip(out, sums):
-            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+        sums = share.each_row(block, stop, item.row_end - item.row_begin, rows, *(mi.Float(0) for _ in NAMES))
+        found.add(sums, g)
 
     return share.each_item(gather)
 
 
-def _add_row(sums, c, dy, moments):
+def _add_row(sums, i: _Item, dy, moments):
     """Add a row's part to the eleven sums, from its moments in t."""
     s, n0, n1, n2, q0, q1, q2 = moments
-    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
-    half = -0.5 * amplitude
+    half = -0.5 * i.amplitude
     h0, h1, h2 = (dr.fma(1 / HALF_LOG2E, q, n) for q, n in zip((q0, q1, q2), (n0, n1, n2)))
     n0, n1, n2, h0, h1, h2 = (half * x for x in (n0, n1, n2, h0, h1, h2))
     # The centre enters through t = dx + shear dy and through dy (d0 and d1 are polynomials in dy). The last number is the
     # derivative by the centre's y along the ridge, at constant t.
-    d1 = dr.fma(2 * e12, dy, e1)
-    dt = 2 * dr.square(mx) * n1 + d1 * h0 + 2 * e11 * h1
-    ddy = 2 * dr.square(my) * dy * n0 + dr.fma(2 * e22, dy, e2) * h0 + 2 * e12 * h1
+    d1 = dr.fma(i.twice_e12, dy, i.e1)
+    dt = 2 * dr.square(i.mx) * n1 + d1 * h0 + 2 * i.e11 * h1
+    ddy = 2 * dr.square(i.my) * dy * n0 + dr.fma(2 * i.e22, dy, i.e2) * h0 + i.twice_e12 * h1
     parts = (
         s,
-        2 * mx * n2,
-        2 * my * dr.square(dy) * n0,
+        2 * i.mx * n2,
+        2 * i.my * dr.square(dy) * n0,
         dy * dt,
         h1,
         dy * h0,
@@ -284,16 +292,15 @@ def _add_row(sums, c, dy, moments):
     return tuple(a + b for a, b in zip(sums, parts))
 
 
-def _tangent_factor(c, dc, t, dy, d1, inverse, exponent):
+def _tangent_factor(i: _Item, dc, t, dy, d1, inverse, exponent):
     """The footprint's directional derivative over its shape."""
-    amplitude, mx, my, shear, e1, e2, e11, e12, e22, *_ = c
     d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_ridge, d_y, _ = dc
     t_dot = dy * d_shear - d_ridge
-    num_dot = 2 * mx * t * (d_mx * t + mx * t_dot) + 2 * my * dy * (d_my * dy - my * d_y)
+    num_dot = 2 * i.mx * t * (d_mx * t + i.mx * t_dot) + 2 * i.my * dy * (d_my * dy - i.my * d_y)
     den_dot = (
         t * (d_e1 + d_e11 * t)
         + dy * (d_e2 + 2 * d_e12 * t + d_e22 * dy)
-        + (d1 + 2 * e11 * t) * t_dot
-        - (e2 + 2 * e12 * t + 2 * e22 * dy) * d_y
+        + (d1 + 2 * i.e11 * t) * t_dot
+        - (i.e2 + 2 * i.e12 * t + 2 * i.e22 * dy) * d_y
     )
-    return d_amplitude - 0.5 * amplitude * inverse * (num_dot + dr.fma(1 / HALF_LOG2E, exponent, 1) * den_dot)
+    return d_amplitude - 0.5 * i.amplitude * inverse * (num_dot + dr.fma(1 / HALF_LOG2E, exponent, 1) * den_dot)

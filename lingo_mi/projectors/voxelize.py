@@ -13,7 +13,7 @@ digits. Likewise they sum derivatives by t and r, which stay small; derivatives 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -21,20 +21,16 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.projectors.balance import (
-    PACKET,
     SHARING,
+    Layout,
     Share,
     Sharing,
+    Sums,
     Target,
     Work,
     high_low,
     load,
     pack,
-    packets_of,
-    pad,
-    position,
-    repeat,
-    span,
     times,
     whole,
 )
@@ -84,7 +80,7 @@ def voxelize(
 
 @full_float64()
 def _numbers(gaussians, grid, extent):
-    """The differentiable numbers of all Gaussians; their places, voxels of a line and voxels, for `_Voxelize`; which are sound."""
+    """Differentiable numbers of all Gaussians, their places, voxels of a line, all voxels (see `_Voxelize`); which are sound."""
     centre, scale, rotation, density = gaussians
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
@@ -134,21 +130,23 @@ class _Voxelize(dr.CustomOp):
         # (column of the ridge, row, slice, lines) and (first row, first slice, rows, row of the spine)
         column, row, *others = rest
         places = pack(mi.Vector4i, mi.Int32, (column + mi.Int32(along_x), row, *others, row + mi.Int32(along_y)))
-        lanes = grid.sharing.lanes
-        blocks, cost = (mi.UInt32(rest[3]) + (lanes - 1)) // lanes, length // PACKET + SETUP
+        sharing = grid.sharing
+        blocks, cost = sharing.blocks(mi.UInt32(rest[3])), length // sharing.step + SETUP
         dr.eval(packed, places, blocks, cost, rest, covered)  # in one kernel: each alone would compute all Gaussians
         self.work = Work.of(blocks, cost, grid.sharing)
         parts = parts_of(deepest(rest[:3], covered, shape)) if deep else 1
-        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, packets_of(nx))
+        extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, sharing.adding.packets(nx))
         self.packed = _Packed(packed, places, extent2, packets, dr.opaque(mi.Int32, ny))
         return self.work.add_up(_fill, ny * nz, nx, parts, f=self.packed)
 
     def backward(self):
         nx, ny, nz = self.shape
-        upstream = pad(self.grad_out(), ny * nz, nx)
-        out = [dr.zeros(mi.Float, self.work.count) for _ in range(NUMBERS)]
-        dr.make_opaque(upstream, out)
-        dr.eval(_collect(self.work.shares(), self.packed, upstream, out), out)
+        layout, sums = self.work.sharing.reading, Sums(self.work.count, NUMBERS)
+        upstream = layout.pad(self.grad_out(), ny * nz, nx)
+        dr.make_opaque(upstream)
+        packed = replace(self.packed, packets=dr.opaque(mi.Int32, layout.packets(nx)))
+        dr.eval(_collect(self.work.shares(layout), packed, upstream, sums), sums.arrays)
+        out = sums.columns()
         # The kernel's derivatives by y and z are at fixed ridge and spine; the one by s1 is at fixed t where r = 0.
         s1, s2, s3 = self.slopes
         by_s1, by_s2, by_s3, x, y, z = (type(s1)(v) for v in out[4:])
@@ -182,7 +180,7 @@ class _Packed:
         return c, dr.gather(mi.Vector4i, self.places, 2 * g), dr.gather(mi.Vector4i, self.places, 2 * g + 1)
 
 
-def _line(c, w, v, index, f: _Packed):
+def _line(layout: Layout, c, w, v, index, f: _Packed):
     """A line of voxels of a Gaussian.
 
     Returns its constants dz, r and m; where t is 0, as a column and a fraction; its packets [begin, end); its first packet.
@@ -204,7 +202,7 @@ def _line(c, w, v, index, f: _Packed):
     offset = (ridge_low - low_y - low_z - low) - ((along_z - steps_z) + rest)
     column = w.x - mi.Int32(steps_y) - mi.Int32(steps_z)
     half = dr.sqrt(dr.maximum(f.extent2 - m, 0)) / m1
-    begin, end = span(-half, half, offset, column, (index >= w.w) | (m > f.extent2), f.packets)
+    begin, end = layout.span(-half, half, offset, column, (index >= w.w) | (m > f.extent2), f.packets)
     return dz, r, m, column, offset, begin, end, (z * f.rows + y) * f.packets
 
 
@@ -219,43 +217,43 @@ def _fill(share: Share, target: Target, f: _Packed):
     def draw(g, block, stop):
         c, w, v = f.load(g)
 
-        def lines(block):
-            index = share.row(block)
-            _, _, m, column, offset, first, last, line = _line(c, w, v, index, f)
+        def lines(index):
+            _, _, m, column, offset, first, last, line = _line(share.layout, c, w, v, index, f)
+            column, line = share.beside(column, target.base + line)
 
             def voxels(packet):
-                u = c[1] * position(packet, column, offset)
+                u = c[1] * share.position(packet, column, offset)
                 value = c[0] * exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
-                target.add(value, target.base + line + packet)
+                target.add(value, line + packet)
 
-            repeat(first, last, voxels)
+            share.each_packet((first, last), voxels)
 
-        repeat(block, stop, lines)
+        share.each_row(block, stop, w.w, lines)
 
     return share.each_item(draw)
 
 
-def _collect(share: Share, f: _Packed, upstream, out):
+def _collect(share: Share, f: _Packed, upstream, found: Sums):
     def gather(g, block, stop):
         c, w, v = f.load(g)
 
-        def lines(block, *sums):
-            index = share.row(block)
-            dz, r, m, column, offset, first, last, line = _line(c, w, v, index, f)
+        def lines(index, *sums):
+            dz, r, m, column, offset, first, last, line = _line(share.layout, c, w, v, index, f)
+            column, line = share.beside(column, line)
 
             def voxels(packet, n0, n1, n2):
-                t = position(packet, column, offset)
+                t = share.position(packet, column, offset)
                 u = c[1] * t
                 shape = exp2_of_negative(dr.fma(u, u, m) * -HALF_LOG2E)
-                n = dr.gather(mi.Vector4f, upstream, line + packet) * shape
+                n = share.read(upstream, line + packet) * shape
                 nt = n * t
-                return n0 + dr.sum(n), n1 + dr.sum(nt), n2 + dr.dot(nt, t)
+                return n0 + share.total(n), n1 + share.total(nt), n2 + share.dot(nt, t)
 
-            return _add_line(sums, c, dz, r, repeat(first, last, voxels, *(mi.Float(0) for _ in range(3))))
+            moments = share.each_packet((first, last), voxels, *(mi.Float(0) for _ in range(3)))
+            return _add_line(sums, c, dz, r, moments)
 
-        sums = repeat(block, stop, lines, *(mi.Float(0) for _ in range(NUMBERS)))
-        for target, value in zip(out, sums):
-            dr.scatter_add(target, value, g, mode=dr.ReduceMode.Local)
+        sums = share.each_row(block, stop, w.w, lines, *(mi.Float(0) for _ in range(NUMBERS)))
+        found.add(sums, g)
 
     return share.each_item(gather)
 

@@ -22,8 +22,8 @@ from lingo_mi.studies.oracle import Pose, random_cloud, relative
 SHARINGS = {
     'narrow teams': Sharing(lanes=2),
     'wide teams': Sharing(lanes=32),
-    'few shares': Sharing(shares_per_thread=0.25, shares_on_gpu=3),
-    'many shares': Sharing(shares_per_thread=40, shares_on_gpu=50_000),
+    'few shares': Sharing(shares=0.125),
+    'many shares': Sharing(shares=20),
 }
 by_sharing = pytest.mark.parametrize('sharing', SHARINGS.values(), ids=SHARINGS)
 NAMES = 'centre', 'scale', 'rotation', 'density'
@@ -82,5 +82,6 @@ def test_meshes(sharing):
 
 
 def test_as_many_shares_as_asked():
-    assert Sharing().scaled(0.25) == Sharing(shares_per_thread=0.5, shares_on_gpu=1024)
-    assert Sharing(shares_on_gpu=1).scaled(0.1).shares_on_gpu == 1
+    usual = Sharing().teams
+    assert usual > 1 and Sharing().scaled(2).scaled(1.5).teams == 3 * usual
+    assert Sharing().scaled(0.1 / usual).teams == 1

@@ -15,6 +15,7 @@ use_variant()
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
+from lingo_mi.projectors.balance import SHARING  # noqa: E402
 from lingo_mi.projectors.mesh import MeshPaths, from_mitsuba  # noqa: E402
 from lingo_mi.projectors.view import View  # noqa: E402
 
@@ -298,5 +299,6 @@ def test_rows_past_a_triangle_write_nothing(level):
     if level:  # an upper edge along a row has no slope
         upper = *upper[:3], nan, nan
     first, last, *_ = mesh._row(long, lower, upper, mi.Int32(1), mi.Int32(0, 1, 7), mi.Int32(1), mi.Int32(20))
-    packets = -(-last.numpy().astype(int) // mesh.PACKET) - first.numpy().astype(int) // mesh.PACKET
+    step = SHARING.step
+    packets = -(-last.numpy().astype(int) // step) - first.numpy().astype(int) // step
     assert np.all(packets[1:] <= 0) and (level or packets[0] == 2)

@@ -1,0 +1,63 @@
+"""What the CUDA driver says of the GPU that Dr.Jit uses: the first of those that CUDA_VISIBLE_DEVICES names, or of all."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from dataclasses import dataclass
+from functools import cache
+
+WARP = 32
+
+# Numbers of CUdevice_attribute in cuda.h
+_MULTIPROCESSORS, _THREADS, _MAJOR, _MINOR = 16, 39, 75, 76
+
+
+@dataclass(frozen=True)
+class GPU:
+    """A graphics card.
+
+    name             as its driver gives it
+    memory           bytes
+    multiprocessors  their number
+    warps            that one of them holds at once, at most
+    capability       compute capability times ten: 86, 90
+    """
+
+    name: str
+    memory: int
+    multiprocessors: int
+    warps: int
+    capability: int
+
+
+@cache
+def gpu() -> GPU:
+    """The GPU in use. Raises OSError where there is no CUDA driver, or no device."""
+    usual = 'nvcuda.dll' if sys.platform == 'win32' else 'libcuda.so.1'
+    driver = ctypes.CDLL(os.environ.get('DRJIT_LIBCUDA_PATH') or usual)  # as Dr.Jit loads it
+
+    def ask(name, *arguments):
+        code = getattr(driver, name)(*arguments)
+        if code:
+            raise OSError(f'the CUDA driver answers {name} with error {code}')
+
+    def attribute(number):
+        value = ctypes.c_int()
+        ask('cuDeviceGetAttribute', ctypes.byref(value), number, device)
+        return value.value
+
+    device, memory, name = ctypes.c_int(), ctypes.c_size_t(), ctypes.create_string_buffer(256)
+    ask('cuInit', 0)
+    ask('cuDeviceGet', ctypes.byref(device), 0)
+    ask('cuDeviceTotalMem_v2', ctypes.byref(memory), device)
+    ask('cuDeviceGetName', name, len(name), device)
+    warps = (attribute(_THREADS) or 2048) // WARP  # a stand-in for a driver may not say
+    capability = 10 * attribute(_MAJOR) + attribute(_MINOR)
+    return GPU(name.value.decode(), memory.value, attribute(_MULTIPROCESSORS), warps, capability)
+
+
+def resident_warps() -> int:
+    """The warps that the GPU holds at once, at most."""
+    return gpu().multiprocessors * gpu().warps
