@@ -8,17 +8,23 @@ import pytest
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
 
 
+VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
+
+
 def pytest_addoption(parser):
     parser.addoption('--slow', action='store_true', help='also run the full-size forms of tests')
 
 
 def pytest_collection_modifyitems(config, items):
-    if config.getoption('--slow'):
-        return
-    skip = pytest.mark.skip(reason='full size: run with --slow')
+    skips = {}
+    if not config.getoption('--slow'):
+        skips['slow'] = 'full size: run with --slow'
+    if 'LINGO_MI_CUDA_STAND_IN' in os.environ and VARIANT.startswith('cuda'):
+        skips['traces_rays'] = 'a stand-in for the CUDA driver has no OptiX'
     for item in items:
-        if 'slow' in item.keywords:
-            item.add_marker(skip)
+        for name, reason in skips.items():
+            if name in item.keywords:
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(scope='session', autouse=True)
@@ -26,7 +32,7 @@ def variant() -> str:
     """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
     from lingo_mi.runtime import use_variant
 
-    return use_variant(os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono'))
+    return use_variant(VARIANT)
 
 
 @pytest.fixture(scope='session')

@@ -185,6 +185,7 @@ def single(g, points, order=28):
     return np.array(out)
 
 
+@pytest.mark.traces_rays
 @pytest.mark.parametrize('changes', [dict(), dict(offDetector=(0.0, 130.0)), dict(mode='parallel')])
 def test_single_scattering(changes):
     """Cone, a panel that sees half of the box, and parallel rays; every point within its error, the mean within 1.5 %."""
@@ -253,6 +254,7 @@ def photons(g, count, rng):
     return arrived.sum() / open_beam, np.sqrt((arrived**2).sum()) / open_beam
 
 
+@pytest.mark.traces_rays
 def test_all_orders():
     """The scattered photons of a whole panel, within 3 standard errors of both; those scattered once are far fewer."""
     g = geometry(DSD=480.0, dDetector=(7.0, 6.0))
@@ -272,6 +274,7 @@ def test_all_orders():
     assert found[1][0] < 0.8 * expected
 
 
+@pytest.mark.traces_rays
 def test_two_names_of_one_material():
     """A grid of two materials, told apart by density, that are one: the same light as from one."""
     ramp = np.broadcast_to(np.linspace(0.5, 1.5, 8)[:, None, None] * MU, (8, 8, 8)).astype(np.float32)
@@ -338,6 +341,7 @@ def body():
     return grid(values_of() * 0.04, mi.ScalarTransform4f().scale(50))
 
 
+@pytest.mark.traces_rays
 def test_a_scene_adds_it_to_the_light():
     ideal, scene = load(dict(body=body()), PANEL), load(dict(body=body(), tube=SCATTER), PANEL)
     sensor = scene.sensors()[0]
@@ -350,6 +354,7 @@ def test_a_scene_adds_it_to_the_light():
     np.testing.assert_array_equal(render(scene), image)
 
 
+@pytest.mark.traces_rays
 def test_numbers_follow_seed_and_view():
     g = geometry()
     view, box = View.of(g.rays(), 0, *g.nDetector), [water_box()]
@@ -362,6 +367,7 @@ def test_numbers_follow_seed_and_view():
     assert np.abs(means(1) - first).min() > 0 and np.abs(means(0, 1) - first).min() > 0
 
 
+@pytest.mark.traces_rays
 def test_scan(scene_file):
     """Every view of a scan is what `mi.render` gives."""
     loaded = load_scene(

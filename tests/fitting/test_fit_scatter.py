@@ -42,6 +42,7 @@ def effects_of(scatter=FEW, **changes):
 # ---- images and derivatives ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.traces_rays
 @pytest.mark.parametrize(
     'effects',
     [
@@ -62,6 +63,7 @@ def test_the_fit_sees_what_the_integrator_renders(effects, tmp_path):
     assert np.abs(plain.model.render(state, g) - expected).max() > 0.05 * expected.max()
 
 
+@pytest.mark.traces_rays
 def test_the_light_is_a_constant_to_the_derivatives():
     """Of the loss by the densities, against differences with the light held fixed; without the light they are others."""
     stepper, state = stepper_of(effects_of(), lambda_tv=0.0)
@@ -92,6 +94,7 @@ def test_the_light_is_a_constant_to_the_derivatives():
 # ---- estimates -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.traces_rays
 def test_when_it_is_estimated(monkeypatch):
     """A handful of times, and at once for coarse and fine views."""
     scan = replace(tiny_scan(geometry(3)), effects=effects_of())
@@ -117,6 +120,7 @@ def test_when_it_is_estimated(monkeypatch):
         np.testing.assert_allclose(coarse.scattered.numpy().reshape(16, 16), image.mean((1, 3)), rtol=1e-6)
 
 
+@pytest.mark.traces_rays
 def test_resumed_fit_is_the_same_fit(tmp_path, variant):
     """Also between two estimates."""
     scan = tiny_scan(geometry(3))
@@ -157,6 +161,7 @@ def scans():
     return Scan(g, clean), Scan(g, lit, effects=replace(effects_of(few), detector=detector(photons=300.0)))
 
 
+@pytest.mark.traces_rays
 def test_linearised(scans):
     """Most of the light is taken out before FDK; without it, nothing changes; what FDK cannot reconstruct keeps it."""
     clean, lit = scans
@@ -172,6 +177,7 @@ def test_linearised(scans):
         np.testing.assert_array_equal(linearised(masked, lit.effects).projections, masked.projections)
 
 
+@pytest.mark.traces_rays
 def test_a_fit_that_models_it_finds_the_volume(scans):
     clean, lit = scans
     volumes = []

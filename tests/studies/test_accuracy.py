@@ -295,6 +295,7 @@ def test_march_of_a_constant():
     np.testing.assert_allclose(found, [2, 2 * np.hypot(1, 0.1)], atol=0.004)
 
 
+@pytest.mark.traces_rays
 def test_tree_of_one_gaussian(variant):
     """With one Gaussian and a generous epsilon, marching has nothing to miss."""
     work = Workload(1, 48, 200.0)
