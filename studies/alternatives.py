@@ -7,16 +7,19 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.footprint import SQRT_2PI
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
 from lingo_mi.projectors.view import View
 
 
+@full_float64()
 def rays(view: View, distance: float) -> tuple[Any, Any]:
     """Origins Point3f and unit directions Vector3f of a cone beam's rays, row by row.
 
@@ -46,6 +49,11 @@ def per_ray(centre: Any, scale: Any, rotation: Any, density: Any, view: View, pr
 
     Float [height * width] of that precision.
     """
+    with full_float64() if precision == 'float64' else nullcontext():
+        return _per_ray(centre, scale, rotation, density, view, precision)
+
+
+def _per_ray(centre, scale, rotation, density, view, precision):
     Float: Any = dr.float64_array_t(mi.Float) if precision == 'float64' else mi.Float
     Vector: Any = mi.Vector3d if precision == 'float64' else mi.Vector3f
     i = dr.arange(mi.UInt32, view.height * view.width)
@@ -61,9 +69,8 @@ def per_ray(centre: Any, scale: Any, rotation: Any, density: Any, view: View, pr
     axes = [row / s for row in rows_of(q, Vector)]
     columns = [*p, *(a for axis in axes for a in axis), rho * SQRT_2PI]
     dr.eval(columns)
-    total = _sum_gaussians(
-        columns, start, direction, dr.opaque(mi.UInt32, dr.width(rho)), Float, Vector, precision == 'compensated'
-    )
+    count = dr.opaque(mi.UInt32, dr.width(rho))
+    total = _sum_gaussians(columns, start, direction, count, Float, Vector, precision == 'compensated')
     return total * dr.norm(direction)
 
 

@@ -52,7 +52,10 @@ def columns(cloud):
 
 def framework(kind: str):
     if kind in ('torch', 'jax'):
-        return pytest.importorskip(kind, reason=f'{kind} is not installed')
+        module = pytest.importorskip(kind, reason=f'{kind} is not installed')
+        if kind == 'torch' and _device() == 'cuda' and not module.cuda.is_available():
+            pytest.skip('PyTorch has no GPU')
+        return module
 
 
 def arrays_of(kind, values):

@@ -341,6 +341,7 @@ def test_presets_are_described_as_measured(variant):
     assert described == measured and list(measured) == list(PRESETS)
 
 
+@pytest.mark.traces_rays
 def test_whole_measurement(tmp_path, monkeypatch):
     """Every part on a tiny configuration, down to the documentation, by the function and by the command."""
     parts = []

@@ -19,6 +19,7 @@ KEYS = (
 )
 
 
+@pytest.mark.traces_rays
 def test_all_numbers_are_there(tmp_path):
     few = '--gaussians', 50, '--size', 32, '--pixels', 40, '--repeats', 1, '--json', tmp_path / 'a.json'
     code, out, err = run(BENCH, *few)
