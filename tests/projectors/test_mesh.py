@@ -97,12 +97,14 @@ def test_convex_bodies_at_every_pixel(mesh, name):
     close(drawn(paths_of(mesh), VIEWS[name], panel=name != 'tilted'), convex(mesh, VIEWS[name]), 2)
 
 
-def test_aligned_box_with_pixel_centres_on_its_edges():
+def test_aligned_box_with_pixel_centres_on_its_edges(variant):
     half = np.array([7.5, 6.5, 4.5])
     paths = paths_of(trimesh.creation.box(2 * half))
     frames = Rays(*np.array([[[-1.0, 0, 0]], [[-20.0, -30.5, 22.0]], [[0.0, 1, 0]], [[0.0, 0, -1]]]), True)
     image = drawn(paths, frames)
-    assert np.isin(image, (0, 15)).all()
+    # Each crossing is divided by 1, which a GPU may do with an error of two units in the last place.
+    exact = 4e-6 if variant.startswith('cuda') else 0
+    assert np.all((image == 0) | (np.abs(image - 15) <= exact))
     assert (image > 0).sum() == 13 * 9
 
 

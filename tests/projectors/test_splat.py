@@ -325,12 +325,17 @@ def test_same_bits_every_time(mode, variant):
             np.testing.assert_array_equal(grads[name], grads_again[name])
 
 
-def test_powers_of_two():
-    """To float32's rounding, exact for whole numbers, and nothing but small where float32 ends."""
+def test_powers_of_two(variant):
+    """To float32's rounding, exact for whole numbers, and nothing but small where float32 ends.
+
+    On a GPU by its instruction `ex2.approx`, which may err by two units in the last place (PTX ISA, 9.7.3).
+    """
     x = np.concatenate([np.linspace(-125.9, 0, 100_001), -np.logspace(-40, 0, 1000), np.arange(-125, 1)]).astype(
         np.float32
     )
     found = exp2_of_negative(mi.Float(x)).numpy()
-    np.testing.assert_allclose(found, np.exp2(x.astype(float)), rtol=1.2e-7)
-    np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
+    cuda = variant.startswith('cuda')
+    np.testing.assert_allclose(found, np.exp2(x.astype(float)), rtol=(3 if cuda else 1) * 1.2e-7)
+    if not cuda:
+        np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
     assert np.all(exp2_of_negative(mi.Float([-126, -127, -200, -1e30, -np.inf])).numpy() <= 2.0**-126)
