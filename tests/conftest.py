@@ -8,6 +8,7 @@ import pytest
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
 
 VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
+STAND_IN = 'LINGO_MI_CUDA_STAND_IN' in os.environ  # for the CUDA driver: one thread, without OptiX
 
 
 def pytest_addoption(parser):
@@ -18,7 +19,7 @@ def pytest_collection_modifyitems(config, items):
     skips = {}
     if not config.getoption('--slow'):
         skips['slow'] = 'full size: run with --slow'
-    if 'LINGO_MI_CUDA_STAND_IN' in os.environ and VARIANT.startswith('cuda'):
+    if STAND_IN and VARIANT.startswith('cuda'):
         skips['traces_rays'] = 'a stand-in for the CUDA driver has no OptiX'
     for item in items:
         for name, reason in skips.items():
@@ -32,6 +33,13 @@ def variant() -> str:
     from lingo_mi.runtime import use_variant
 
     return use_variant(VARIANT)
+
+
+@pytest.fixture
+def sums_in_order(variant) -> None:
+    """Skips where the order of additions is not that of the program."""
+    if variant.startswith('cuda') and not STAND_IN:
+        pytest.skip('a GPU adds atomically, in any order')
 
 
 @pytest.fixture(scope='session')

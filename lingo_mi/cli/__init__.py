@@ -21,6 +21,7 @@ COMMANDS = {
     'effects': 'measure what modelling the effects of a real detector is worth',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
     'bench-recon': 'time reconstruction on voxels against other packages',
+    'cuda-check': 'check the CUDA backend where there is no GPU',
 }
 
 

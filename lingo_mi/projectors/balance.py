@@ -30,6 +30,7 @@ from lingo_mi.projectors.depth import hashed
 while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable
 
 PACKET = 4  # numbers of an item that a lane loads at once
+MOST_PARTS = 256  # images of parts of the items in one launch
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
 
 
@@ -241,20 +242,30 @@ class Share:
 class Target:
     """The images that a kernel adds packets to.
 
-    values    Float, the images of all teams, or one common image
-    base      Int32, the first packet of a team's own image
-    private   whether each team has its own image, and needs no atomics
+    values    Float, the images of all teams, or common ones
+    size      Int32, packets of an image
+    team      UInt32, of a team's own image, which needs no atomics; None: the images are common
+    parts     common images, each of a part of the items
     """
 
     values: Any
-    base: Any
-    private: bool
+    size: Any
+    team: Any
+    parts: int
+
+    def base(self, item: Any) -> Any:
+        """The first packet of the image to add an item to, Int32."""
+        if self.team is not None:
+            return mi.Int32(self.team * self.size)
+        if self.parts == 1:
+            return mi.Int32(0)
+        return mi.Int32(hashed(item) // 256 % dr.opaque(mi.UInt32, self.parts)) * self.size
 
     def add(self, value: Any, packet: Any) -> None:
         """Add a packet, Vector4f or Float, counted from the start of `values`."""
         # On a GPU no two lanes of a warp meet: there is nothing to add up before the atomics.
         shared = dr.ReduceMode.Auto if _on_cpu() else dr.ReduceMode.Direct
-        mode = dr.ReduceMode.NoConflicts if self.private else shared
+        mode = shared if self.team is None else dr.ReduceMode.NoConflicts
         dr.scatter_add(self.values, value, packet, mode=mode)
 
 
@@ -321,35 +332,49 @@ class Work:
     def add_up(self, kernel: Callable[..., Any], rows: int, width: int, parts: int = 1, /, **arguments: Any) -> Any:
         """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole steps.
 
-        Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts. Each part is
-        summed by itself, and the partial sums are added in float64.
+        Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts or more. Each part
+        is summed by itself, on a GPU many in one launch, and the partial sums are added in float64.
         """
-        if parts > 1:
-            which = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, parts)
+        layout, Float64 = self.sharing.adding, dr.float64_array_t(mi.Float)
+        size = rows * layout.packets(width)
+        at_once = 1 if _on_cpu() else min(parts, MOST_PARTS, max(MOST_COPIED // size, 1))
+        launches = -(-parts // at_once)
+        if launches > 1:
+            which = hashed(dr.arange(mi.UInt32, self.count)) % dr.opaque(mi.UInt32, launches)
             total: Any = 0
-            Float64: Any = dr.float64_array_t(mi.Float)
-            for part in range(parts):
-                blocks = dr.select(which == dr.opaque(mi.UInt32, part), self.blocks, 0)
+            for launch in range(launches):
+                blocks = dr.select(which == dr.opaque(mi.UInt32, launch), self.blocks, 0)
                 some = Work.of(blocks, self.block_cost, self.sharing)
-                total += Float64(some.add_up(kernel, rows, width, **arguments))
+                total += Float64(some.add_up(kernel, rows, width, at_once, **arguments))  # type: ignore[call-arg]
                 dr.eval(total)
             return mi.Float(total)
-        layout = self.sharing.adding
-        size = rows * layout.packets(width)
         private = _on_cpu() and self.teams * size <= MOST_COPIED
-        copies = self.teams if private else 1
+        copies = self.teams if private else at_once
         values = dr.zeros(mi.Float, copies * size * layout.size)
         dr.make_opaque(values)
         share, stride = self.shares(layout), dr.opaque(mi.UInt32, size)
-        base = mi.Int32(share.lane // layout.lanes * stride if private else mi.UInt32(0))
-        dr.eval(kernel(share, Target(values, base, private), **arguments), values)
-        if copies > 1:
+        team = share.lane // layout.lanes if private else None
+        dr.eval(kernel(share, Target(values, stride, team, at_once), **arguments), values)
+        if not private and copies > 1:
+            values = _sum_of_copies(values, size * layout.size, copies)
+        elif copies > 1:
             i, total = dr.arange(mi.UInt32, size), dr.zeros(mi.Vector4f, size)
             for copy in range(copies):
                 total += dr.gather(mi.Vector4f, values, i + copy * stride)
             values = dr.empty(mi.Float, size * PACKET)
             dr.scatter(values, total, i, mode=dr.ReduceMode.Permute)
         return layout.crop(values, rows, width)
+
+
+def _sum_of_copies(values, size, copies):
+    """The sum of so many images of `size` elements, added in float64."""
+    i, pitch = dr.arange(mi.UInt32, size), dr.opaque(mi.UInt32, size)
+    Float64: Any = dr.float64_array_t(mi.Float)
+
+    def add(copy, total):
+        return (total + Float64(dr.gather(mi.Float, values, i + copy * pitch)),)
+
+    return mi.Float(repeat(mi.UInt32(0), dr.opaque(mi.UInt32, copies), add, dr.zeros(Float64, size))[0])
 
 
 def _cut(position, ends, block_cost, count):

@@ -296,7 +296,7 @@ def _fill(share: Share, target: Target, mesh: _Packed):
             row = row_begin + row
             first, last, sign, anchor, q0, slope = _row(long, lower, upper, i.w, row, row_end, mesh.width)
 
-            origin, line = share.beside(mi.Int32(0), target.base + row * mesh.packets)
+            origin, line = share.beside(mi.Int32(0), target.base(g) + row * mesh.packets)
 
             def pixels(packet):
                 column: Any = share.elements(packet, origin)

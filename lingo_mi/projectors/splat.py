@@ -209,7 +209,7 @@ def _draw(share: Share, target: Target, f: _Packed, moved=None):
         def rows(row):
             y = item.row_begin + row
             dy, m, d0, d1, column, offset, first, last = _row(share.layout, item, y)
-            column, line = share.beside(column, target.base + y * f.packets)
+            column, line = share.beside(column, target.base(g) + y * f.packets)
 
             def pixels(packet):
                 t = share.position(packet, column, offset)

@@ -219,7 +219,7 @@ def _fill(share: Share, target: Target, f: _Packed):
 
         def lines(index):
             _, _, m, column, offset, first, last, line = _line(share.layout, c, w, v, index, f)
-            column, line = share.beside(column, target.base + line)
+            column, line = share.beside(column, target.base(g) + line)
 
             def voxels(packet):
                 u = c[1] * share.position(packet, column, offset)

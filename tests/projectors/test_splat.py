@@ -309,9 +309,7 @@ def test_derivatives_without_the_image(mode):
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
-def test_same_bits_every_time(mode, variant):
-    if not variant.startswith('llvm'):
-        pytest.skip('a GPU adds atomically, in any order')
+def test_same_bits_every_time(mode, sums_in_order):
     frames, shape = scanner(mode, (64, 63))
     cloud = Cloud([[0.1, -0.2, 0.05]], [[0.5, 0.45, 0.52]], [[0.1, 0.2, -0.3, 1.0]], [0.4]) + random_cloud(
         np.random.default_rng(13), 300

@@ -116,9 +116,7 @@ def test_cut_off():
     assert np.all((values[far] == 0) | (np.abs(values[far] - expected[far]) < 1e-6))
 
 
-def test_same_bits_every_time(variant):
-    if not variant.startswith('llvm'):
-        pytest.skip('a GPU adds atomically, in any order')
+def test_same_bits_every_time(sums_in_order):
     cloud = random_cloud(np.random.default_rng(4), 50) + Cloud([[0, 0, 0]], [[1, 1, 1.2]], [[0, 0.1, 0, 1]], [1.0])
     grid = boxed((17, 16, 15))
     weights = np.random.default_rng(0).normal(size=17 * 16 * 15)

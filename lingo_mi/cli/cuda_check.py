@@ -1,0 +1,65 @@
+"""Check the CUDA backend without a GPU: the tests on cuda_ad_mono under a stand-in for the driver, then NVIDIA's assembler.
+
+    lingo-mi cuda-check --stand-in PROGRAM --share
+    lingo-mi cuda-check --stand-in PROGRAM --markdown docs/tables/cuda.md
+
+PROGRAM COMMAND ... runs a command with a CUDA driver that executes Dr.Jit's PTX on the CPU (see lingo_mi.studies.cuda). Needs a
+checkout, for its tests, and `pip install nvidia-cuda-nvcc-cu12` for ptxas. The exit code is 1 where a test fails, or a kernel
+does not assemble or spills registers.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+
+
+def arguments() -> argparse.Namespace:
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('--stand-in', required=True, metavar='PROGRAM', help='runs a command with a stand-in for the driver')
+    p.add_argument(
+        '--tests', type=Path, default=Path('tests'), metavar='FOLDER', help='of the checkout (default: tests)'
+    )
+    p.add_argument('--share', action='store_true', help='few tests, for one compute capability: some minutes')
+    p.add_argument('--sm', type=int, nargs='+', default=[75, 80, 90], help='compute capabilities times ten')
+    p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
+    args = p.parse_args()
+    if shutil.which(args.stand_in) is None:
+        raise InputError(f'--stand-in {args.stand_in}: is not a program that can be run')
+    if not args.tests.is_dir():
+        raise InputError(f'--tests {args.tests}: there is no such folder; run this in a checkout')
+    return args
+
+
+def main() -> int:
+    args = arguments()
+    from lingo_mi.studies.cuda.assemble import assemble_all, find_ptxas
+    from lingo_mi.studies.cuda.page import page
+    from lingo_mi.studies.cuda.suite import SHARE, run_tests, test_files
+    from lingo_mi.studies.provenance import write_provenance
+
+    find_ptxas()
+    stand_in, outcomes = Path(shutil.which(args.stand_in) or '').resolve(), {}
+    files = [args.tests / name for name in SHARE] if args.share else test_files(args.tests)
+    with tempfile.TemporaryDirectory() as folder:
+        runs = {f'sm_{sm}': dict(SM=sm, DUMP=folder) for sm in ([80] if args.share else args.sm)}
+        if not args.share:
+            runs['sm_80, noise, checked'] = dict(SM=80, NOISE=1, CHECK=1)
+        for title, settings in runs.items():
+            outcomes[title] = run_tests(
+                stand_in, files, lambda line, title=title: print(f'{title}: {line}', flush=True), **settings
+            )
+        kernels = assemble_all(Path(folder), args.sm)
+    text = page(outcomes, kernels)
+    print(text)
+    if args.markdown:
+        args.markdown.write_text(text, encoding='utf-8')
+        write_provenance(args.markdown)
+    failed = [name for outcome in outcomes.values() for name in outcome.failed]
+    for name in failed:
+        print(f'failed: {name}', file=sys.stderr)
+    return int(bool(failed) or any(k.error or k.spilled for k in kernels))

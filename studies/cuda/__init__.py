@@ -1,0 +1,11 @@
+"""The CUDA backend without a GPU, by a stand-in for its driver that runs Dr.Jit's PTX on the CPU.
+
+`suite`      the tests, on cuda_ad_mono
+`assemble`   every kernel through NVIDIA's assembler: does it compile, how many registers, does it spill
+`work`       what is counted: one image of a cloud, its derivatives, a step of a fit
+`count`      instructions and memory sectors of that work
+`model`      the time on a graphics card that follows from the counts
+
+The stand-in is a program that runs a command with its driver. It is told what to do by environment variables: CUDA_ON_CPU_SM
+(compute capability times ten), _DUMP (a folder for the PTX of every module), _PROFILE (a folder for counts), _NOISE and _CHECK.
+"""

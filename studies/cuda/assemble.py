@@ -1,0 +1,81 @@
+"""PTX through `ptxas`, NVIDIA's assembler: registers, spills and errors of every kernel.
+
+It comes with `pip install nvidia-cuda-nvcc-cu12` or a CUDA toolkit, and needs no GPU.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from lingo_mi.errors import InputError
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """What the assembler makes of one entry of a module.
+
+    name        of the entry
+    sm          compute capability times ten that it was assembled for
+    lines       PTX instructions of its module
+    registers   a thread's
+    spilled     bytes of registers that are stored in memory and loaded again
+    error       why it was not assembled; None
+    """
+
+    name: str
+    sm: int
+    lines: int
+    registers: int = 0
+    spilled: int = 0
+    error: str | None = None
+
+
+def find_ptxas() -> Path:
+    """The assembler: of the package nvidia-cuda-nvcc-cu12, or on PATH. Raises InputError where there is none."""
+    places = [Path(p) / 'nvidia/cuda_nvcc/bin/ptxas' for p in sys.path] + [Path(shutil.which('ptxas') or 'ptxas')]
+    for place in places:
+        if place.is_file():
+            return place
+    raise InputError('there is no ptxas: pip install nvidia-cuda-nvcc-cu12')
+
+
+def assemble(module: Path, sm: int, ptxas: Path) -> list[Kernel]:
+    """The kernels of a PTX file, assembled for a compute capability. None where its code is for a newer one."""
+    text = module.read_text(encoding='utf-8')
+    names = re.findall(r'\.entry\s+([\w$]+)', text)
+    target = re.search(r'\.target\s+sm_(\d+)', text)
+    if target is None or int(target[1]) > sm:
+        return []
+    lines = sum(line.rstrip().endswith(';') and not line.lstrip().startswith('.') for line in text.splitlines())
+    with tempfile.TemporaryDirectory() as folder:
+        command = [ptxas, '-v', '-O3', f'-arch=sm_{sm}', module, '-o', Path(folder) / 'kernel.cubin']
+        done = subprocess.run(command, capture_output=True, text=True)
+    said = done.stdout + done.stderr
+    if done.returncode:
+        reason = next((line.strip() for line in said.splitlines() if 'error' in line or 'fatal' in line), said.strip())
+        return [Kernel(name, sm, lines, error=reason) for name in names]
+    out = []
+    for name in names:
+        part = said.partition(f"Compiling entry function '{name}'")[2].partition('Compiling entry function')[0]
+        stores, loads = re.search(r'(\d+) bytes spill stores, (\d+) bytes spill loads', part).groups()  # type: ignore
+        registers = re.search(r'Used (\d+) registers', part)
+        out.append(Kernel(name, sm, lines, int(registers[1]) if registers else 0, int(stores) + int(loads)))
+    return out
+
+
+def assemble_all(folder: Path, sms: Iterable[int]) -> list[Kernel]:
+    """The kernels of all PTX files in a folder, for each of some compute capabilities that their code is for."""
+    ptxas = find_ptxas()
+    jobs = [(module, sm) for module in sorted(Path(folder).glob('*.ptx')) for sm in sms]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = pool.map(lambda job: assemble(*job, ptxas), jobs)
+        return [kernel for kernels in found for kernel in kernels]
