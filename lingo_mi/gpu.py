@@ -12,6 +12,7 @@ WARP = 32
 
 # Numbers of CUdevice_attribute in cuda.h
 _MULTIPROCESSORS, _THREADS, _MAJOR, _MINOR = 16, 39, 75, 76
+_CLOCK, _MEMORY_CLOCK, _BUS = 13, 36, 37  # kHz, kHz, bits
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class GPU:
     multiprocessors  their number
     warps            that one of them holds at once, at most
     capability       compute capability times ten: 86, 90
+    clock            of the multiprocessors, Hz; 0 where the driver does not say, as the next
+    bandwidth        of the memory, bytes a second
     """
 
     name: str
@@ -30,6 +33,8 @@ class GPU:
     multiprocessors: int
     warps: int
     capability: int
+    clock: float
+    bandwidth: float
 
 
 @cache
@@ -55,7 +60,15 @@ def gpu() -> GPU:
     ask('cuDeviceGetName', name, len(name), device)
     warps = (attribute(_THREADS) or 2048) // WARP  # a stand-in for a driver may not say
     capability = 10 * attribute(_MAJOR) + attribute(_MINOR)
-    return GPU(name.value.decode(), memory.value, attribute(_MULTIPROCESSORS), warps, capability)
+    return GPU(
+        name=name.value.decode(),
+        memory=memory.value,
+        multiprocessors=attribute(_MULTIPROCESSORS),
+        warps=warps,
+        capability=capability,
+        clock=1e3 * attribute(_CLOCK),
+        bandwidth=2 * 1e3 * attribute(_MEMORY_CLOCK) * attribute(_BUS) / 8,  # twice a cycle
+    )
 
 
 def resident_warps() -> int:

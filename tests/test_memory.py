@@ -8,6 +8,7 @@ import pytest
 
 from helpers.script import FIT, SCENE
 from lingo_mi import memory
+from lingo_mi.gpu import GPU, resident_warps
 
 
 def test_limits_of_control_groups(tmp_path):
@@ -47,3 +48,13 @@ def test_too_little_address_space_is_one_line(tmp_path):
     )
     assert done.returncode == 2 and done.stderr.startswith('error: ') and done.stderr.count('\n') == 1, done.stderr
     assert 'GiB of memory' in done.stderr
+
+
+def test_on_a_gpu_its_memory_counts(monkeypatch, variant):
+    if not variant.startswith('cuda'):
+        monkeypatch.setattr('mitsuba.variant', lambda: 'cuda_ad_mono')
+        monkeypatch.setattr(memory, 'gpu', lambda: GPU('a card', 3 << 30, 8, 48, 86, 1e9, 1e9))
+        assert memory.room() == 3 << 30
+    else:
+        assert memory.room() == memory.gpu().memory > 1 << 28
+        assert memory.gpu().name and resident_warps() >= memory.gpu().multiprocessors > 0

@@ -48,12 +48,16 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
-    use_variant(args.variant)
+    variant = use_variant(args.variant)
     from lingo_mi.studies.benchmarks.integrator import TREE, Bench, Work, describe_times, describe_tree
+    from lingo_mi.studies.cuda.model import beside
 
     bench = Bench(Work(args.gaussians, args.size, args.pixels, args.extent, args.repeats))
     result = bench.times() | dict.fromkeys(TREE)
     print(describe_times(result, args.repeats))
+    if variant.startswith('cuda'):
+        for part, name in (('image', 'forward'), ('derivatives', 'backward')):
+            print(beside(name, part, result[f'{name}_ms'] / 1e3, args.gaussians, result['pairs']))
     if args.bvh:
         result |= bench.against_tree()
         print(describe_tree(result))

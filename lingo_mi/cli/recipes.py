@@ -46,6 +46,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
+    from lingo_mi.studies.cuda.model import beside
     from lingo_mi.studies.provenance import write_provenance
     from lingo_mi.studies.recipes import Comparison, draw, table
 
@@ -53,6 +54,9 @@ def main() -> None:
     results = comparison.results(args.scenes, args.methods)
     text = table(results)
     print(text)
+    for (scene, method), metrics in results.items():
+        if str(metrics.get('variant')).startswith('cuda'):
+            print(beside(f'{scene}, {method}, a step', 'step', metrics['ms_per_iteration'] / 1e3, metrics['gaussians']))
     path = args.out / 'recipes.md'
     path.write_text(text + '\n', encoding='utf-8')
     write_provenance(path)

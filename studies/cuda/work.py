@@ -1,0 +1,111 @@
+"""What is counted, run under a stand-in for the CUDA driver: `python -m lingo_mi.studies.cuda.work CLOUD PART`.
+
+CLOUD is the checkpoint of a fit, or `giants`: 300 random Gaussians that fill the image. PART is
+
+    image         project it into one view of its scan
+    derivatives   that, and backpropagate an image of random derivatives
+    steps N       N steps of its fit on that view: the gain from N to N + 1 is one step
+
+It prints a line of JSON: the Gaussians, the image's pixels, and the pairs of a Gaussian and a pixel, inside the cut-off (`pairs`)
+and inside the footprint's box (`boxes`).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.step import Stepper
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.cutoff import FIT
+from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.view import View
+from lingo_mi.runtime import use_variant
+from lingo_mi.scan import Scan
+from lingo_mi.studies.pairs import count_pairs
+
+VIEW = 3
+
+
+def giants() -> tuple[list[np.ndarray], Geometry]:
+    """Random Gaussians with standard deviations of about 15 mm, and a scan of 512 x 512 pixels of 1 mm."""
+    rng, count = np.random.default_rng(0), 300
+    cloud = [
+        rng.uniform(-60, 60, (count, 3)),
+        15 * np.exp(rng.normal(0, 0.4, (count, 3))),
+        rng.normal(size=(count, 4)),
+        rng.uniform(0.01, 0.02, count),
+    ]
+    return cloud, Geometry.cone(
+        DSO=1000, DSD=1500, nDetector=512, dDetector=1, nVoxel=256, dVoxel=1, angles=circular(50)
+    )
+
+
+def main() -> None:
+    name, part, *count = sys.argv[1:]
+    use_variant('cuda_ad_mono')
+    if part == 'steps':
+        found = steps(Fitted.from_checkpoint(name), int(count[0]))
+    elif name == 'giants':
+        found = image(*giants(), derivatives=part == 'derivatives')
+    else:
+        fitted = Fitted.from_checkpoint(name)
+        found = image(fitted.world_gaussians(), fitted.geometry, derivatives=part == 'derivatives')
+    print(json.dumps(found))
+
+
+def image(cloud: Any, geometry: Geometry, derivatives: bool) -> dict:
+    """Project a cloud into one view, and backpropagate."""
+    *vectors, density = (np.float32(x) for x in cloud)
+    types = mi.Point3f, mi.Vector3f, mi.Vector4f
+    gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
+    view = View.of(geometry.rays(), VIEW, *geometry.nDetector, panel=False)
+    if derivatives:
+        dr.enable_grad(gaussians)
+    found = line_integrals(*gaussians, view=view, options=RenderOptions(FIT))
+    dr.eval(found)
+    if derivatives:
+        upstream = np.random.default_rng(1).normal(size=geometry.nDetector).astype(np.float32)
+        dr.set_grad(found, uploaded(upstream.ravel()))
+        dr.enqueue(dr.ADMode.Backward, found)
+        dr.traverse(dr.ADMode.Backward)
+        dr.eval([dr.grad(x) for x in gaussians])
+    dr.sync_thread()
+    return _sizes(gaussians, view)
+
+
+def steps(fitted: Fitted, count: int) -> dict:
+    """Late steps of a fit, on one view with random pixels: what is counted does not depend on them."""
+    geometry, rng = fitted.geometry.subset([VIEW]), np.random.default_rng(0)
+    scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)))
+    stepper, state = Stepper(scan, fitted.settings), DeviceState(fitted.state)
+    for i in range(count):
+        stepper.step(state, [0], fitted.settings.iterations - 1 - count + i, rng)
+    dr.sync_thread()
+    return _sizes(state.gaussians(fitted.settings), stepper.targets[0].view)
+
+
+def _sizes(gaussians, view):
+    gaussians = [dr.detach(x) for x in gaussians]
+    area = dr.sum(dr.float64_array_t(mi.Float)(project(*gaussians, view=view, extent=FIT).area))
+    return dict(
+        gaussians=dr.width(gaussians[-1]),
+        pixels=view.width * view.height,
+        pairs=int(area[0]),
+        boxes=int(count_pairs(gaussians, view, FIT)),
+    )
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,157 @@
+"""What is checked and counted of CUDA without a GPU: assembling, counting, the model, the page and the command."""
+
+from collections import Counter
+from importlib import resources
+
+import pytest
+
+from helpers.script import FIT, run
+from lingo_mi.errors import InputError
+from lingo_mi.gpu import GPU
+from lingo_mi.studies.cuda import assemble, model, report
+from lingo_mi.studies.cuda.assemble import Kernel, assemble_all, find_ptxas
+from lingo_mi.studies.cuda.count import KINDS, _counts, difference
+from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
+from lingo_mi.studies.cuda.page import page
+from lingo_mi.studies.cuda.suite import SHARE, Outcome, test_files
+
+CHECK = FIT.with_name('cuda_check.py')
+TESTS = FIT.parents[1] / 'tests'
+MODULE = """
+.version 7.0
+.target sm_75
+.address_size 64
+.visible .entry twice(.param .u64 x) {
+    .reg .b64 %rd<2>; .reg .f32 %f<3>;
+    ld.param.u64 %rd0, [x];
+    ld.global.f32 %f0, [%rd0];
+    add.f32 %f1, %f0, %f0;
+    st.global.f32 [%rd0], %f1;
+    ret;
+}
+"""
+
+
+def kernel(launches=1, atomics=0, loads=0, **warp):
+    return dict(launches=launches, warp=dict.fromkeys(KINDS, 0) | warp, lanes=0, loads=loads, stores=0, atomics=atomics)
+
+
+# ---- assembling ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ptxas():
+    try:
+        return find_ptxas()
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+def test_kernels_are_assembled(ptxas, tmp_path):
+    (tmp_path / 'good.ptx').write_text(MODULE)
+    (tmp_path / 'bad.ptx').write_text(MODULE.replace('add.f32', 'ad.f32').replace('twice', 'broken'))
+    (tmp_path / 'newer.ptx').write_text(MODULE.replace('sm_75', 'sm_90').replace('twice', 'newer'))
+    found = {(k.name, k.sm): k for k in assemble_all(tmp_path, [75, 90])}
+    assert set(found) == {('twice', 75), ('twice', 90), ('broken', 75), ('broken', 90), ('newer', 90)}
+    good, bad = found['twice', 75], found['broken', 75]
+    assert good.error is None and 0 < good.registers < 32 and good.spilled == 0 and good.lines == 5
+    assert 'ad' in bad.error
+
+
+def test_no_assembler(monkeypatch):
+    monkeypatch.setattr(assemble.sys, 'path', [])
+    monkeypatch.setenv('PATH', '')
+    with pytest.raises(InputError, match='pip install nvidia-cuda-nvcc'):
+        find_ptxas()
+
+
+# ---- counting --------------------------------------------------------------------------------------------------------
+
+
+def test_counts_of_a_profile():
+    """Instructions of warps are a block's times the warps that ran it; moves are left out."""
+    blocks = [dict(warps=10, lanes=200, fp32=3, move=7), dict(warps=2, lanes=64, atomic=1)]
+    accesses = [dict(kind='a', sectors=5), dict(kind='l', sectors=7), dict(kind='l', sectors=1)]
+    found = _counts(dict(launches=2, threads=64, blocks=blocks, accesses=accesses))
+    assert found['warp']['fp32'] == 30 and found['warp']['atomic'] == 2 and sum(found['warp'].values()) == 32
+    assert found['lanes'] == 3 * 200 + 64 and (found['loads'], found['stores'], found['atomics']) == (8, 0, 5)
+
+
+def test_difference_of_counts():
+    more, less = dict(a=kernel(3, fp32=9), b=kernel(1), c=kernel(2, int=4)), dict(a=kernel(1, fp32=2), b=kernel(1))
+    found = difference(more, less)
+    assert set(found) == {'a', 'c'} and found['a']['launches'] == 2 and found['a']['warp']['fp32'] == 7
+
+
+# ---- the model -------------------------------------------------------------------------------------------------------
+
+
+def test_times_of_a_kernel():
+    """By hand: 64 multiprocessors at 1 GHz, 100 GB/s, lanes of an A100."""
+    card = Card('a card', 64, 1e9, 100e9, 80)
+    found = times(kernel(fp32=64_000_000, fp64=1_000_000, atomics=47_360_000, loads=3_125_000), card)
+    assert found['fp32'] == pytest.approx(64e6 * 32 / (64 * 64e9))
+    assert found['issue'] == pytest.approx(65e6 / (4 * 64e9)) and found['fp64'] == pytest.approx(32e6 / (32 * 64e9))
+    assert found['atomics'] == pytest.approx(1e-3) and found['memory'] == pytest.approx(1e-3)
+    assert seconds(kernel(launches=7), card) == pytest.approx(7 * model.LAUNCH)
+
+
+def test_consumer_cards_take_longer_for_float64():
+    work = kernel(fp64=1_000_000)
+    slow, a100, h100 = (times(work, card)['fp64'] for card in CARDS)
+    assert slow > 8 * a100 and a100 > h100
+
+
+def test_predictions():
+    """More Gaussians and pairs take more time; the kept counts are complete."""
+    found = counts()
+    assert set(found) == {'foot', 'chest', 'giants'}
+    for name, parts in found.items():
+        assert parts['gaussians'] > 0 and parts['boxes'] >= parts['pairs'] > 0
+        assert largest(parts['image'])['atomics'] > 0 and ('step' in parts) == (name != 'giants')
+    foot = found['foot']
+    for part in ('image', 'derivatives', 'step'):
+        usual = predicted(part, CARDS[0], foot['gaussians'], foot['boxes'])
+        assert usual == pytest.approx(sum(seconds(k, CARDS[0]) for k in foot[part]))
+        assert predicted(part, CARDS[0], foot['gaussians'], 2 * foot['boxes']) > usual
+        assert predicted(part, CARDS[0], 2 * foot['gaussians'], foot['boxes']) > usual
+
+
+def test_a_line_beside_a_measurement(monkeypatch):
+    card = GPU('a card', 8 << 30, 64, 48, 86, 1e9, 100e9)
+    monkeypatch.setattr(model, 'gpu', lambda: card)
+    assert 'forward: 2.00 ms; predicted for a card: ' in model.beside('forward', 'image', 2e-3, 1000, 1e6)
+    monkeypatch.setattr(model, 'gpu', lambda: GPU('a card', 8 << 30, 64, 48, 86, 0, 0))
+    assert 'no prediction' in model.beside('forward', 'image', 2e-3, 1000)
+
+
+def test_tables_of_the_document(tmp_path, monkeypatch):
+    document, before = tmp_path / 'gpu.md', tmp_path / 'before.json'
+    names = 'clouds', 'counted', 'predicted', 'kernels'
+    document.write_text('\n'.join(f'<!-- table {n} -->\n<!-- end {n} -->' for n in names))
+    before.write_text((resources.files('lingo_mi.studies.cuda') / 'counts.json').read_text())
+    monkeypatch.setattr('sys.argv', ['report', str(document), '--before', str(before)])
+    report.main()
+    text = document.read_text()
+    assert '| foot, image |' in text and 'RTX 3090' in text and text.count('\n') > 30
+
+
+# ---- the page and the command ----------------------------------------------------------------------------------------
+
+
+def test_page():
+    outcomes = {'sm_80': Outcome(5, ['test_a.py: test_b'], Counter({'no OptiX': 2}))}
+    text = page(outcomes, [Kernel('drjit_0123456789abcdef', 80, 99, 200, 16), Kernel('drjit_f', 80, 9, error='why')])
+    assert '| sm_80 | 5 | 2 | 1 |' in text and '| no OptiX | 2 |' in text and '- sm_80: test_a.py: test_b' in text
+    assert '| sm_80 | 2 | 200 | 200 | 1 | 1 | 1 |' in text and '`0123456789ab`' in text and 'sm_80: why' in text
+
+
+def test_the_share_is_of_tests_that_exist():
+    files = {str(p.relative_to(TESTS)) for p in test_files(TESTS)}
+    assert set(SHARE) < files and 'test_examples.py' not in files
+
+
+@pytest.mark.parametrize('args', [(), ('--stand-in', 'no-such-program'), ('--stand-in', 'true', '--tests', 'nowhere')])
+def test_bad_input(args):
+    code, out, err = run(CHECK, *args)
+    assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not out
