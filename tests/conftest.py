@@ -7,7 +7,6 @@ import pytest
 
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
 
-
 VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
 
 

@@ -18,6 +18,7 @@ from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry import Geometry
+from lingo_mi.metrics import current_names
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import Measured, measure
@@ -121,8 +122,8 @@ class Result:
 
         data   what to compare with (default: what was given to `lm.fit`; of a loaded result, the numbers as saved)
 
-        The full scale of `psnr_3d` and `ssim_3d` is a density of 1, as in R2-Gaussian. That of `psnr_3d_absolute` and
-        `ssim_3d_absolute` is the largest true density: take these for densities per mm of real objects.
+        The full scale of `psnr_2d`, `ssim_2d`, `psnr_3d` and `ssim_3d` is the largest true value. Those that end in `_r2` are
+        R2-Gaussian's, as published tables have them: views divided by their own maxima, and 1 for densities.
         """
         if data is not None:
             numbers = measure(self.fitted, data.test, data.volume).numbers
@@ -173,7 +174,7 @@ def load_result(path: str | PathLike) -> Result:
     stored = None
     if path.is_dir() and numbers.exists():
         try:
-            stored = json.loads(numbers.read_text(encoding='utf-8'))
+            stored = current_names(json.loads(numbers.read_text(encoding='utf-8')))
         except ValueError:
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
     return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)
