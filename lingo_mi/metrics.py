@@ -128,6 +128,15 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
 
 
+def compared(volume: ArrayLike, truth: ArrayLike) -> dict[str, float | None]:
+    """PSNR and SSIM of a volume [x, y, z], each in both forms, by name; None where the value is not finite.
+
+    compared(found.volume, truth)['psnr_3d']
+    """
+    values = {f.__name__: f(volume, truth) for f in (psnr_3d, ssim_3d, psnr_3d_r2, ssim_3d_r2)}
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+
 def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.ndarray:
     """SSIM of two images [rows, columns], or volumes, at every pixel, for values with full scale 1.
 

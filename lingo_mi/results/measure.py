@@ -70,7 +70,10 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         ssim_2d=of(metrics.ssim_2d, rendered, expected),
         psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
         ssim_2d_r2=of(metrics.ssim_2d_r2, rendered, expected),
-        **compared(volume, truth),
+        psnr_3d=of(metrics.psnr_3d, volume, truth),
+        ssim_3d=of(metrics.ssim_3d, volume, truth),
+        psnr_3d_r2=of(metrics.psnr_3d_r2, volume, truth),
+        ssim_3d_r2=of(metrics.ssim_3d_r2, volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
@@ -82,14 +85,6 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         history=fitted.history,
     )
     return Measured(numbers, volume, truth, test, views)
-
-
-def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:
-    """PSNR and SSIM of a volume, each in both forms; None if there is nothing to compare or the value is not finite."""
-    names = 'psnr_3d', 'ssim_3d', 'psnr_3d_r2', 'ssim_3d_r2'
-    if volume is None or truth is None:
-        return dict.fromkeys(names)
-    return {name: _number(getattr(metrics, name)(volume, truth)) for name in names}
 
 
 def summary(result: dict) -> str:
@@ -106,7 +101,7 @@ def summary(result: dict) -> str:
 
 
 def volume_quality(result: dict) -> str:
-    """A volume's numbers (`compared`) as lines: first for densities in any unit, then R2-Gaussian's, for densities up to 1."""
+    """A volume's numbers as lines: first for densities in any unit, then R2-Gaussian's, for densities up to 1."""
     return (
         f'volume          {_shown(result, "psnr_3d", "ssim_3d")} (full scale: the largest true density)\n'
         f'                {_shown(result, "psnr_3d_r2", "ssim_3d_r2")} (full scale: 1, as in R2-Gaussian)'

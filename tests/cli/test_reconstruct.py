@@ -20,11 +20,11 @@ from lingo_mi.files.ply import write_ply
 from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry.base import CircularGeometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d, psnr_3d_r2
+from lingo_mi.metrics import compared, psnr_3d, psnr_3d_r2
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART
 from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
-from lingo_mi.results.measure import compared, volume_quality
+from lingo_mi.results.measure import volume_quality
 from lingo_mi.results.scene_file import write_scene
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.load import load_scene
