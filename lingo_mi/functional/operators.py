@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
 from lingo_mi.functional.frameworks import call
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import cutoff
@@ -69,7 +69,7 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
     `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
-    _require_geometry(geometry)
+    require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
     rays = geometry.rays()
     index = _indices(views, len(rays))
@@ -94,7 +94,7 @@ def voxelize(
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
-    _require_geometry(geometry)
+    require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
@@ -118,11 +118,6 @@ def _checked(function, name: str):
         return function(*gaussians)
 
     return wrapped
-
-
-def _require_geometry(geometry):
-    if not isinstance(geometry, Geometry):
-        raise InputError(f'geometry must be a Geometry, not {type(geometry).__name__}; of a scan give scan.geometry')
 
 
 def _extent(extent) -> float:

@@ -191,3 +191,11 @@ def test_documentation(name):
     assert found[0].examples and runner.run(found[0]).failed == 0
     words = algorithm.__doc__.replace(',', ' ').split()
     assert all(option in words for option in algorithm().options)
+
+
+@pytest.mark.parametrize('name', [name for name in ALGORITHMS if name != 'refined'])
+def test_projections_spoilt_after_the_scan_was_made(scan, name):
+    spoilt = replace(scan, projections=scan.projections.copy())
+    spoilt.projections[3, 0, 0] = np.nan
+    with pytest.raises(InputError, match='first in view 3'):
+        reconstruct(spoilt, quick(name))
