@@ -58,8 +58,8 @@ def project(
 
     The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
     Differentiable once in all four, not in the geometry: in reverse mode, in Dr.Jit also in forward mode. A result that is to
-    be differentiated holds about 100 bytes for each Gaussian in each view until it is, so a step of a fit had better
-    project some views than all.
+    be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
+    project a few views, not all.
 
         images = project(means, scales, quaternions, density, geometry, views=[0, 7])
         loss = ((images - measured) ** 2).mean()
