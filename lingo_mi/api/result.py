@@ -185,6 +185,6 @@ def load_result(path: str | PathLike) -> Result:
     if path.is_dir() and numbers.exists():
         try:
             stored = current_names(json.loads(numbers.read_text(encoding='utf-8')))
-        except ValueError:
+        except (ValueError, AttributeError):  # no JSON, or no dictionary
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
     return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)

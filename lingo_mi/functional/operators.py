@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterable
+from numbers import Real
 from typing import Any
 
 import drjit as dr
@@ -121,7 +122,7 @@ def _checked(function, name: str):
 
 
 def _extent(extent) -> float:
-    if not 1 <= extent <= 20:
+    if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
         raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
     return float(extent)
 

@@ -150,6 +150,7 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.Scan(g, np.ones((10, 24, 30))).subset([99]), 'from 0 to 9, not by'),
         (lambda g: g.subset([-11]), 'from 0 to 9, not by'),
         (lambda g: lm.project(*np.ones((4, 3)), {}), 'geometry must be a Geometry, not dict'),
+        (lambda g: lm.project(*np.ones((4, 3)), g, extent='3'), 'extent is in standard deviations, from 1 to 20'),
     ],
 )
 def test_bad_input_is_one_line(geometry, call, message):
@@ -245,6 +246,10 @@ def test_save_and_load(result, data, tmp_path):
     assert again.metrics()['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'])
     assert again.metrics(data)['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'], abs=1e-4)
     assert len(lm.load_result(folder / 'checkpoint.npz')) == len(result)
+    for damaged in '[]', '{':
+        (folder / 'metrics.json').write_text(damaged)
+        with pytest.raises(lm.InputError, match='metrics.json: is damaged'):
+            lm.load_result(folder)
 
 
 def test_checkpoint_and_resume(data, tmp_path):

@@ -77,6 +77,10 @@ def test_options_are_fields(scan):
     [
         ('fdk', dict(filter='box'), "filter 'box' is unknown: use one of ram-lak, shepp-logan, cosine, hamming, hann"),
         ('sart', dict(niter=0), 'niter must be an integer from 1 on, not 0'),
+        ('sart', dict(niter='3'), "niter must be an integer from 1 on, not '3'"),
+        ('sart', dict(niter=True), 'niter must be an integer from 1 on, not True'),
+        ('sart', dict(lmbda=None), 'lmbda must be above 0 and at most 2, not None'),
+        ('sart', dict(tol='0'), "tol must be from 0 to 1e+18, not '0'"),
         ('sart', dict(lmbda=2.5), 'lmbda must be above 0 and at most 2, not 2.5'),
         ('sart', dict(lmbda_red=0), 'lmbda_red must be above 0 and at most 1, not 0'),
         (
