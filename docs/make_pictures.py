@@ -14,7 +14,7 @@ from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics import psnr_3d_r2
 
 matplotlib.use('agg')
 import matplotlib.pyplot as plt
@@ -82,7 +82,7 @@ def two_stages(data, result):
     figure, panels = plt.subplots(2, len(volumes), figsize=(13, 5.7))
     top = data.volume.max()
     for (name, volume), (above, below) in zip(volumes.items(), panels.T):
-        quality = '' if name == 'truth' else f'\n{psnr_3d(volume, data.volume):.1f} dB'
+        quality = '' if name == 'truth' else f'\n{psnr_3d_r2(volume, data.volume):.1f} dB'
         above.imshow(sagittal(volume), cmap='gray', vmin=0, vmax=top)
         above.set_title(name + quality, fontsize=10.5)
         if name == 'truth':

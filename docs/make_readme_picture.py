@@ -18,6 +18,7 @@ import numpy as np
 
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.metrics import current_names
 
 matplotlib.use('agg')
 import matplotlib.pyplot as plt
@@ -59,7 +60,7 @@ def main():
     out = arguments().out
     volume = Path(os.environ['LINGO_MI_DATA']) / VOLUME
     fit(volume, out)
-    metrics = json.loads((out / 'metrics.json').read_text(encoding='utf-8'))
+    metrics = current_names(json.loads((out / 'metrics.json').read_text(encoding='utf-8')))
     truth, found = read_volume(volume).data, read_volume(out / 'volume.nii.gz').data
     height = round(SLICE * truth.shape[2])
     inside = slice(14, -14), slice(40, -28)  # the body
@@ -69,7 +70,7 @@ def main():
 
     panels = [
         ('truth', true_slice, 'gray', WINDOW),
-        (f'fit of 25 views: {metrics["psnr_3d"]:.1f} dB', fitted, 'gray', WINDOW),
+        (f'fit of 25 views: {metrics["psnr_3d_r2"]:.1f} dB', fitted, 'gray', WINDOW),
         ('error, ± 10 % of the scale', fitted - true_slice, 'RdBu_r', (-0.1, 0.1)),
         ('a view held out', true_view, 'gray', (0, true_view.max())),
         (f'rendered: {metrics["psnr_2d"]:.1f} dB', view, 'gray', (0, true_view.max())),

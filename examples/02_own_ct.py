@@ -36,7 +36,7 @@ data = lm.simulate(volume, geometry, held_out=between)
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 fitted = result.volume()
 numbers = result.metrics()
-print(f'PSNR of held-out views {numbers["psnr_2d"]:.1f} dB, of the volume {numbers["psnr_3d_absolute"]:.1f} dB')
+print(f'PSNR of held-out views {numbers["psnr_2d"]:.1f} dB, of the volume {numbers["psnr_3d"]:.1f} dB')
 
 # %%
 # Coronal slices of both. Ribs and vessels of a voxel's width are more than 20 views tell.

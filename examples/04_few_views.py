@@ -9,11 +9,13 @@ and `Refined` mends it where it is wrong.
 # %%
 # Ten views of a foot, and a cloud fitted to them.
 
+import tempfile
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 import numpy as np
 
 import lingo_mi as lm
-from lingo_mi.metrics import psnr_3d
 
 foot = lm.phantom('foot', size=64)
 geometry = lm.Geometry.cone(
@@ -35,16 +37,23 @@ volumes = {
     'FDK': lm.reconstruct(data.train, lm.FDK()),
     'SART': lm.reconstruct(data.train, lm.SART(niter=20)),
     'ASD-POCS': lm.reconstruct(data.train, lm.ASDPOCS(niter=20)),
-    'cloud': result.volume(),
+    'cloud': result,
     'refined': lm.reconstruct(data.train, lm.Refined(niter=10, completed_niter=0), start=result),
 }
-volumes = {'truth': foot.data, **{name: np.asarray(volume) for name, volume in volumes.items()}}
 
 fig, axes = plt.subplots(2, 3, figsize=(9, 6.6), layout='constrained')
-for axis, (name, volume) in zip(axes.flat, volumes.items()):
+shown = {'truth': foot.data}
+for name, found in volumes.items():
+    numbers = found.metrics() if found is result else found.metrics(foot.data)
+    shown[f'{name}, {numbers["psnr_3d"]:.1f} dB'] = np.asarray(found)
+for axis, (title, volume) in zip(axes.flat, shown.items()):
     axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
-    quality = '' if name == 'truth' else f', {psnr_3d(volume, foot.data):.1f} dB'
-    axis.set(title=name + quality, xticks=[], yticks=[])
+    axis.set(title=title, xticks=[], yticks=[])
+
+# %%
+# A reconstruction is saved as NIfTI, with its voxel size and position.
+
+print(volumes['refined'].save(Path(tempfile.mkdtemp()) / 'refined.nii.gz').name)
 
 # %%
 # FDK has streaks. On these clean projections 20 passes of SART or ASD-POCS are about as good as the cloud, and what starts from

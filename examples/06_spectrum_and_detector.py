@@ -3,7 +3,7 @@ Beam hardening and a real detector
 ==================================
 
 A scene with an `xray_tube` or a `ct_detector` is scanned as a real scanner would see it. The fit models what the scene names:
-here a spectrum of 120 kV, whose soft photons are lost first. It needs ``pip install 'lingo_mi[physics]'``.
+here a spectrum of 120 kV, whose soft photons are lost first. It needs ``pip install '.[physics]'`` in a checkout.
 """
 
 # %%

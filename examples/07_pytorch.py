@@ -3,7 +3,7 @@ In a PyTorch training loop
 ==========================
 
 `lm.project` is differentiable for PyTorch tensors: the exact X-ray counterpart of a Gaussian rasteriser, without a CUDA
-toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else. It needs ``pip install 'lingo_mi[torch]'``.
+toolkit. This example fits a cloud with `torch.optim.Adam` and nothing else. It needs ``pip install '.[torch]'`` in a checkout.
 """
 
 # %%

@@ -34,6 +34,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
     'load',
     'phantom',
     'Geometry',
+    'circular',
     'Scan',
     'Dataset',
     'fit',
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
     from lingo_mi.errors import InputError
     from lingo_mi.fitting.settings import Settings
     from lingo_mi.functional import project, voxelize
-    from lingo_mi.geometry import Geometry
+    from lingo_mi.geometry import Geometry, circular
     from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Reconstruction, Refined
     from lingo_mi.runtime import use_variant
     from lingo_mi.scan import Dataset, Scan
@@ -75,6 +76,7 @@ _PUBLIC = {
     'load': 'lingo_mi.api.data',
     'phantom': 'lingo_mi.api.data',
     'Geometry': 'lingo_mi.geometry',
+    'circular': 'lingo_mi.geometry',
     'Scan': 'lingo_mi.scan',
     'Dataset': 'lingo_mi.scan',
     'fit': 'lingo_mi.api.fitting',

@@ -19,14 +19,17 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
     name     what they are, for messages
     dtype    of the result; default: their own
 
-    Raises InputError where they are no array, or one that NumPy cannot reach, such as a PyTorch tensor on a GPU.
+    Raises InputError where they are no array of real numbers, or one that NumPy cannot reach, such as a PyTorch tensor on a GPU.
 
         as_numpy(torch.zeros(3), 'the projections', np.float32)
     """
     try:
         if hasattr(values, '__dlpack__') and not hasattr(values, '__array__'):
             values = np.from_dlpack(values)
-        return np.asarray(values, dtype)
+        array = np.asarray(values)
+        if array.dtype.kind in 'cSUOMm':  # NumPy would take text for numbers, and drop imaginary parts
+            raise TypeError(f'its values are {array.dtype}, not real numbers')
+        return np.asarray(array, dtype)
     except (TypeError, ValueError, RuntimeError, BufferError) as error:
         why = ' '.join(str(error).split()).rstrip('.')
         raise InputError(f'{name} cannot be read as an array ({why}); give a NumPy array') from None

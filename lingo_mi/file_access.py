@@ -81,6 +81,46 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
         yield temporary
 
 
+@contextmanager
+def writing(path: PathLike | str) -> Iterator[None]:
+    """Turns what the file system says about `path` while files are written there into an InputError."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f'{error.filename or path}: cannot be written ({error.strerror or one_line(error)}); choose another place'
+        ) from None
+
+
+def require_writable(folder: Path, path: Path, mend: str = 'choose another place') -> None:
+    """Raises InputError, in the name of `path`, unless `folder` can be made and written to. Leaves nothing behind.
+
+    mend   what to do, for the message
+    """
+    made = []
+    try:
+        for part in (*reversed(folder.parents), folder):
+            if not part.exists():
+                part.mkdir()
+                made.append(part)
+        probe = folder / '.writable'
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f'{path}: cannot write there ({error.strerror}); {mend}') from None
+    finally:
+        for part in reversed(made):
+            part.rmdir()
+
+
+def as_path(name: str, value: Any) -> Path:
+    """`value` as a path. Raises InputError, in the name of `name`, where it is none."""
+    try:
+        return Path(value)
+    except TypeError:
+        raise InputError(f'{name} must be a path, not {type(value).__name__}') from None
+
+
 def optional(module: str) -> Any:
     """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
     import importlib
@@ -88,4 +128,6 @@ def optional(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise InputError(f"this format needs the package {module}: pip install 'lingo_mi[formats]'") from None
+        raise InputError(
+            f"this format needs the package {module}: pip install '.[formats]' in a checkout of lingo_mi"
+        ) from None

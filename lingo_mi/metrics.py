@@ -1,19 +1,21 @@
 """Image quality in 2D (projections) and 3D (volumes). Pure NumPy and SciPy, float64 throughout.
 
-Two families stand side by side:
+Each measure comes in two forms. The plain name is the absolute one, and `_r2` is R2-Gaussian's:
 
-    psnr_2d_r2, ssim_2d         R2-Gaussian's form: every view of either stack is divided by its own maximum,
-                                so a wrong gain costs nothing. Published tables hold these.
-    psnr_2d, ssim_2d_absolute   the same with one peak for all: a wrong gain counts as the error it is.
-    psnr_3d, ssim_3d            R2-Gaussian's form: peak 1, nothing rescaled or clipped, SSIM slice by slice.
-    psnr_3d_absolute,           with the truth's own full scale, whatever the unit of density, and a window for SSIM that
-    ssim_3d_absolute            is as thick as it is wide.
+    psnr_2d, ssim_2d         line integrals as they are, one full scale for all views: the largest true value. A wrong
+                             gain counts as the error it is.
+    psnr_3d, ssim_3d         full scale is the largest true density, in whatever unit; the window of SSIM is as thick
+                             as it is wide.
+    psnr_2d_r2, ssim_2d_r2   every view of either stack is divided by its own maximum, so a wrong gain costs nothing.
+    psnr_3d_r2, ssim_3d_r2   full scale 1, nothing rescaled or clipped, SSIM slice by slice.
+
+Published tables hold R2-Gaussian's forms.
 
 Every function takes the result first and the truth second, raises InputError where the shapes differ or a
 value is not finite, and returns a float: inf dB for identical images, NaN where the truth holds nothing to
 compare with.
 
-References: Zha et al., "R2-Gaussian", NeurIPS 2024 (the forms above); Wang et al., "Image quality assessment:
+References: Zha et al., "R2-Gaussian", NeurIPS 2024 (its forms); Wang et al., "Image quality assessment:
 from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 """
 
@@ -53,7 +55,7 @@ def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     return _mean(_psnr(a, b, peak) for a, b in zip(images, truth)) if peak > 0 else np.nan
 
 
-def ssim_2d(images: ArrayLike, truth: ArrayLike) -> float:
+def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     """SSIM as R2-Gaussian reports it: each view divided by its own maximum, mean over the views.
 
     images, truth : [view, v, u]. Views whose truth has no positive pixel are left out.
@@ -62,7 +64,7 @@ def ssim_2d(images: ArrayLike, truth: ArrayLike) -> float:
     return _mean(ssim_map(a, b).mean() for a, b in _own_maximum(images, truth))
 
 
-def ssim_2d_absolute(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
+def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of line integrals with one full scale for both stacks, mean over the views.
 
     images, truth : [view, v, u]
@@ -73,7 +75,7 @@ def ssim_2d_absolute(images: ArrayLike, truth: ArrayLike, peak: float | None = N
     return _mean(ssim_map(a / peak, b / peak).mean() for a, b in zip(images, truth)) if peak > 0 else np.nan
 
 
-def psnr_3d(volume: ArrayLike, truth: ArrayLike) -> float:
+def psnr_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
     """PSNR in dB with peak 1, neither volume rescaled or clipped.
 
     volume, truth : [x, y, z]. The number means what it says where the truth's densities fill [0, 1].
@@ -81,7 +83,7 @@ def psnr_3d(volume: ArrayLike, truth: ArrayLike) -> float:
     return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.0)
 
 
-def ssim_3d(volume: ArrayLike, truth: ArrayLike) -> float:
+def ssim_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
     """SSIM of all slices with full scale 1: mean over the slices of an axis, then over the three axes.
 
     volume, truth : [x, y, z]. Slices whose truth has no positive voxel are left out. So is an axis whose
@@ -103,7 +105,7 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike) -> float:
     return _mean(means)
 
 
-def psnr_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
+def psnr_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """PSNR in dB of densities in any unit.
 
     volume, truth : [x, y, z]
@@ -114,7 +116,7 @@ def psnr_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = N
     return _psnr(volume, truth, peak) if peak > 0 else np.nan
 
 
-def ssim_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
+def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of densities in any unit, with a window of 11 x 11 x 11 voxels, mean over all of them.
 
     volume, truth : [x, y, z]; along an axis of one voxel there is no window
@@ -124,6 +126,15 @@ def ssim_3d_absolute(volume: ArrayLike, truth: ArrayLike, peak: float | None = N
     peak = _peak(truth, peak)
     axes = [axis for axis in range(3) if truth.shape[axis] > 1]
     return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
+
+
+def compared(volume: ArrayLike, truth: ArrayLike) -> dict[str, float | None]:
+    """PSNR and SSIM of a volume [x, y, z], each in both forms, by name; None where the value is not finite.
+
+    compared(found.volume, truth)['psnr_3d']
+    """
+    values = {f.__name__: f(volume, truth) for f in (psnr_3d, ssim_3d, psnr_3d_r2, ssim_3d_r2)}
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
 
 
 def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.ndarray:
@@ -142,6 +153,21 @@ def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.n
     mab, mm = ma * mb, ma * ma + mb * mb
     # The two variances enter as a sum only, which saves one of five blurs.
     return (2 * mab + C1) * (2 * (blur(a * b) - mab) + C2) / ((mm + C1) * (blur(a * a + b * b) - mm + C2))
+
+
+def current_names(numbers: dict) -> dict:
+    """Stored numbers, or an entry of a fit's history, with today's names.
+
+    Before, `psnr_3d`, `ssim_3d` and `ssim_2d` were R2-Gaussian's forms, and the others were called `psnr_3d_absolute` and so on.
+    Numbers with today's names come back as they are.
+
+        current_names(dict(psnr_3d=30.0, psnr_3d_absolute=28.0))   # psnr_3d_r2=30.0, psnr_3d=28.0
+    """
+    new = {}
+    for name in 'psnr_3d', 'ssim_3d', 'ssim_2d':
+        if f'{name}_r2' not in numbers:
+            new |= {name: f'{name}_r2', f'{name}_absolute': name}
+    return {new.get(name, name): value for name, value in numbers.items()}
 
 
 def _pair(a, b, what, axes):

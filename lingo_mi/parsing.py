@@ -1,8 +1,15 @@
-"""Values of settings and parameters from the text of a command line."""
+"""Values of settings and parameters: from the text of a command line, and from Python."""
 
 from __future__ import annotations
 
+import difflib
+import math
+import numbers
+import operator
+from collections.abc import Iterable
 from typing import Any
+
+import numpy as np
 
 from lingo_mi.errors import InputError
 
@@ -27,3 +34,55 @@ def parse(name: str, text: str, like: Any) -> Any:
             type(like)
         ]
         raise InputError(f'{name} must be {kind}, not {text!r}') from None
+
+
+def checked(name: str, value: Any, like: Any) -> Any:
+    """A value given in Python, after a check that it is of the kind of `like`: text, True or False, a whole number, a number, or
+    two numbers. NumPy's scalars and arrays become Python's.
+
+    Raises InputError, in the name of `name`.
+
+        checked('rate_centre', np.array([1e-3, 1e-4]), (1.0, 1.0))   # (0.001, 0.0001)
+    """
+    if isinstance(like, tuple):
+        pair = value.tolist() if isinstance(value, np.ndarray) else value
+        if not (isinstance(pair, list | tuple) and len(pair) == 2 and all(map(_is_number, pair))):
+            raise InputError(f'{name} takes two numbers, first and last, such as {like}, not {value!r}')
+        return tuple(map(_plain, pair))
+    if isinstance(like, bool):
+        good, kind = isinstance(value, bool | np.bool_), 'True or False'
+    elif isinstance(like, int):
+        good, kind = _is_number(value) and math.isfinite(value) and value == int(value), 'a whole number'
+        value = int(value) if good else value
+    elif isinstance(like, float):
+        good, kind = _is_number(value), 'a number'
+    else:
+        good, kind = isinstance(value, str), 'text'
+    if not good:
+        raise InputError(f'{name} must be {kind}, not {value!r}')
+    return _plain(value)
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """A whole number from `least` on. Raises InputError, in the name of `name`."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least or isinstance(value, bool):
+        raise InputError(f'{name} must be a whole number from {least} on, not {value!r}')
+    return number
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """', did you mean ...?' of the known name nearest to a misspelt one, for messages; empty where none is near."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f', did you mean {near[0]}?' if near else ''
+
+
+def _is_number(value):
+    return isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+
+
+def _plain(value):
+    return value.item() if isinstance(value, np.generic) else value

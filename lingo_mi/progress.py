@@ -14,7 +14,7 @@ from typing import Any
 LABELS = {
     'psnr': 'PSNR {:.2f} dB',
     'psnr_2d': 'PSNR {:.2f} dB',
-    'psnr_3d_absolute': '3D {:.2f} dB',
+    'psnr_3d': '3D {:.2f} dB',
     'gaussians': '{:,} Gaussians',
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal

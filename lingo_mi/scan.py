@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.arrays import as_numpy, short_repr
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.geometry.rays import Index
+from lingo_mi.geometry.rays import Index, checked_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,7 @@ class Scan:
     effects: Any = None  # `Effects` is in a package above this one
 
     def __post_init__(self):
+        require_type('geometry', self.geometry, Geometry, 'write Scan(geometry, projections)')
         p = as_numpy(self.projections, 'the projections', np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
         if p.shape != expected:
@@ -55,18 +56,15 @@ class Scan:
                 raise InputError('no pixel of the scan is valid')
             object.__setattr__(self, 'valid', None if valid.all() else valid)
             p = np.where(valid, p, np.float32(0))
-        if not np.isfinite(p).all():
-            view = int(np.argwhere(~np.isfinite(p))[0, 0])
-            raise InputError(
-                f'the projections contain NaN or infinity (first in view {view}): mask or repair those pixels first'
-            )
+        require_finite(p)
         object.__setattr__(self, 'projections', p)
 
     def __len__(self) -> int:
         return len(self.geometry)
 
     def subset(self, index: Index) -> Scan:
-        """The views `index` only: a slice, or integers [m]."""
+        """The views `index` only: a slice, or integers [m]. Raises InputError for views that the scan does not have."""
+        index = checked_views(index, len(self))
         return replace(
             self,
             geometry=self.geometry.subset(index),
@@ -95,6 +93,16 @@ class Scan:
         return self.projections * np.float32(self.geometry.scale)
 
 
+def require_finite(projections: np.ndarray) -> None:
+    """Raises InputError, which names the view, for projections [view, v, u] that are not finite."""
+    if not np.isfinite(projections).all():
+        view = int(np.argwhere(~np.isfinite(projections))[0, 0])
+        raise InputError(
+            f'the projections contain NaN or infinity (first in view {view}): repair those pixels, or leave them out '
+            'with lm.Scan(geometry, projections, valid=mask), where mask is numpy.isfinite(projections)'
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
@@ -111,5 +119,8 @@ class Dataset:
     __repr__ = short_repr
 
     def __post_init__(self):
+        require_type('train', self.train, Scan, 'write Dataset(Scan(geometry, projections))')
+        if self.test is not None:
+            require_type('test', self.test, Scan)
         if self.volume is not None:
             object.__setattr__(self, 'volume', as_numpy(self.volume, 'the volume'))

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.metrics import current_names
 
 Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
 
@@ -28,9 +29,9 @@ Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the f
 COLUMNS = dict(
     psnr_2d=('views, dB', '{:.2f}'),
     psnr_2d_r2=('views (R2), dB', '{:.2f}'),
-    ssim_2d=('SSIM', '{:.4f}'),
-    psnr_3d=('volume, dB', '{:.2f}'),
-    ssim_3d=('SSIM 3D', '{:.4f}'),
+    ssim_2d_r2=('SSIM', '{:.4f}'),
+    psnr_3d_r2=('volume, dB', '{:.2f}'),
+    ssim_3d_r2=('SSIM 3D', '{:.4f}'),
     ipsd=('IPSD', '{:.4f}'),
     ipsd_targets=('born', '{:,}'),
     gaussians=('Gaussians', '{:,}'),
@@ -77,7 +78,8 @@ class Comparison:
             print(' '.join(command), file=sys.stderr)
             if code := run_command(command):
                 raise InputError(f'{scene}: lingo-mi fit --method {method} failed with exit code {code}')
-        return json.loads((folder / 'metrics.json').read_text(encoding='utf-8'))
+        found = current_names(json.loads((folder / 'metrics.json').read_text(encoding='utf-8')))
+        return found | dict(history=[current_names(entry) for entry in found['history']])
 
     def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""
@@ -116,7 +118,7 @@ def draw(results: Results, figure: Path) -> None:
     fig = Figure(figsize=(5 * len(scenes), 7), layout='constrained')
     axes = fig.subplots(2, len(scenes), squeeze=False)
     for (scene, method), metrics in results.items():
-        for row, (key, what) in enumerate(dict(psnr_2d='held-out views', psnr_3d='volume').items()):
+        for row, (key, what) in enumerate(dict(psnr_2d='held-out views', psnr_3d_r2='volume').items()):
             axis = axes[row, scenes.index(scene)]
             points = [(e['seconds'], e[key]) for e in metrics['history'] if e.get(key) is not None]
             if not points:  # 3dgs and xgaussian make no volume

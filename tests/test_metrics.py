@@ -10,23 +10,23 @@ from lingo_mi.metrics import (
     psnr_2d,
     psnr_2d_r2,
     psnr_3d,
-    psnr_3d_absolute,
+    psnr_3d_r2,
     ssim_2d,
-    ssim_2d_absolute,
+    ssim_2d_r2,
     ssim_3d,
-    ssim_3d_absolute,
+    ssim_3d_r2,
     ssim_map,
 )
 
 BEST = {
     psnr_2d_r2: np.inf,
     psnr_2d: np.inf,
+    psnr_3d_r2: np.inf,
     psnr_3d: np.inf,
-    psnr_3d_absolute: np.inf,
+    ssim_2d_r2: 1.0,
     ssim_2d: 1.0,
-    ssim_2d_absolute: 1.0,
+    ssim_3d_r2: 1.0,
     ssim_3d: 1.0,
-    ssim_3d_absolute: 1.0,
 }
 ALL = list(BEST)
 
@@ -75,22 +75,22 @@ def test_2d_measures_against_scikit_image(pair):
     assert psnr_2d(a, b, peak=7.0) == pytest.approx(
         np.mean([peak_signal_noise_ratio(y, x, data_range=7.0) for x, y in zip(a, b)])
     )
-    assert ssim_2d(a, b) == pytest.approx(np.mean([ssim_map(x, y) for x, y in own]))
-    assert ssim_2d_absolute(a, b) == pytest.approx(np.mean([ssim_map(x / b.max(), y / b.max()) for x, y in zip(a, b)]))
+    assert ssim_2d_r2(a, b) == pytest.approx(np.mean([ssim_map(x, y) for x, y in own]))
+    assert ssim_2d(a, b) == pytest.approx(np.mean([ssim_map(x / b.max(), y / b.max()) for x, y in zip(a, b)]))
 
 
 def test_a_wrong_gain_shows_only_in_the_absolute_measures(pair):
     truth = pair[1]
-    assert psnr_2d_r2(truth * 1.25, truth) > 250 and ssim_2d(truth * 1.25, truth) == pytest.approx(1)
+    assert psnr_2d_r2(truth * 1.25, truth) > 250 and ssim_2d_r2(truth * 1.25, truth) == pytest.approx(1)
     expected = np.mean([10 * np.log10(truth.max() ** 2 / np.mean((0.25 * t) ** 2)) for t in truth])
     assert psnr_2d(truth * 1.25, truth) == pytest.approx(expected)
-    assert ssim_2d_absolute(truth * 1.25, truth) < 0.99
+    assert ssim_2d(truth * 1.25, truth) < 0.99
 
 
 def test_absolute_measures_do_not_depend_on_the_unit(pair):
     a, b = pair
     assert psnr_2d(a * 40, b * 40) == pytest.approx(psnr_2d(a, b))
-    assert ssim_2d_absolute(a * 40, b * 40) == pytest.approx(ssim_2d_absolute(a, b))
+    assert ssim_2d(a * 40, b * 40) == pytest.approx(ssim_2d(a, b))
 
 
 def test_3d_measures(pair):
@@ -98,37 +98,35 @@ def test_3d_measures(pair):
     truth = rng.random((13, 17, 15))
     volume = truth + rng.normal(0, 0.05, truth.shape)
     truth[4] = 0  # an empty slice does not count
-    assert psnr_3d(volume, truth) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=1.0))
+    assert psnr_3d_r2(volume, truth) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=1.0))
     x = np.mean([ssim_map(volume[i], truth[i]).mean() for i in range(13) if i != 4])
     y = np.mean([ssim_map(volume[:, i], truth[:, i]).mean() for i in range(17)])
     z = np.mean([ssim_map(volume[:, :, i], truth[:, :, i]).mean() for i in range(15)])
-    assert ssim_3d(volume, truth) == pytest.approx((x + y + z) / 3)
+    assert ssim_3d_r2(volume, truth) == pytest.approx((x + y + z) / 3)
     # The peak stays 1.
-    assert psnr_3d(2 * volume, 2 * truth) == pytest.approx(psnr_3d(volume, truth) - 20 * np.log10(2))
+    assert psnr_3d_r2(2 * volume, 2 * truth) == pytest.approx(psnr_3d_r2(volume, truth) - 20 * np.log10(2))
 
 
 def test_absolute_3d_measures_against_scikit_image():
     rng = np.random.default_rng(4)
     truth = 0.02 * rng.random((13, 17, 15))
     volume = truth + rng.normal(0, 0.001, truth.shape)
-    assert psnr_3d_absolute(volume, truth) == pytest.approx(
-        peak_signal_noise_ratio(truth, volume, data_range=truth.max())
-    )
-    assert psnr_3d_absolute(volume, truth, 0.1) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=0.1))
+    assert psnr_3d(volume, truth) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=truth.max()))
+    assert psnr_3d(volume, truth, 0.1) == pytest.approx(peak_signal_noise_ratio(truth, volume, data_range=0.1))
     for peak in (None, 0.1):
         # Scikit-image continues by mirroring; what it finds inside a border of zeros is continued by zeros.
         scale = peak or truth.max()
         padded = reference_ssim(*(np.pad(x / scale, 10) for x in (volume, truth)))[10:-10, 10:-10, 10:-10]
-        assert ssim_3d_absolute(volume, truth, peak) == pytest.approx(padded.mean(), rel=1e-10)
-    for measure in psnr_3d_absolute, ssim_3d_absolute:
+        assert ssim_3d(volume, truth, peak) == pytest.approx(padded.mean(), rel=1e-10)
+    for measure in psnr_3d, ssim_3d:
         assert measure(50 * volume, 50 * truth) == pytest.approx(measure(volume, truth))
         assert measure(1.25 * volume, truth) < measure(volume, truth)
 
 
 def test_a_fan_beam_slice_is_measured_in_its_plane(pair):
     a, b = pair[0][1], pair[1][1]
-    assert ssim_3d(a[:, :, None], b[:, :, None]) == pytest.approx(ssim_map(a, b).mean())
-    assert ssim_3d_absolute(a[:, :, None], b[:, :, None], 1.0) == pytest.approx(ssim_map(a, b).mean())
+    assert ssim_3d_r2(a[:, :, None], b[:, :, None]) == pytest.approx(ssim_map(a, b).mean())
+    assert ssim_3d(a[:, :, None], b[:, :, None], 1.0) == pytest.approx(ssim_map(a, b).mean())
 
 
 @pytest.mark.parametrize('measure', ALL)
@@ -149,7 +147,7 @@ def test_constant_images_by_hand():
 @pytest.mark.parametrize('measure', ALL)
 def test_empty_truth(measure):
     zero = np.zeros((3, 12, 12))
-    expected = np.inf if measure is psnr_3d else np.nan
+    expected = np.inf if measure is psnr_3d_r2 else np.nan
     assert measure(zero, zero) == pytest.approx(expected, nan_ok=True)
 
 
@@ -175,7 +173,7 @@ def test_bad_input(measure, pair):
         measure(a[0], b[0])
 
 
-@pytest.mark.parametrize('measure', [psnr_2d, ssim_2d_absolute, psnr_3d_absolute, ssim_3d_absolute])
+@pytest.mark.parametrize('measure', [psnr_2d, ssim_2d, psnr_3d, ssim_3d])
 def test_bad_peak(measure, pair):
     for peak in (0, -1, np.nan):
         with pytest.raises(InputError, match='peak'):
@@ -186,5 +184,21 @@ def test_float32_input_is_accumulated_in_float64():
     truth = np.full((64, 64, 64), 0.5, np.float32)
     volume = truth + np.float32(1e-4)
     error = float(volume[0, 0, 0]) - 0.5
-    assert psnr_3d(volume, truth) == pytest.approx(-20 * np.log10(error), rel=1e-9)
+    assert psnr_3d_r2(volume, truth) == pytest.approx(-20 * np.log10(error), rel=1e-9)
     assert metrics.WINDOW.sum() == pytest.approx(1)
+
+
+def test_names_of_earlier_results_become_todays():
+    old = dict(psnr_2d=1, psnr_2d_r2=2, ssim_2d=3, ssim_2d_absolute=4, psnr_3d=5, psnr_3d_absolute=6, ipsd=None)
+    now = dict(psnr_2d=1, psnr_2d_r2=2, ssim_2d_r2=3, ssim_2d=4, psnr_3d_r2=5, psnr_3d=6, ipsd=None)
+    assert metrics.current_names(old) == now == metrics.current_names(now)
+    assert metrics.current_names({}) == {}
+    assert metrics.current_names(dict(psnr_3d=5, ssim_3d=6)) == dict(psnr_3d_r2=5, ssim_3d_r2=6)
+
+
+@pytest.mark.parametrize('name', ['psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d'])
+def test_the_plain_name_is_the_absolute_form(pair, name):
+    """In a unit of which 1 is no full scale, with a wrong gain."""
+    images, truth = (4 * x for x in pair)
+    plain, r2 = (getattr(metrics, n)(1.2 * truth, truth) for n in (name, f'{name}_r2'))
+    assert plain == pytest.approx(getattr(metrics, name)(1.2 * truth / 4, truth / 4)) and plain != pytest.approx(r2)

@@ -56,10 +56,36 @@ def test_without_a_copy():
     assert np.shares_memory(as_numpy(Capsule(VALUES), 'these', np.float32), VALUES)
 
 
-@pytest.mark.parametrize('values', [Elsewhere(), [[1, 2], [3]], 'none'])
+@pytest.mark.parametrize(
+    'values',
+    [Elsewhere(), [[1, 2], [3]], 'none', VALUES.astype(str), VALUES.astype(complex), VALUES.astype(object), None],
+)
 def test_what_is_no_array(values):
     with pytest.raises(InputError, match='the projections cannot be read as an array') as caught:
         Scan(GEOMETRY, values)
     assert '\n' not in str(caught.value)
     with pytest.raises(InputError, match='the volume cannot'):
         Dataset(Scan(GEOMETRY, VALUES), volume=Elsewhere())
+
+
+def test_pixels_that_are_not_finite_say_how_to_leave_them_out():
+    values = VALUES.copy()
+    values[1, 0, 2] = np.nan
+    with pytest.raises(InputError, match='first in view 1.*valid=mask'):
+        Scan(GEOMETRY, values)
+    assert Scan(GEOMETRY, values, valid=np.isfinite(values)).projections[1, 0, 2] == 0
+
+
+@pytest.mark.parametrize('index', [[2], [-3], 1, [0.5], 'all', None, [[0, 1]], [[0], [0, 1]], [True]])
+def test_views_that_are_none(index):
+    for some in Scan(GEOMETRY, VALUES), GEOMETRY:
+        with pytest.raises(InputError, match='views are chosen by'):
+            some.subset(index)
+
+
+@pytest.mark.parametrize('index', [[1, 0], [-1], slice(1, None), np.array([0]), [False, True], (1,)])
+def test_views_of_a_scan(index):
+    found = Scan(GEOMETRY, VALUES).subset(index)
+    chosen = np.arange(2)[index if isinstance(index, slice) else np.asarray(index)]
+    np.testing.assert_array_equal(found.projections, VALUES[chosen])
+    np.testing.assert_array_equal(found.geometry.angles, GEOMETRY.angles[chosen])

@@ -7,9 +7,11 @@ from os import PathLike
 import numpy as np
 
 from lingo_mi.arrays import as_numpy
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
+from lingo_mi.file_access import as_path
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
+from lingo_mi.parsing import whole
 from lingo_mi.phantoms import Phantom, make
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
 from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
@@ -17,7 +19,7 @@ from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
-from lingo_mi.scene.checks import check_memory, warn_if_truncated
+from lingo_mi.scene.checks import check_memory, require_densities, warn_if_truncated
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import choose_views, take_scan
@@ -49,19 +51,25 @@ def simulate(
     Returns a `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume`
     [x, y, z] is the true density, where it is known.
 
-    Raises InputError where the source is unknown, does not fit the geometry, or needs more memory than there is.
+    Raises InputError where the source is unknown, does not fit the geometry, needs more memory than there is, or is a volume
+    whose negative values look like Hounsfield units (`docs/how_to/own_volume.md` says how to convert them).
 
         data = lm.simulate('x3d_foot', views=25)
         data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
     """
     ensure_variant()
-    if seed < 0:
-        raise InputError(f'seed must not be negative, but is {seed}')
+    seed = whole('seed', seed, 0)
+    views = 0 if views is None else whole('views', views, 1)
+    for name, given in (('geometry', geometry), ('held_out', held_out)):
+        if given is not None:
+            require_type(name, given, Geometry, 'such as lm.Geometry.cone(...)')
+    if parameters is not None:
+        require_type('parameters', parameters, dict)
     if isinstance(source, (str, PathLike)):
         if geometry is not None or held_out is not None:
             raise InputError(f'{source}: a scene has its own scanner; leave out geometry and held_out')
         scene = load_scene(scene_path(source), {k: str(v) for k, v in (parameters or {}).items()})
-        return take_scan(scene, views or 0, seed=seed)
+        return take_scan(scene, views, seed=seed)
     if parameters:
         raise InputError('parameters are those of a scene file; this source is none')
     if isinstance(source, Phantom) and geometry is None:
@@ -74,6 +82,7 @@ def simulate(
     volume = source.data if isinstance(source, Phantom) else as_numpy(source, 'the volume', np.float32)
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    require_densities(volume)
     check_memory(geometry, held_out)
     warn_if_truncated(geometry)
     every = geometry if held_out is None else geometry.joined(held_out)
@@ -88,9 +97,9 @@ def simulate(
             projections = grid.project(volume, every, report)
     scan = Scan(every, projections)
     if held_out is None:
-        return choose_views(Dataset(scan, None, volume), views or 0)
+        return choose_views(Dataset(scan, None, volume), views)
     train, test = scan.subset(slice(0, len(geometry))), scan.subset(slice(len(geometry), None))
-    return choose_views(Dataset(train, test, volume), views or 0)
+    return choose_views(Dataset(train, test, volume), views)
 
 
 def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views: int | None = None) -> Dataset:
@@ -106,7 +115,13 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
 
         data = lm.load('foot_50.pickle', views=25)
     """
-    dataset = choose_views(read_scan(path, geometry), views or 0)
+    if geometry is not None and not isinstance(geometry, (str, PathLike)):
+        raise InputError(
+            f'geometry must be the path of a geometry file, not {type(geometry).__name__}; '
+            'with a Geometry, make the scan by lm.Scan(geometry, numpy.load(path))'
+        )
+    views = 0 if views is None else whole('views', views, 1)
+    dataset = choose_views(read_scan(as_path('path', path), geometry), views)
     check_memory(dataset.train.geometry)
     warn_if_truncated(dataset.train.geometry)
     return dataset

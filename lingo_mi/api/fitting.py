@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from lingo_mi.api.result import Result
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
+from lingo_mi.file_access import as_path, require_writable, writing
 from lingo_mi.fitting.checkpoint import CHECKPOINT
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.interrupts import between_steps
+from lingo_mi.parsing import whole
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure
 from lingo_mi.runtime import ensure_variant
@@ -44,25 +46,30 @@ def fit(
     settings     any setting of the fit by name, such as iterations=800, n_points=20_000 or lambda_tv=0.1 (see `Settings`)
 
     Returns a `Result`. Ctrl-C stops between two steps and leaves a checkpoint, where one is named. Raises InputError for an
-    unknown recipe or setting, a scan without signal, a checkpoint of another fit, and a fit that diverges.
+    unknown recipe or setting, a scan without signal, a checkpoint of another fit or that cannot be written, and a fit that
+    diverges.
 
         result = lm.fit(data, 'fast', iterations=800, checkpoint='out/foot.npz')
     """
     ensure_variant()
-    if not isinstance(scan, (Scan, Dataset)):
-        raise InputError(f'scan must be a Scan or a Dataset, not {type(scan).__name__}')
-    if seed < 0:
-        raise InputError(f'seed must not be negative, but is {seed}')
+    require_type('scan', scan, (Scan, Dataset))
+    require_type('recipe', recipe, (str, Settings))
+    seed = whole('seed', seed, 0)
     dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
     if isinstance(recipe, Settings):
         name, chosen = 'settings', recipe.changed(**settings)
     else:
         name, chosen = recipe, settings_of(recipe, **settings)
-    path = None if checkpoint is None else Path(checkpoint)
+    path = None if checkpoint is None else as_path('checkpoint', checkpoint)
     if resume and path is None:
         raise InputError('resume=True needs the checkpoint to go on from: give checkpoint=FILE')
-    if path is not None and path.exists() and not resume:
-        raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
+    if path is not None:
+        with writing(path):
+            if path.is_dir():
+                raise InputError(f'{path}: is a folder; name a file in it, such as {path / CHECKPOINT}')
+            if path.exists() and not resume:
+                raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
+        require_writable(path.parent, path)
     cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
     with tempfile.TemporaryDirectory() as folder, between_steps() as check:
         # Kept even where nobody names a file: `Result.save` writes it.

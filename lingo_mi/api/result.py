@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import replacing
+from lingo_mi.errors import InputError, require_type
+from lingo_mi.file_access import as_path, replacing, writing
 from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry import Geometry
+from lingo_mi.metrics import current_names
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import Measured, measure
@@ -97,6 +98,8 @@ class Result:
 
         Raises InputError for the baselines '3dgs' and 'xgaussian', whose opacities are no densities.
         """
+        if geometry is not None:
+            require_type('geometry', geometry, Geometry, 'scan.geometry.with_volume(nVoxel, dVoxel) has another grid')
         volume = self.fitted.volume(geometry)
         if volume is None:
             raise InputError(
@@ -110,6 +113,8 @@ class Result:
 
         Where the fit has modelled effects, what the scan's detector would see, noise apart.
         """
+        if geometry is not None:
+            require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
         return self.fitted.render(self.geometry if geometry is None else geometry)
 
     @cached_property
@@ -121,10 +126,11 @@ class Result:
 
         data   what to compare with (default: what was given to `lm.fit`; of a loaded result, the numbers as saved)
 
-        The full scale of `psnr_3d` and `ssim_3d` is a density of 1, as in R2-Gaussian. That of `psnr_3d_absolute` and
-        `ssim_3d_absolute` is the largest true density: take these for densities per mm of real objects.
+        The full scale of `psnr_2d`, `ssim_2d`, `psnr_3d` and `ssim_3d` is the largest true value. Those that end in `_r2` are
+        R2-Gaussian's, as published tables have them: views divided by their own maxima, and 1 for densities.
         """
         if data is not None:
+            require_type('data', data, Dataset, 'write lm.Dataset(scan, test, volume)')
             numbers = measure(self.fitted, data.test, data.volume).numbers
         else:
             numbers = self._measured.numbers if self._stored is None else self._stored
@@ -138,13 +144,14 @@ class Result:
 
         Raises InputError where the folder holds files already, or cannot be written.
         """
-        folder = Path(folder)
-        if folder.is_dir() and any(folder.iterdir()) and not force:
-            raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / CHECKPOINT) as temporary:
-            temporary.write_bytes(self._checkpoint)
-        save(folder, self.fitted, self._measured, title=title or folder.name, method=self.recipe)
+        folder = as_path('folder', folder)
+        with writing(folder):
+            if folder.is_dir() and any(folder.iterdir()) and not force:
+                raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(folder / CHECKPOINT) as temporary:
+                temporary.write_bytes(self._checkpoint)
+            save(folder, self.fitted, self._measured, title=title or folder.name, method=self.recipe)
         return folder
 
     def __repr__(self) -> str:
@@ -162,18 +169,22 @@ class Result:
 def load_result(path: str | PathLike) -> Result:
     """A result from the folder that `Result.save` or the command line wrote, or from a checkpoint (.npz) alone.
 
-    Raises InputError where there is no checkpoint, or it is damaged.
+    Raises InputError where there is no result, or it is damaged.
 
         result = lm.load_result('out/foot')
     """
     ensure_variant()
-    path = Path(path)
+    path = as_path('path', path)
     file = path / CHECKPOINT if path.is_dir() else path
+    if not file.exists():
+        raise InputError(
+            f'{path}: there is no result here; give a folder that Result.save or lingo-mi fit wrote, or its {CHECKPOINT}'
+        )
     fitted, numbers = Fitted.from_checkpoint(file), file.with_name(METRICS)
     stored = None
     if path.is_dir() and numbers.exists():
         try:
-            stored = json.loads(numbers.read_text(encoding='utf-8'))
-        except ValueError:
+            stored = current_names(json.loads(numbers.read_text(encoding='utf-8')))
+        except (ValueError, AttributeError):  # no JSON, or no dictionary
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
     return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from os import PathLike
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.api.result import Result
+from lingo_mi.arrays import as_numpy
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
+from lingo_mi.parsing import whole
 from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined, progress_bar
 from lingo_mi.reconstruction import reconstruct as run
 from lingo_mi.reconstruction.effects_correction import linearised
@@ -46,8 +50,13 @@ def reconstruct(
     """
     ensure_variant()
     scan = scan.train if isinstance(scan, Dataset) else scan
-    if not isinstance(scan, Scan):
-        raise InputError(f'scan must be a Scan or a Dataset, not {type(scan).__name__}')
+    require_type('scan', scan, (Scan, Dataset))
+    if views is not None:
+        views = whole('views', views, 1)
+    if isinstance(start, str | PathLike):
+        raise InputError(
+            f'start must be the Result of a fit, or a volume, not a path: give lm.load_result({str(start)!r})'
+        )
     if not isinstance(algorithm, Algorithm):
         raise InputError(f'algorithm must be an object such as lm.SART(niter=20), not {algorithm!r}')
     inputs = {}
@@ -66,6 +75,6 @@ def reconstruct(
     else:
         if scan.effects is not None:
             scan = linearised(scan, scan.effects)
-        inputs = {} if start is None else dict(start=start)
+        inputs = {} if start is None else dict(start=as_numpy(start, 'the start volume', np.float32))
     with progress_bar(algorithm, scan) if progress else nullcontext() as bar:
         return run(scan, algorithm, progress=bar, **inputs)

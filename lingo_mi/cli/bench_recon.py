@@ -10,7 +10,8 @@ relative RMS difference from our result, without the outermost voxels, whose out
 where methods differ: diffct projects voxels that are constant (Siddon), ours and RTK's interpolate (Joseph); RTK's SART
 backprojects by interpolating the panel, ours by the matched transpose.
 
-RTK comes with `pip install 'lingo_mi[reference]'`, diffct with `pip install diffct torch`; what is not installed is left out.
+RTK comes with `pip install '.[reference]'` in a checkout, diffct with `pip install diffct torch`; what is not installed is
+left out.
 """
 
 import argparse

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
 
 
 class Parser(argparse.ArgumentParser):
@@ -179,7 +180,7 @@ def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
     if path.is_dir() and any(path.iterdir()) and not (force or resume):
         what = 'holds a result already' if (path / owns).exists() else 'is not empty'
         raise InputError(f'{path}: {what}; add --resume to go on, --force to replace it, or choose another --out')
-    _probe(path, path)
+    require_writable(path, path, 'choose another --out')
     return path
 
 
@@ -195,23 +196,5 @@ def writable_file(path: Path, force: bool) -> Path:
         raise InputError(f'{path}: is a folder; choose another --out')
     if path.exists() and not force:
         raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
-    _probe(path.parent, path)
+    require_writable(path.parent, path, 'choose another --out')
     return path
-
-
-def _probe(folder: Path, path: Path):
-    """Make a folder, write into it and take it away again. Raises InputError, naming `path`, where that fails."""
-    made = []
-    try:
-        for part in (*reversed(folder.parents), folder):
-            if not part.exists():
-                part.mkdir()
-                made.append(part)
-        probe = folder / '.writable'
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f'{path}: cannot write there ({error.strerror}); choose another --out') from None
-    finally:
-        for part in reversed(made):
-            part.rmdir()

@@ -26,6 +26,7 @@ from lingo_mi.cli.common import (
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.interrupts import between_steps
+from lingo_mi.parsing import nearest
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
@@ -86,12 +87,12 @@ def main() -> None:
     if twice := given.keys() & options.keys():
         raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
     given |= options
-    unknown = [k for k in given if k not in METHODS[args.method].flat()]
-    if unknown:
+    known = METHODS[args.method].flat()
+    if unknown := [k for k in given if k not in known]:
         names = ', '.join(sorted(own)) or 'it has none'
         raise InputError(
-            f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit '
-            '(see lingo_mi/fitting/settings.py)'
+            f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit'
+            + (nearest(unknown[0], [*own, *known]) or '; the documentation of Settings lists those')
         )
     settings = METHODS[args.method].changed(**given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)

@@ -79,6 +79,7 @@ def check(args: argparse.Namespace) -> None:
     """Everything that can be refused before the work begins."""
     if args.name is None:
         raise InputError(f'name a phantom: one of {", ".join(phantoms.names())}')
+    phantoms.require_name(args.name)
     if args.out is None and args.projections is None:
         raise InputError('nothing to write: give --out, --projections or both')
     if args.views < 1:

@@ -26,12 +26,11 @@ from lingo_mi.cli.common import Parser, check_input, definitions, input_argument
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
-from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.parsing import parse
 from lingo_mi.reconstruction import ALGORITHMS, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_signal
-from lingo_mi.results.measure import compared, volume_quality
+from lingo_mi.results.measure import volume_quality
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
@@ -166,8 +165,7 @@ def main() -> None:
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress, **inputs)
         of = len(scan)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_volume(out, found.volume, found.geometry.dVoxel, first_voxel(found.geometry), 'density per mm')
+    found.save(out, force=True)  # `output` has refused to replace a file without --force
     print(
         f'{args.algorithm} of {of} views: {found.seconds:.1f} s'
         + (
@@ -177,5 +175,5 @@ def main() -> None:
         )
     )
     if dataset.volume is not None:
-        print(volume_quality(compared(found.volume, dataset.volume)))
+        print(volume_quality(found.metrics(dataset.volume)))
     print(out)

@@ -1,7 +1,7 @@
 """Spectra of X-ray tubes and attenuation of materials: tables of spekpy and xraylib (NumPy).
 
-Both libraries come with `pip install lingo_mi[physics]`. spekpy needs seconds for a spectrum, so spectra are cached in the
-user's cache folder.
+Both libraries come with `pip install '.[physics]'` in a checkout of lingo_mi. spekpy needs seconds for a spectrum, so spectra
+are cached in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _version(name: str) -> str:
         raise InputError(_MISSING.format(name)) from None
 
 
-_MISSING = "{} is not installed: pip install 'lingo_mi[physics]'"
+_MISSING = "{} is not installed: pip install '.[physics]' in a checkout of lingo_mi"
 
 
 def _cache_folder() -> Path:

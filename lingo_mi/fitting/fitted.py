@@ -18,6 +18,7 @@ from lingo_mi.fitting.poses import Poses
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State, activate
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.metrics import current_names
 from lingo_mi.projectors.objects import Ellipsoids
 
 
@@ -112,7 +113,8 @@ class Fitted:
         try:
             settings = _settings(extra['settings'])
             scanner, unit, seed = (extra[name] for name in ('scanner', 'unit', 'seed'))
-            history, seconds, info = (extra[name] for name in ('history', 'seconds', 'info'))
+            seconds, info = (extra[name] for name in ('seconds', 'info'))
+            history = [current_names(entry) for entry in extra['history']]
             initial = arrays['initial']
         except (AttributeError, KeyError, TypeError, InputError):
             raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; fit again') from None

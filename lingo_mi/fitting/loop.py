@@ -22,6 +22,7 @@ from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import start
 from lingo_mi.fitting.step import Stepper
 from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.metrics import current_names
 from lingo_mi.scan import Scan
 from lingo_mi.scene.description import describe
 
@@ -63,7 +64,8 @@ def run(
         require_same_fit(host, extra, settings, scanned, seed, begin)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
-        iteration, seconds, history, info = (extra[k] for k in ('iteration', 'seconds', 'history', 'info'))
+        iteration, seconds, info = (extra[k] for k in ('iteration', 'seconds', 'info'))
+        history = [current_names(entry) for entry in extra['history']]
         state = DeviceState(host)
         stepper.restore(arrays)
         average.restore(arrays)
@@ -121,10 +123,8 @@ def run(
             history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
             clock = time.perf_counter()  # excludes the time of `measure`
         if progress is not None:
-            # But for `psnr_3d`: its full scale is 1, whatever the unit of density.
-            last = {
-                k: v for k, v in (history[-1].items() if history else ()) if k.startswith('psnr') and k != 'psnr_3d'
-            }
+            measured = history[-1].items() if history else ()
+            last = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
             try:
                 progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
             except KeyboardInterrupt:

@@ -12,7 +12,7 @@ from typing import Any
 
 from lingo_mi.errors import InputError
 from lingo_mi.lingo.initialise import LingoSettings
-from lingo_mi.parsing import parse
+from lingo_mi.parsing import checked, nearest, parse
 from lingo_mi.projectors import cutoff
 
 INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by the setting `render`
@@ -285,12 +285,14 @@ class Settings:
 
         Example: `R2.changed(iterations=800, lambda_tv=0.1)`.
         """
-        known = self.flat()
+        known = Settings().flat()  # of the kinds to expect
         for name, value in values.items():
             if name not in known:
-                raise InputError(f'unknown setting {name!r}: one of {", ".join(known)}')
-            if isinstance(value, str):
-                values[name] = parse(f'setting {name}', value, known[name])
+                raise InputError(
+                    f'unknown setting {name!r}{nearest(name, known) or ": see the documentation of Settings"}'
+                )
+            of_kind = parse if isinstance(value, str) else checked
+            values[name] = of_kind(f'setting {name}', value, known[name])
         changes = {}
         for part, own in self._parts():
             new = {name: values[name] for name in own if name in values}

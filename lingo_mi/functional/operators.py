@@ -18,13 +18,14 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterable
+from numbers import Real
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, require_type
 from lingo_mi.functional.frameworks import call
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import cutoff
@@ -58,8 +59,8 @@ def project(
 
     The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
     Differentiable once in all four, not in the geometry: in reverse mode, in Dr.Jit also in forward mode. A result that is to
-    be differentiated holds about 100 bytes for each Gaussian in each view until it is, so a step of a fit had better
-    project some views than all.
+    be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
+    project a few views, not all.
 
         images = project(means, scales, quaternions, density, geometry, views=[0, 7])
         loss = ((images - measured) ** 2).mean()
@@ -69,7 +70,7 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
     `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
-    _require_geometry(geometry)
+    require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
     rays = geometry.rays()
     index = _indices(views, len(rays))
@@ -94,7 +95,7 @@ def voxelize(
 
         grid = voxelize(means, scales, quaternions, density, geometry)
     """
-    _require_geometry(geometry)
+    require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
@@ -120,13 +121,8 @@ def _checked(function, name: str):
     return wrapped
 
 
-def _require_geometry(geometry):
-    if not isinstance(geometry, Geometry):
-        raise InputError(f'geometry must be a Geometry, not {type(geometry).__name__}; of a scan give scan.geometry')
-
-
 def _extent(extent) -> float:
-    if not 1 <= extent <= 20:
+    if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
         raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
     return float(extent)
 

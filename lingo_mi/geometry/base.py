@@ -20,6 +20,7 @@ integrals are multiplied by `Geometry.scale` = 2 / max(sVoxel); densities keep t
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from os import PathLike
@@ -33,7 +34,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.geometry import astra, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
-from lingo_mi.geometry.rays import Index, Rays
+from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import helix, scanner_rays
 
 
@@ -80,7 +81,7 @@ class Geometry(ABC):
         """A cone beam whose source moves on a circle about z.
 
         DSO, DSD      distances from the source to the axis and to the panel, mm: DSD >= DSO > 0
-        angles        [n] radians, n >= 1
+        angles        [n] radians, n >= 1; whole numbers over more than four turns cause a warning, as they look like degrees
         offDetector   shift of the panel, (v, u), mm, positive v up
         rotDetector   the panel turned by (roll, pitch, yaw), radians; COR: an axis off centre, mm; tilt: the source lifted
                       out of the plane of rotation, radians. `trajectories.scanner_rays` defines them
@@ -133,6 +134,7 @@ class Geometry(ABC):
     def _moving(cls, mode: str, scan: dict[str, Any], **motion: Any) -> Geometry:
         """The circle of the numbers `scan`, or what `motion` makes of it where any of that is not zero."""
         circle = CircularGeometry(mode=mode, **scan)
+        _warn_of_degrees(circle.angles)
         if not any(np.any(value) for value in motion.values()):
             return circle
         motion['rotDetector'] = _numbers('rotDetector', motion['rotDetector'], float, 3)
@@ -379,7 +381,10 @@ class CircularGeometry(Geometry):
             raise InputError(f"mode must be 'cone' or 'parallel', not {self.mode!r}")
         super().__post_init__()
         object.__setattr__(self, 'offDetector', _numbers('offDetector', self.offDetector, float, 2))
-        angles = np.atleast_1d(np.asarray(self.angles, float))
+        try:
+            angles = np.atleast_1d(np.asarray(self.angles, float))
+        except (TypeError, ValueError):
+            raise InputError(f'angles must be numbers, in radians, not {self.angles!r}') from None
         if angles.ndim != 1 or len(angles) == 0:
             raise InputError('the scan has no views: give at least one angle')
         if not np.all(np.isfinite(angles)):
@@ -409,7 +414,7 @@ class CircularGeometry(Geometry):
 
     def subset(self, index: Index) -> CircularGeometry:
         """The same scan with the views `index` only: a slice, or integers [m]."""
-        return replace(self, angles=self.angles[index])
+        return replace(self, angles=self.angles[checked_views(index, len(self))])
 
     def joined(self, other: Geometry) -> Geometry:
         """The views of this scan, then those of another by the same scanner on the same grid."""
@@ -469,7 +474,7 @@ class PosedGeometry(Geometry):
 
     def subset(self, index: Index) -> PosedGeometry:
         """The same scan with the views `index` only: a slice, or integers [m]."""
-        return replace(self, poses=self.poses[index])
+        return replace(self, poses=self.poses[checked_views(index, len(self))])
 
     def binned(self, factor: int) -> PosedGeometry:
         """The same rays with `factor` x `factor` pixels taken as one: see `Geometry.binned`."""
@@ -481,9 +486,24 @@ class PosedGeometry(Geometry):
 
 def _numbers(name: str, value: ArrayLike, kind: type, length: int) -> tuple:
     """`length` finite numbers of a kind; one may stand for all."""
-    array = np.atleast_1d(np.asarray(value, float)).ravel()
+    try:
+        array = np.atleast_1d(np.asarray(value, float)).ravel()
+    except (TypeError, ValueError):
+        array = np.empty(0)
     if len(array) == 1:
         array = np.repeat(array, length)
     if len(array) != length or not np.all(np.isfinite(array)):
         raise InputError(f'{name} must be {length} finite numbers, not {value!r}')
+    if kind is int and np.any(array % 1):
+        raise InputError(f'{name} must be whole numbers, not {value!r}')
     return tuple(kind(x) for x in array)
+
+
+def _warn_of_degrees(angles: np.ndarray) -> None:
+    """Warn, in the name of the caller's caller's caller, if angles in radians look like degrees."""
+    if np.ptp(angles) > 8 * np.pi and not np.any(angles % 1):
+        warnings.warn(
+            f'angles are radians, but these are whole numbers from {angles.min():g} to {angles.max():g}: '
+            'if they are degrees, give numpy.radians(angles)',
+            stacklevel=4,
+        )

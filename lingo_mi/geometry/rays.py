@@ -17,6 +17,21 @@ from lingo_mi.errors import InputError
 Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
 
 
+def checked_views(index: Index, count: int) -> Index:
+    """`index` of some of `count` views. Raises InputError where it is neither a slice nor integers, or beyond the views."""
+    if isinstance(index, slice):
+        return index
+    try:
+        views = np.asarray(index)
+    except (TypeError, ValueError):  # lists of several lengths
+        views = np.empty((0, 0))
+    whole = views.dtype.kind in 'iu' and (views.size == 0 or -count <= views.min() and views.max() < count)
+    mask = views.dtype.kind == 'b' and len(views) == count
+    if views.ndim != 1 or not (whole or mask or views.size == 0):
+        raise InputError(f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {index!r}')
+    return views if views.size else views.astype(int)
+
+
 @dataclass(frozen=True, eq=False)
 class Rays:
     """The rays of n flat-panel views.

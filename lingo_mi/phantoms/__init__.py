@@ -61,6 +61,12 @@ def names() -> tuple[str, ...]:
     return _NAMES
 
 
+def require_name(name: str) -> None:
+    """Raises InputError unless there is a phantom of this name."""
+    if name not in _NAMES:
+        raise InputError(f'there is no phantom {name!r}: choose one of {", ".join(_NAMES)}')
+
+
 def make(name: str, size: int, seed: int = 0) -> Phantom:
     """The phantom `name` on size^3 voxels.
 
@@ -68,8 +74,7 @@ def make(name: str, size: int, seed: int = 0) -> Phantom:
 
     Raises InputError for an unknown name, a size outside 8..512 or a negative seed.
     """
-    if name not in _NAMES:
-        raise InputError(f'there is no phantom {name!r}: choose one of {", ".join(_NAMES)}')
+    require_name(name)
     try:
         size, seed = operator.index(size), operator.index(seed)
     except TypeError:

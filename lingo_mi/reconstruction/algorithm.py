@@ -5,13 +5,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.arrays import short_repr
+from lingo_mi.arrays import as_numpy, short_repr
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import as_path, writing
+from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.metrics import compared
 from lingo_mi.scan import Scan
 
 # Called after every step as progress(steps done, all steps, |A x - b| / |b|). The last is None if an algorithm does not know it.
@@ -21,6 +27,10 @@ Progress = Callable[[int, int, float | None], None]
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """A reconstructed volume with its convergence. `numpy.asarray` of it is the volume.
+
+        found = lm.reconstruct(scan, lm.SART(niter=20))
+        found.metrics(truth)['psnr_3d']
+        found.save('out/foot.nii.gz')
 
     volume      float32 [x, y, z], density per mm
     residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|); none for FDK
@@ -37,6 +47,32 @@ class Reconstruction:
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.volume, dtype) if copy else np.asarray(self.volume, dtype)
+
+    def metrics(self, truth: ArrayLike) -> dict[str, float | None]:
+        """PSNR in dB and SSIM of the volume: psnr_3d and ssim_3d, whose full scale is the largest true density, and psnr_3d_r2
+        and ssim_3d_r2, R2-Gaussian's, whose full scale is 1; None where a value is not finite.
+
+        truth   the true densities per mm, [x, y, z], on the same voxels
+
+        Raises InputError for a truth of another shape, or that is not finite.
+        """
+        return compared(self.volume, as_numpy(truth, 'the true volume'))
+
+    def save(self, path: str | PathLike, *, force: bool = False) -> Path:
+        """Write the volume as NIfTI, densities per mm, with voxel size and position in mm; returns the path.
+
+        path    .nii or .nii.gz; its folder is made
+        force   replace an earlier file
+
+        Raises InputError for another suffix, a file that is there already, or one that cannot be written.
+        """
+        path, geometry = as_path('path', path), self.geometry
+        with writing(path):
+            if path.exists() and not force:
+                raise InputError(f'{path}: exists already; give force=True to replace it')
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+        return path
 
 
 class Algorithm(ABC):

@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Scan, require_finite
 
 
 def is_circular(scan: Scan) -> bool:
@@ -48,7 +48,8 @@ def require_rays(geometry: Geometry) -> None:
 
 
 def require_signal(scan: Scan, purpose: str = 'reconstruct') -> None:
-    """Raises InputError for empty projections. purpose: a verb, for the message."""
+    """Raises InputError for projections that are empty or not finite. purpose: a verb, for the message."""
+    require_finite(scan.projections)  # a scan is checked when it is made, but its array can be written to
     if not scan.projections.any():
         raise InputError(f'the projections are zero everywhere: there is nothing to {purpose}')
     if scan.projections.max() <= 0:

@@ -72,9 +72,8 @@ def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Genera
 def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterator[list[np.ndarray]]:
     """The `blocks` of pass after pass, an endless iterator."""
     rng = np.random.default_rng(seed)
-    blocks(
-        angles, blocksize, order, rng
-    )  # unused: random orders are those of volumes made before, which drew one for a check
+    # Drawn once and discarded, so that a seed gives the same orders as in 0.1.0.
+    blocks(angles, blocksize, order, rng)
     while True:
         yield blocks(angles, blocksize, order, rng)
 

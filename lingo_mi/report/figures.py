@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 PLANES = {2: ('Axial', 'x', 'y', 'z'), 1: ('Coronal', 'x', 'z', 'y'), 0: ('Sagittal', 'y', 'z', 'x')}
 DIFFERENCE = 'RdBu_r'
-COLOURS = {'loss': '#444444', 'psnr_2d': '#1f77b4', 'psnr_3d_absolute': '#d6641e', 'gaussians': '#2a7f4f'}
+COLOURS = {'loss': '#444444', 'psnr_2d': '#1f77b4', 'psnr_3d': '#d6641e', 'gaussians': '#2a7f4f'}
 PADS = {'w_pad': 0.1, 'h_pad': 0.06}  # inches around everything
 MOST_POINTS = 30_000  # of a scatter plot; more cannot be distinguished
 STYLE: dict = {
@@ -141,7 +141,7 @@ def sections(data: Any) -> list[Section]:
                 ' Opacities and radiances are no attenuation: this cloud makes no volume, and no scene renders it.'
             )
         out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width), caption))
-    if any(len(series(data.history, 'iteration', y)[0]) for y in ('loss', 'psnr_2d', 'psnr_3d_absolute', 'gaussians')):
+    if any(len(series(data.history, 'iteration', y)[0]) for y in ('loss', 'psnr_2d', 'psnr_3d', 'gaussians')):
         out.append(
             Section(
                 'Convergence',
@@ -320,8 +320,8 @@ def draw_cloud(fig: Any, data: Any) -> None:
 
 def draw_curves(fig: Any, data: Any) -> None:
     """Loss, PSNR and number of Gaussians against iterations and against seconds, if known."""
-    rows = [('Loss', ['loss']), ('PSNR [dB]', ['psnr_2d', 'psnr_3d_absolute']), ('Gaussians', ['gaussians'])]
-    names = {'psnr_2d': '2D, held-out views', 'psnr_3d_absolute': '3D, volume'}
+    rows = [('Loss', ['loss']), ('PSNR [dB]', ['psnr_2d', 'psnr_3d']), ('Gaussians', ['gaussians'])]
+    names = {'psnr_2d': '2D, held-out views', 'psnr_3d': '3D, volume'}
     columns = [('iteration', 'iteration'), ('seconds', 'time [s]')]
 
     def known(x, key):

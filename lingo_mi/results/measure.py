@@ -26,7 +26,7 @@ def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None and (volume := model.volume(state)) is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
-            out['psnr_3d_absolute'] = _number(metrics.psnr_3d_absolute(volume, dataset.volume))
+            out['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(volume, dataset.volume))
         return out
 
     return measure
@@ -66,11 +66,14 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         return None if result is None or reference is None else _number(function(result, reference))
 
     numbers = dict(
-        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
         psnr_2d=of(metrics.psnr_2d, rendered, expected),
         ssim_2d=of(metrics.ssim_2d, rendered, expected),
-        ssim_2d_absolute=of(metrics.ssim_2d_absolute, rendered, expected),
-        **compared(volume, truth),
+        psnr_2d_r2=of(metrics.psnr_2d_r2, rendered, expected),
+        ssim_2d_r2=of(metrics.ssim_2d_r2, rendered, expected),
+        psnr_3d=of(metrics.psnr_3d, volume, truth),
+        ssim_3d=of(metrics.ssim_3d, volume, truth),
+        psnr_3d_r2=of(metrics.psnr_3d_r2, volume, truth),
+        ssim_3d_r2=of(metrics.ssim_3d_r2, volume, truth),
         ipsd=_number(ipsd(fitted.initial, born)),
         ipsd_targets=len(born),
         ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
@@ -82,14 +85,6 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         history=fitted.history,
     )
     return Measured(numbers, volume, truth, test, views)
-
-
-def compared(volume: np.ndarray | None, truth: np.ndarray | None) -> dict:
-    """PSNR and SSIM of a volume, each in both forms; None if there is nothing to compare or the value is not finite."""
-    names = 'psnr_3d', 'ssim_3d', 'psnr_3d_absolute', 'ssim_3d_absolute'
-    if volume is None or truth is None:
-        return dict.fromkeys(names)
-    return {name: _number(getattr(metrics, name)(volume, truth)) for name in names}
 
 
 def summary(result: dict) -> str:
@@ -106,10 +101,10 @@ def summary(result: dict) -> str:
 
 
 def volume_quality(result: dict) -> str:
-    """A volume's numbers (`compared`) as lines: first for densities in any unit, then R2-Gaussian's, for densities up to 1."""
+    """A volume's numbers as lines: first for densities in any unit, then R2-Gaussian's, for densities up to 1."""
     return (
-        f'volume          {_shown(result, "psnr_3d_absolute", "ssim_3d_absolute")} (full scale: the largest true density)\n'
-        f'                {_shown(result, "psnr_3d", "ssim_3d")} (full scale: 1, as in R2-Gaussian)'
+        f'volume          {_shown(result, "psnr_3d", "ssim_3d")} (full scale: the largest true density)\n'
+        f'                {_shown(result, "psnr_3d_r2", "ssim_3d_r2")} (full scale: 1, as in R2-Gaussian)'
     )
 
 

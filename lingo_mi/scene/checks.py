@@ -31,6 +31,20 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
         )
 
 
+def require_densities(volume: np.ndarray) -> None:
+    """Raises InputError for a volume [x, y, z] that is hardly one of densities per mm: with a value of -500 or less, as
+    Hounsfield units of air have, or below minus half the maximum.
+
+    Smaller negative values may be undershoots of a reconstruction, and pass.
+    """
+    low, high = float(volume.min()), float(volume.max())
+    if low <= -500 or low < -0.5 * high:
+        raise InputError(
+            f'the volume holds values from {low:g} to {high:g}, but densities per mm are not negative: convert Hounsfield '
+            'units by numpy.maximum(mu_water * (1 + HU / 1000), 0), where mu_water is that of water, 0.0206 per mm at 60 keV'
+        )
+
+
 def warn_if_truncated(geometry: Geometry) -> None:
     """Warn if the volume's midplane is wider than the panels' field of view."""
     rays, centre = geometry.rays(), np.array(geometry.offOrigin)

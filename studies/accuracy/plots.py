@@ -110,7 +110,7 @@ def _fits(fig, found):
     most = max(r['iterations'] for r in runs)
     colours = dict(fast=GREEN, lingo=BLUE, r2=RED)
     axes = fig.subplots(1, 2)
-    for axis, key, title in zip(axes, ('psnr_2d', 'psnr_3d'), ('Held-out views', 'Volume')):
+    for axis, key, title in zip(axes, ('psnr_2d', 'psnr_3d_r2'), ('Held-out views', 'Volume')):
         for r in runs:
             points = [(r['seconds_init'] + h['seconds'], h[key]) for h in r['history']]
             axis.semilogx(*zip(*points), '-', color=colours[r['name']], alpha=1 if r['iterations'] == most else 0.4)

@@ -134,7 +134,7 @@ _SCALING = [
     ('memory, MB', _number('memory_mb', '{:.1f}')),
     ('with gradients, MB', _number('memory_gradients_mb', '{:.1f}')),
 ]
-_QUALITY = [('views, dB', _number('psnr_2d', '{:.2f}')), ('volume, dB', _number('psnr_3d', '{:.2f}'))]
+_QUALITY = [('views, dB', _number('psnr_2d', '{:.2f}')), ('volume, dB', _number('psnr_3d_r2', '{:.2f}'))]
 _INITIAL = [
     ('initial cloud', _number('name', '{}')),
     ('Gaussians', _number('points', '{:,}')),

@@ -14,7 +14,7 @@ from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.metrics import psnr_3d_absolute
+from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
@@ -153,7 +153,7 @@ def quality(volume: np.ndarray, truth: np.ndarray) -> dict:
     """PSNR in dB of a volume [x, y, z] against the truth, whose maximum is full scale: as it is, and after the factor that
     makes the error least."""
     gain = np.vdot(volume, truth) / max(np.vdot(volume, volume), 1e-30)
-    return dict(psnr_3d=psnr_3d_absolute(volume, truth), psnr_3d_gain=psnr_3d_absolute(gain * volume, truth))
+    return dict(psnr_3d=psnr_3d(volume, truth), psnr_3d_gain=psnr_3d(gain * volume, truth))
 
 
 def pace(history: list[dict]) -> float:

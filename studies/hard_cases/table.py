@@ -9,9 +9,10 @@ from lingo_mi.studies.hard_cases.measuring import PARAMETERS
 INTRODUCTION = """# Hard cases
 
 Written by `lingo-mi hard-cases --markdown FILE`; asserted by `tests/studies/test_hard_cases.py`. Errors in float32
-against float64 on the same input, relative: of the image, its root mean square deviation over its own; of derivatives by the
-Gaussians' parameters, the worst Gaussian's, each kind over the length of all of that Gaussian's derivatives, made numbers of one
-unit (`lingo_mi.studies.hard_cases.measuring` says how). *At most* is what the tests allow.
+against float64 on the same input, relative. Of the image: its root mean square deviation over its root mean square. Of
+derivatives, for each Gaussian and each kind of parameter: the norm of the deviation over the norm of all derivatives of that
+Gaussian, after all are converted to one unit (`lingo_mi.studies.hard_cases.measuring` says how); the worst Gaussian's is shown.
+*At most* is what the tests allow.
 """
 
 

@@ -46,7 +46,7 @@ from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.tables.objects import PHANTOMS, VOLUMES, averaged, load_object
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
-NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d', 'ipsd'), ('psnr_3d', 'ssim_3d')  # numbers of a fit's views; of a volume
+NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d_r2', 'ipsd'), ('psnr_3d_r2', 'ssim_3d_r2')  # of a fit's views; of a volume
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
 ALGORITHMS = {
@@ -156,7 +156,8 @@ class Cells:
         except (FileNotFoundError, ValueError):
             return None
         needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
-        return found if isinstance(found, dict) and found.keys() >= set(needed) else None
+        found = metrics.current_names(found) if isinstance(found, dict) else {}
+        return found if found.keys() >= set(needed) else None
 
     def compute(self, cell: Fit | Volume, label: str) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
@@ -269,8 +270,8 @@ class Cells:
             options=algorithm.options,
             method=cell.fit.method,
             seconds=found.seconds,
-            psnr_3d=metrics.psnr_3d(found.volume, dataset.volume),
-            ssim_3d=metrics.ssim_3d(found.volume, dataset.volume),
+            psnr_3d_r2=metrics.psnr_3d_r2(found.volume, dataset.volume),
+            ssim_3d_r2=metrics.ssim_3d_r2(found.volume, dataset.volume),
         )
 
 

@@ -25,10 +25,10 @@ TITLES = dict(
 )
 LABELS = dict(
     psnr_2d_r2=('PSNR', '{:.2f}'),
-    ssim_2d=('SSIM', '{:.4f}'),
+    ssim_2d_r2=('SSIM', '{:.4f}'),
     ipsd=('IPSD', '{:.4f}'),
-    psnr_3d=('PSNR', '{:.2f}'),
-    ssim_3d=('SSIM', '{:.4f}'),
+    psnr_3d_r2=('PSNR', '{:.2f}'),
+    ssim_3d_r2=('SSIM', '{:.4f}'),
     seconds_init=('start, s', '{:.2f}'),
 )
 _PAPER_IS = "The rows `paper` hold the paper's means over the 15 scenes of X3D."

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.files.volumes import first_voxel, read_volume
 from lingo_mi.geometry import circular
+from lingo_mi.metrics import psnr_3d
 
 SCANNER = dict(DSO=100, DSD=150, nDetector=(24, 30), dDetector=(2, 2), nVoxel=(20,) * 3, dVoxel=(1.2,) * 3)
+VOLUME = np.linspace(0, 1, 8000).reshape(20, 20, 20)  # densities per mm
 TINY = dict(iterations=12, n_points=300, densify_from=4, densify_every=4)
 
 
@@ -54,6 +57,7 @@ def result(data):
 
 def test_names():
     assert set(lm.__all__) <= set(dir(lm))
+    assert lm.circular is circular
     for name in lm.__all__:
         assert getattr(lm, name).__doc__, name
     with pytest.raises(AttributeError, match='no attribute'):
@@ -112,7 +116,41 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'n_pints'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), resume=True), 'checkpoint'),
         (lambda g: lm.fit(lm.Scan(g, np.zeros((10, 24, 30)))), 'zero everywhere'),
-        (lambda g: lm.load_result('missing'), 'no such file'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'did you mean n_points'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), None), 'recipe must be a str or a Settings, not NoneType'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), seed=1.5), 'seed must be a whole number'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), iterations=2.5), 'iterations must be a whole number'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), checkpoint=3), 'checkpoint must be a path, not int'),
+        (lambda g: lm.load_result('missing'), 'missing: there is no result here'),
+        (lambda g: lm.load_result(g), 'path must be a path'),
+        (lambda g: lm.load('scan.npy', g), 'geometry must be the path of a geometry file, not CircularGeometry'),
+        (lambda g: lm.load('scan.npy', views=0), 'views must be a whole number from 1 on, not 0'),
+        (lambda g: lm.load(None), 'path must be a path'),
+        (lambda g: lm.simulate(VOLUME, {}), 'geometry must be a Geometry, not dict'),
+        (lambda g: lm.simulate(VOLUME, g, held_out=[1, 2]), 'held_out must be a Geometry, not list'),
+        (lambda g: lm.simulate(VOLUME, g, views=0), 'views must be a whole number from 1 on, not 0'),
+        (lambda g: lm.simulate(VOLUME, g, views=2.5), 'views must be a whole number'),
+        (lambda g: lm.simulate(VOLUME, g, seed=-1), 'seed must be a whole number from 0 on, not -1'),
+        (lambda g: lm.simulate('x3d_foot', parameters=['views']), 'parameters must be a dict'),
+        (lambda g: lm.simulate(1500 * VOLUME - 1000, g), 'Hounsfield units by'),
+        (lambda g: lm.simulate(3500 * VOLUME - 1000, g), 'Hounsfield units by'),
+        (lambda g: lm.simulate(VOLUME - 0.6, g), 'Hounsfield units by'),
+        (
+            lambda g: lm.reconstruct(lm.Scan(g, np.ones((10, 24, 30))), lm.SART(), start='out/x'),
+            "lm.load_result\\('out/x'",
+        ),
+        (
+            lambda g: lm.reconstruct(lm.Scan(g, np.ones((10, 24, 30))), lm.SART(), start={}),
+            'start volume cannot be read',
+        ),
+        (lambda g: lm.reconstruct(np.ones(3), lm.SART()), 'scan must be a Scan or a Dataset, not ndarray'),
+        (lambda g: lm.Scan(np.ones((10, 24, 30)), g), 'geometry must be a Geometry, not ndarray; write Scan'),
+        (lambda g: lm.Dataset(np.ones((10, 24, 30))), 'train must be a Scan, not ndarray'),
+        (lambda g: lm.Dataset(lm.Scan(g, np.ones((10, 24, 30))), g), 'test must be a Scan'),
+        (lambda g: lm.Scan(g, np.ones((10, 24, 30))).subset([99]), 'from 0 to 9, not by'),
+        (lambda g: g.subset([-11]), 'from 0 to 9, not by'),
+        (lambda g: lm.project(*np.ones((4, 3)), {}), 'geometry must be a Geometry, not dict'),
+        (lambda g: lm.project(*np.ones((4, 3)), g, extent='3'), 'extent is in standard deviations, from 1 to 20'),
     ],
 )
 def test_bad_input_is_one_line(geometry, call, message):
@@ -131,6 +169,60 @@ def test_result(result, data):
     assert numbers['psnr_3d'] > 10 and numbers['gaussians'] == len(result)
     assert 'Gaussians' in repr(result) and result.seconds > 0
     assert result._repr_html_().startswith('<img ')
+
+
+@pytest.mark.parametrize(
+    'call, message',
+    [
+        (lambda r: r.render('x'), 'geometry must be a Geometry, not str'),
+        (lambda r: r.volume((64, 64, 64)), 'geometry must be a Geometry, not tuple'),
+        (lambda r: r.metrics(VOLUME), 'data must be a Dataset, not ndarray'),
+        (lambda r: r.save(3), 'folder must be a path, not int'),
+    ],
+)
+def test_a_result_refuses_other_types(result, call, message):
+    with pytest.raises(lm.InputError, match=message):
+        call(result)
+
+
+def test_undershoots_are_no_hounsfield_units(geometry):
+    assert lm.simulate(VOLUME - 0.3, geometry, progress=False).train.projections.min() < 0
+
+
+def test_where_nothing_can_be_written(result, data, tmp_path, monkeypatch):
+    """A file where a folder is needed, and a folder where a file is: one line, for a fit before it starts."""
+    (tmp_path / 'file').write_text('')
+    monkeypatch.setattr('lingo_mi.api.fitting.initial_cloud', None)
+    for path in tmp_path / 'file' / 'fit.npz', tmp_path / 'file' / 'folder' / 'fit.npz', tmp_path:
+        with pytest.raises(lm.InputError, match='cannot write there|is a folder|cannot be written') as caught:
+            lm.fit(data, checkpoint=path, progress=False, **TINY)
+        assert '\n' not in str(caught.value)
+    for folder in tmp_path / 'file', tmp_path / 'file' / 'folder':
+        with pytest.raises(lm.InputError, match='cannot be written') as caught:
+            result.save(folder)
+        assert '\n' not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ['file']
+
+
+def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
+    found = lm.reconstruct(data, lm.SART(niter=2), progress=False)
+    numbers = found.metrics(data.volume)
+    assert list(numbers) == ['psnr_3d', 'ssim_3d', 'psnr_3d_r2', 'ssim_3d_r2']
+    assert numbers['psnr_3d'] == psnr_3d(found.volume, data.volume) > 10
+    assert found.metrics(found)['psnr_3d'] is None  # infinite
+    path = found.save(tmp_path / 'new' / 'foot.nii.gz')
+    stored = read_volume(path)
+    np.testing.assert_array_equal(stored.data, found.volume)
+    np.testing.assert_allclose(stored.spacing, data.train.geometry.dVoxel)
+    np.testing.assert_allclose(stored.affine[:3, 3], first_voxel(data.train.geometry))
+    with pytest.raises(lm.InputError, match='force=True'):
+        found.save(path)
+    assert found.save(str(path), force=True) == path
+    for bad in tmp_path / 'foot.npy', path / 'x.nii', 3:
+        with pytest.raises(lm.InputError):
+            found.save(bad)
+    with pytest.raises(lm.InputError, match='volumes have the shapes'):
+        found.metrics(data.volume[1:])
 
 
 def test_the_cloud_by_function(result, data):
@@ -154,6 +246,10 @@ def test_save_and_load(result, data, tmp_path):
     assert again.metrics()['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'])
     assert again.metrics(data)['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'], abs=1e-4)
     assert len(lm.load_result(folder / 'checkpoint.npz')) == len(result)
+    for damaged in '[]', '{':
+        (folder / 'metrics.json').write_text(damaged)
+        with pytest.raises(lm.InputError, match='metrics.json: is damaged'):
+            lm.load_result(folder)
 
 
 def test_checkpoint_and_resume(data, tmp_path):

@@ -146,6 +146,8 @@ def test_a_cloud_of_nothing(tmp_path):
 @pytest.mark.parametrize(
     'args, says',
     [
+        (['-D', 'lambda_tb=1'], 'did you mean lambda_tv?'),
+        (['-D', 'wavelet=1'], 'the documentation of Settings lists those'),
         (['-D', 'vews=3'], '(views)'),
         (['-D', 'views'], 'name=value'),
         (['-D', '=3'], 'name=value'),

@@ -87,3 +87,8 @@ def test_as_a_module():
     assert done.returncode == 0 and 'shepp_logan' in done.stdout
     done = run('nothing')
     assert done.returncode == 2 and done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
+
+
+def test_an_unknown_phantom_is_said_before_a_missing_out(command):
+    code, out, err = command('phantom', 'hand')
+    assert code == 2 and not out and err.startswith("error: there is no phantom 'hand'") and err.count('\n') == 1

@@ -428,7 +428,7 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch, module, name):
     if name:
         (tmp_path / name).touch()
     monkeypatch.setitem(sys.modules, module, None)
-    refused(tmp_path / name, r"pip install 'lingo_mi\[formats\]'")
+    refused(tmp_path / name, r"pip install '.\[formats\]' in a checkout")
 
 
 def test_readers_load_without_the_optional_packages():

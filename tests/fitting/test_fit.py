@@ -329,3 +329,28 @@ def test_files_that_are_no_fit(scan, stored):
     del extra['effects']  # as earlier versions wrote it
     checkpoint.save(stored, state, extra, arrays)
     assert len(Fitted.from_checkpoint(stored).state) == len(state)
+
+
+def test_progress_shows_the_absolute_measures(tmp_path):
+    """A resumed fit's history may have the measures under their earlier names."""
+    scan, path, shown = tiny_scan(geometry()), tmp_path / 'checkpoint.npz', []
+
+    def measured(values):
+        return lambda *_: values
+
+    settings = SHORT.changed(iterations=2, decay_steps=100)
+    run(
+        scan, settings, some_points(scan.geometry), measure=measured(dict(psnr_3d=1.0, psnr_3d_absolute=2.0)), path=path
+    )
+    longer = settings.changed(iterations=3)
+    again = run(
+        scan,
+        longer,
+        None,
+        measure=measured(dict(psnr_2d=3.0, psnr_3d=4.0, psnr_3d_r2=5.0)),
+        progress=lambda _, **fields: shown.append({k: v for k, v in fields.items() if k.startswith('psnr')}),
+        path=path,
+    )
+    assert shown[-1] == dict(psnr_2d=3.0, psnr_3d=4.0)
+    assert {k: v for k, v in again.history[0].items() if k.startswith('psnr')} == dict(psnr_3d_r2=1.0, psnr_3d=2.0)
+    assert Fitted.from_checkpoint(path).history == again.history

@@ -1,5 +1,6 @@
 """Settings of a fit, from the text of a command line too."""
 
+import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
@@ -60,10 +61,58 @@ def test_values(name, text, value):
     ],
 )
 @pytest.mark.parametrize('method', ['r2', 'fast'])
-def test_bad_values(method, name, text, message):
+def test_bad_texts(method, name, text, message):
     with pytest.raises(InputError) as caught:
         METHODS[method].changed(**{name: text})
     assert message in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'name, value, message',
+    [
+        ('iterations', 2.5, 'a whole number'),
+        ('iterations', True, 'a whole number'),
+        ('iterations', None, 'a whole number'),
+        ('iterations', float('nan'), 'a whole number'),
+        ('lambda_tv', (1, 2), 'a number'),
+        ('lambda_tv', False, 'a number'),
+        ('lambda_tv', 1j, 'a number'),
+        ('values_per_gaussian', None, 'a number'),
+        ('normalise', 1, 'True or False'),
+        ('init', 3, 'text'),
+        ('rate_density', 0.01, 'rate_density takes two numbers, first and last, such as (0.01, 0.001), not 0.01'),
+        ('rate_density', (1, 2, 3), 'two numbers'),
+        ('rate_density', ('1', '2'), 'two numbers'),
+        ('rate_density', (True, 2), 'two numbers'),
+        ('rate_densty', (1, 2), "unknown setting 'rate_densty', did you mean rate_density?"),
+        ('wavelet', 1, "unknown setting 'wavelet': see the documentation of Settings"),
+    ],
+)
+@pytest.mark.parametrize('method', ['r2', 'fast'])
+def test_bad_values_of_python(method, name, value, message):
+    with pytest.raises(InputError) as caught:
+        METHODS[method].changed(**{name: value})
+    assert message in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'name, value, expected',
+    [
+        ('iterations', np.int64(7), 7),
+        ('iterations', 2e3, 2000),
+        ('lambda_tv', np.float64(0.5), 0.5),
+        ('lambda_tv', 1, 1),
+        ('values_per_gaussian', 3.5, 3.5),
+        ('values_per_gaussian', '3.5', 3.5),
+        ('normalise', np.bool_(True), True),
+        ('rate_density', np.array([0.2, 0.1]), (0.2, 0.1)),
+        ('rate_density', [1, 0.1], (1, 0.1)),
+    ],
+)
+@pytest.mark.parametrize('method', ['r2', 'fast'])
+def test_values_of_python(method, name, value, expected):
+    found = METHODS[method].changed(**{name: value}).flat()[name]
+    assert found == expected and type(found) is type(expected)
 
 
 def test_settings_of():

@@ -1,5 +1,7 @@
 """Poses of every kind of scan: equivalences between geometries, axes by hand, bad input."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -300,3 +302,33 @@ def test_bad_poses():
         few.joined(circle('parallel'))
     with pytest.raises(InputError, match='one scan'):
         moving(tilt=0.1).joined(circle('parallel'))
+
+
+@pytest.mark.parametrize('name', ['nDetector', 'nVoxel'])
+@pytest.mark.parametrize('count', [24.9, (24, 32.5, 24)])
+def test_counts_are_whole_numbers(name, count):
+    count = count[:2] if name == 'nDetector' and isinstance(count, tuple) else count
+    scan = dict(DSO=100, DSD=150, nDetector=32.0, dDetector=1, nVoxel=np.float32(24), dVoxel=1, angles=[0.0])
+    assert Geometry.cone(**scan).nVoxel == (24, 24, 24)
+    with pytest.raises(InputError, match=f'{name} must be whole numbers'):
+        Geometry.cone(**scan | {name: count})
+
+
+@pytest.mark.parametrize('name', ['nVoxel', 'dDetector', 'angles', 'offOrigin'])
+@pytest.mark.parametrize('value', ['many', ['a', 'b', 'c'], [None, 1, 2]])
+def test_what_is_no_number(name, value):
+    scan = dict(nDetector=32, dDetector=1, nVoxel=24, dVoxel=1, angles=[0.0])
+    with pytest.raises(InputError, match=name.removesuffix('s')):
+        Geometry.parallel(**scan | {name: value})
+
+
+def test_angles_that_look_like_degrees_cause_a_warning():
+    panel = dict(nDetector=32, dDetector=1, nVoxel=24, dVoxel=1)
+    for angles in np.arange(360), np.arange(0, 180, 60):
+        with pytest.warns(UserWarning, match='numpy.radians') as caught:
+            Geometry.parallel(**panel, angles=angles)
+        assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        Geometry.parallel(**panel, angles=np.arange(6))
+        Geometry.cone(**panel, DSO=100, DSD=150, angles=circular(100, 3600))

@@ -11,7 +11,7 @@ from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.sensors import view_of
 
 physics = pytest.mark.skipif(
-    any(find_spec(m) is None for m in ('spekpy', 'xraylib')), reason="needs pip install 'lingo_mi[physics]'"
+    any(find_spec(m) is None for m in ('spekpy', 'xraylib')), reason="needs pip install '.[physics]'"
 )
 
 

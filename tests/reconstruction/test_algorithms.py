@@ -77,6 +77,10 @@ def test_options_are_fields(scan):
     [
         ('fdk', dict(filter='box'), "filter 'box' is unknown: use one of ram-lak, shepp-logan, cosine, hamming, hann"),
         ('sart', dict(niter=0), 'niter must be an integer from 1 on, not 0'),
+        ('sart', dict(niter='3'), "niter must be an integer from 1 on, not '3'"),
+        ('sart', dict(niter=True), 'niter must be an integer from 1 on, not True'),
+        ('sart', dict(lmbda=None), 'lmbda must be above 0 and at most 2, not None'),
+        ('sart', dict(tol='0'), "tol must be from 0 to 1e+18, not '0'"),
         ('sart', dict(lmbda=2.5), 'lmbda must be above 0 and at most 2, not 2.5'),
         ('sart', dict(lmbda_red=0), 'lmbda_red must be above 0 and at most 1, not 0'),
         (
@@ -191,3 +195,11 @@ def test_documentation(name):
     assert found[0].examples and runner.run(found[0]).failed == 0
     words = algorithm.__doc__.replace(',', ' ').split()
     assert all(option in words for option in algorithm().options)
+
+
+@pytest.mark.parametrize('name', [name for name in ALGORITHMS if name != 'refined'])
+def test_projections_spoilt_after_the_scan_was_made(scan, name):
+    spoilt = replace(scan, projections=scan.projections.copy())
+    spoilt.projections[3, 0, 0] = np.nan
+    with pytest.raises(InputError, match='first in view 3'):
+        reconstruct(spoilt, quick(name))

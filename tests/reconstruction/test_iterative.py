@@ -17,7 +17,7 @@ from lingo_mi.completion.views import complete
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph
@@ -352,8 +352,8 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
     found = Refined(4, 0, 1).run(scan, completed=scan, sample=lambda _: start).volume
     alike = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
     alike = alike.run(scan, start=start).volume
-    assert psnr_3d(found, made.data) > psnr_3d(alike, made.data) + 1, [
-        psnr_3d(v, made.data) for v in (found, alike, start)
+    assert psnr_3d_r2(found, made.data) > psnr_3d_r2(alike, made.data) + 1, [
+        psnr_3d_r2(v, made.data) for v in (found, alike, start)
     ]
 
 
@@ -370,7 +370,7 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
         return np.kron(means, np.ones(np.array(geometry.nVoxel) // means.shape))
 
     found = [
-        psnr_3d(Refined(3, 1, 5, finer=finer).run(coarse, completed=coarse, sample=sample).volume, means)
+        psnr_3d_r2(Refined(3, 1, 5, finer=finer).run(coarse, completed=coarse, sample=sample).volume, means)
         for finer in (1, 2)
     ]
     assert found[1] > found[0] + 3, found

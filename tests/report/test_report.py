@@ -39,8 +39,8 @@ def content(shape=SHAPE, **changes):
         cloud_density=rng.random(300),
         command='fit a > b',
         metrics=dict(
-            psnr_3d_absolute=31.234,
-            ssim_3d_absolute=0.9,
+            psnr_3d=31.234,
+            ssim_3d=0.9,
             psnr_2d=40.0,
             ipsd=float('nan'),
             ipsd_targets=0,
@@ -59,7 +59,7 @@ def content(shape=SHAPE, **changes):
                     seconds=i / 10,
                     loss=1 / (1 + i),
                     psnr_2d=30.0 if i % 2 else None,
-                    psnr_3d_absolute=float('nan'),
+                    psnr_3d=float('nan'),
                     gaussians=100 + i,
                 )
                 for i in range(5)
@@ -162,9 +162,7 @@ def test_headline():
         'PSNR 3D 31.23 dB   ·   SSIM 3D 0.9000   ·   PSNR 2D 40.00 dB   ·   51,234 Gaussians   ·   '
         '3,000 iterations   ·   fit 12.3 s'
     )
-    assert (
-        headline({'psnr_3d_absolute': np.inf, 'psnr_2d': np.float32('nan'), 'ssim_3d_absolute': None}) == 'PSNR 3D ∞ dB'
-    )
+    assert headline({'psnr_3d': np.inf, 'psnr_2d': np.float32('nan'), 'ssim_3d': None}) == 'PSNR 3D ∞ dB'
 
 
 # ---- Files ---------------------------------------------------------------------------------------

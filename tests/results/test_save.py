@@ -30,6 +30,13 @@ def test_a_result_without_a_scan(checkpoint, tmp_path):
     assert (tmp_path / 'result.xml').exists() and not (tmp_path / 'views').exists() and 'n/a' in summary(found)
 
 
+def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
+    fitted, test = Fitted.from_checkpoint(checkpoint), tiny_scan(geometry(2))
+    numbers = measure(fitted, test, fitted.volume()).numbers
+    assert f'PSNR {numbers["psnr_2d"]:.2f} dB, SSIM {numbers["ssim_2d"]:.4f}' in summary(numbers)
+    assert numbers['ssim_2d'] != numbers['ssim_2d_r2']
+
+
 def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path):
     fitted, test = Fitted.from_checkpoint(checkpoint), tiny_scan(geometry(2))
     found = save(tmp_path, fitted, measure(fitted, test, fitted.volume()), title='itself', method='r2', command='fit')

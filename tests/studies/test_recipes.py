@@ -13,16 +13,16 @@ from lingo_mi.studies import recipes as study
 METRICS = dict(
     psnr_2d=30.0,
     psnr_2d_r2=29.0,
-    ssim_2d=0.9,
-    psnr_3d=25.0,
-    ssim_3d=0.8,
+    ssim_2d_r2=0.9,
+    psnr_3d_r2=25.0,
+    ssim_3d_r2=0.8,
     ipsd=0.02,
     ipsd_targets=10,
     gaussians=100,
     iterations=7,
     seconds_init=0.1,
     seconds_fit=2.0,
-    history=[dict(seconds=1.0, psnr_2d=20.0, psnr_3d=15.0)],
+    history=[dict(seconds=1.0, psnr_2d=20.0, psnr_3d_r2=15.0)],
 )
 
 
@@ -88,3 +88,15 @@ def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypat
 def test_bad_methods(recipes, fits, method):
     code, _, err = recipes('--methods', 'r2', method)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not fits
+
+
+def test_results_stored_with_earlier_names_of_the_measures(tmp_path):
+    r2 = dict(ssim_2d=0.9, psnr_3d=25.0, ssim_3d=0.8)
+    old = {name: value for name, value in METRICS.items() if not name.endswith('d_r2') or name == 'psnr_2d_r2'} | r2
+    comparison = study.Comparison(tmp_path)
+    folder, _ = comparison.plan('a.xml', 'r2')
+    folder.mkdir()
+    (folder / 'metrics.json').write_text(
+        json.dumps(old | dict(history=[dict(seconds=1.0, psnr_2d=20.0, psnr_3d=15.0)]))
+    )
+    assert comparison.result('a.xml', 'r2') == METRICS

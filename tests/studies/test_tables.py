@@ -71,6 +71,18 @@ def test_a_cell_that_exists_is_not_computed_again(out):
     assert code == 0 and '1 of 1 cells' in text
 
 
+def test_a_cell_stored_with_earlier_names_of_the_measures_is_read(tmp_path):
+    cells, fit = Cells(tmp_path, TINY), Fit('foot', 3, 'r2', 5)
+    old = dict(
+        psnr_2d_r2=30.0, ssim_2d=0.9, ipsd=None, psnr_3d=25.0, ssim_3d=0.8, psnr_3d_absolute=24.0, seconds_init=1
+    )
+    for cell in fit, Volume(fit, 'fdk'):
+        cells.path(cell).parent.mkdir(parents=True, exist_ok=True)
+        cells.path(cell).write_text(json.dumps(old))
+        found = cells.get(cell)
+        assert (found['psnr_3d_r2'], found['psnr_3d'], found['ssim_2d_r2']) == (25.0, 24.0, 0.9)
+
+
 @pytest.mark.parametrize('content', [b'', b'{}', b'[]', b'{"psnr_2d_r2": 3', b'\xff'])
 def test_a_damaged_cell_is_computed_again(out, content):
     arguments = 'views', out, '--views', '3', '--iterations', '5', '--methods', 'r2'
@@ -90,7 +102,7 @@ def test_two_stages(out):
     rows = {r['second']: r['columns'] for r in json.loads((out / 'ct.json').read_text()) if r['object'] == 'foot'}
     assert list(rows) == ['fdk', 'sart', 'asd-pocs', 'refined', 'voxelize']
     assert rows['voxelize']['none'] is None and '| voxelize | foot | – | – |' in text
-    volumes = [rows[a][m]['psnr_3d'] for a in ('fdk', 'sart', 'asd-pocs') for m in ('none', 'r2')]
+    volumes = [rows[a][m]['psnr_3d_r2'] for a in ('fdk', 'sart', 'asd-pocs') for m in ('none', 'r2')]
     assert len(set(volumes)) == 6 and min(volumes) > 0
     # The numbers are those of the algorithms, on views rendered from the stored cloud.
     cells = Cells(out, TINY)
@@ -101,11 +113,11 @@ def test_two_stages(out):
     np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
     volume = tables.FDK().run(whole).volume
     truth = make('foot', 16).data
-    assert rows['fdk']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(volume, truth), abs=1e-3)
+    assert rows['fdk']['r2']['psnr_3d_r2'] == pytest.approx(tables.metrics.psnr_3d_r2(volume, truth), abs=1e-3)
     measured = train.subset([0, 6, 12, 18])
     refined = tables.Refined().run(measured, completed=whole, sample=cells._cloud(fit).volume)
     found = refined.volume
-    assert rows['refined']['r2']['psnr_3d'] == pytest.approx(tables.metrics.psnr_3d(found, truth), abs=1e-3)
+    assert rows['refined']['r2']['psnr_3d_r2'] == pytest.approx(tables.metrics.psnr_3d_r2(found, truth), abs=1e-3)
     assert (
         rows['refined']['none'] is None
         and groups('ct', [4], [20], ['3dgs'], ['refined'])[0].columns[1].cell('foot') is None
@@ -127,7 +139,7 @@ def test_the_parts_of_lingo():
 
 def test_opacities_have_no_row_of_means(tmp_path):
     found = groups('ct', [4], [20], ['3dgs'])
-    cells = mock.Mock(get=lambda cell: dict(psnr_3d=30.0, ssim_3d=0.9))
+    cells = mock.Mock(get=lambda cell: dict(psnr_3d_r2=30.0, ssim_3d_r2=0.9))
     rows = [(row['second'], row['object']) for row in results(found, ['foot'], cells)]
     assert rows == [(a, name) for a in ('fdk', 'sart', 'asd-pocs') for name in ('foot', 'mean of 1')] + [
         ('refined', 'foot'),
@@ -141,7 +153,7 @@ def test_opacities_have_no_row_of_means(tmp_path):
 
 def test_paper_beside_ours():
     found = groups('views', [5, 25], [5000, 30_000], ['r2', 'lingo', 'fast'])
-    cells = mock.Mock(get=lambda cell: dict(psnr_2d_r2=30.0 + cell.views, ssim_2d=0.9, ipsd=None))
+    cells = mock.Mock(get=lambda cell: dict(psnr_2d_r2=30.0 + cell.views, ssim_2d_r2=0.9, ipsd=None))
     text = markdown('views', found, results(found, ['a', 'b'], cells))
     assert '| 25 | 30000 | paper | 46.09 | 0.9899 | 0.1129 | 47.04 | 0.9911 | 0.0233 | – | – | – |' in text
     assert '| 5 | 5000 | mean of 2 | 35.00 | 0.9000 | – |' in text
@@ -166,7 +178,9 @@ def test_the_order_of_cells():
 
 
 def numbers(found):
-    return {k: found[k] for k in ('psnr_2d_r2', 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians')}
+    return {
+        k: found[k] for k in ('psnr_2d_r2', 'psnr_2d', 'ssim_2d_r2', 'psnr_3d_r2', 'ssim_3d_r2', 'ipsd', 'gaussians')
+    }
 
 
 def test_an_interrupted_fit_goes_on(tmp_path):
