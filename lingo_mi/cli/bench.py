@@ -57,7 +57,7 @@ def main() -> None:
     print(describe_times(result, args.repeats))
     if variant.startswith('cuda'):
         for part, name in (('image', 'forward'), ('derivatives', 'backward')):
-            print(beside(name, part, result[f'{name}_ms'] / 1e3, args.gaussians, result['pairs']))
+            print(beside(name, part, float(result[f'{name}_ms']) / 1e3, args.gaussians, float(result['pairs'])))
     if args.bvh:
         result |= bench.against_tree()
         print(describe_tree(result))

@@ -81,6 +81,11 @@ def plain(error: Exception) -> str:
         return (f'line {lines[-1]}: ' if lines else '') + ours[-1].strip()
     if '"ellipsoids"' in text and '(sizes: 0, 1)' in text:  # Mitsuba's message for an empty cloud
         return 'the shape ellipsoids holds no Gaussian: give it a file or data of at least one'
+    if 'Could not initialize OptiX' in text:
+        return (
+            'Mitsuba needs OptiX to load a scene on a GPU, and the NVIDIA driver here has none (in a container: '
+            'NVIDIA_DRIVER_CAPABILITIES=all); take --variant llvm_ad_mono, or give an array or a scan instead of a scene'
+        )
     text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]
     return ' '.join(lines)[:400] or type(error).__name__
