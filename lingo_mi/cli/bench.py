@@ -15,6 +15,7 @@ against float64 on some of the pixels. That takes a minute; --no-bvh leaves it o
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
@@ -53,11 +54,11 @@ def main() -> None:
     from lingo_mi.studies.cuda.model import beside
 
     bench = Bench(Work(args.gaussians, args.size, args.pixels, args.extent, args.repeats))
-    result = bench.times() | dict.fromkeys(TREE)
+    result: dict[str, Any] = {**bench.times(), **dict.fromkeys(TREE)}
     print(describe_times(result, args.repeats))
     if variant.startswith('cuda'):
         for part, name in (('image', 'forward'), ('derivatives', 'backward')):
-            print(beside(name, part, float(result[f'{name}_ms']) / 1e3, args.gaussians, float(result['pairs'])))
+            print(beside(name, part, result[f'{name}_ms'] / 1e3, args.gaussians, result['pairs']))
     if args.bvh:
         result |= bench.against_tree()
         print(describe_tree(result))

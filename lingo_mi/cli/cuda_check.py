@@ -1,7 +1,7 @@
 """Check the CUDA backend without a GPU: the tests on cuda_ad_mono under a stand-in for the driver, then NVIDIA's assembler.
 
-    lingo-mi cuda-check --stand-in PROGRAM --share
-    lingo-mi cuda-check --stand-in PROGRAM --markdown docs/tables/cuda.md
+    lingo-mi cuda-check --stand-in PROGRAM --share --sm 80
+    lingo-mi cuda-check --stand-in PROGRAM --noise --markdown docs/tables/cuda.md
 
 PROGRAM COMMAND ... runs a command with a CUDA driver that executes Dr.Jit's PTX on the CPU (see lingo_mi.studies.cuda). Needs a
 checkout, for its tests, and `pip install nvidia-cuda-nvcc-cu12` for ptxas. The exit code is 1 where a test fails, or a kernel
@@ -24,8 +24,11 @@ def arguments() -> argparse.Namespace:
     p.add_argument(
         '--tests', type=Path, default=Path('tests'), metavar='FOLDER', help='of the checkout (default: tests)'
     )
-    p.add_argument('--share', action='store_true', help='few tests, for one compute capability: some minutes')
+    p.add_argument(
+        '--share', action='store_true', help='few tests of every part that computes on the device: some minutes'
+    )
     p.add_argument('--sm', type=int, nargs='+', default=[75, 80, 90], help='compute capabilities times ten')
+    p.add_argument('--noise', action='store_true', help='once more, with the errors that NVIDIA allows, and checks')
     p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
     args = p.parse_args()
     if shutil.which(args.stand_in) is None:
@@ -46,9 +49,9 @@ def main() -> int:
     stand_in, outcomes = Path(shutil.which(args.stand_in) or '').resolve(), {}
     files = [args.tests / name for name in SHARE] if args.share else test_files(args.tests)
     with tempfile.TemporaryDirectory() as folder:
-        runs = {f'sm_{sm}': dict(SM=sm, DUMP=folder) for sm in ([80] if args.share else args.sm)}
-        if not args.share:
-            runs['sm_80, noise, checked'] = dict(SM=80, NOISE=1, CHECK=1)
+        runs = {f'sm_{sm}': dict(SM=sm, DUMP=folder) for sm in args.sm}
+        if args.noise:
+            runs[f'sm_{args.sm[0]}, noise, checked'] = dict(SM=args.sm[0], NOISE=1, CHECK=1)
         for title, settings in runs.items():
             outcomes[title] = run_tests(
                 stand_in, files, lambda line, title=title: print(f'{title}: {line}', flush=True), **settings

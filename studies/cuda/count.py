@@ -22,7 +22,7 @@ KINDS = 'fp32', 'fp64', 'int', 'mufu', 'load', 'store', 'atomic', 'branch', 'syn
 SECTORS = {'l': 'loads', 's': 'stores', 'a': 'atomics'}
 
 
-def profiled(stand_in: str, *arguments: str) -> tuple[dict, dict]:
+def profiled(stand_in: str, *arguments: str) -> tuple[str, dict]:
     """What `work` prints, and the counts of all kernels that it launches, by name.
 
     A kernel's counts: launches; `warp`: instructions of warps by kind; `lanes`: their lanes at work, summed; sectors by kind.
@@ -34,7 +34,7 @@ def profiled(stand_in: str, *arguments: str) -> tuple[dict, dict]:
         kernels = {}
         for file in Path(folder).glob('profile.*.json'):
             kernels |= {name: _counts(k) for name, k in json.loads(file.read_text()).items()}
-    return json.loads(done.stdout.splitlines()[-1]), kernels
+    return done.stdout, kernels
 
 
 def _counts(kernel):
@@ -62,9 +62,9 @@ def difference(more: dict, less: dict) -> dict:
 
 def counted(stand_in: str, cloud: str) -> dict:
     """Sizes, and the kernels of an image and of its derivatives; of a fit's checkpoint also those of a step."""
-    sizes, image = profiled(stand_in, cloud, 'image')
-    _, both = profiled(stand_in, cloud, 'derivatives')
-    out = sizes | dict(image=list(image.values()), derivatives=list(difference(both, image).values()))
+    sizes, _ = profiled(stand_in, cloud, 'sizes')
+    image, both = (profiled(stand_in, cloud, part)[1] for part in ('image', 'derivatives'))
+    out = json.loads(sizes) | dict(image=list(image.values()), derivatives=list(difference(both, image).values()))
     if cloud != 'giants':
         few, more = (profiled(stand_in, cloud, 'steps', str(n))[1] for n in (1, 2))
         out['step'] = list(difference(more, few).values())

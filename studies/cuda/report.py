@@ -18,7 +18,7 @@ PASSES = dict(image='image', derivatives='derivatives', step='a step')
 
 
 def per_pair(kernels: list[dict], pairs: float) -> dict:
-    """Of the largest kernel: instructions of warps a pair, share of lanes at work, sectors a pair; sectors of atomics a pair."""
+    """Of the largest kernel: instructions of warps a pair, share of lanes at work, sectors a pair, those of atomics, and predicted ms."""
     kernel = largest(kernels)
     instructions = sum(kernel['warp'].values())
     sectors = kernel['loads'] + kernel['stores'] + kernel['atomics']
@@ -27,6 +27,7 @@ def per_pair(kernels: list[dict], pairs: float) -> dict:
         lanes=kernel['lanes'] / (32 * instructions),
         sectors=sectors / pairs,
         atomics=kernel['atomics'] / pairs,
+        ms=1e3 * seconds(kernel, CARDS[0]),
     )
 
 
@@ -48,6 +49,7 @@ def compared(before: dict, after: dict) -> str:
             column('lanes at work', 'lanes', '{:.2f}'),
             column('sectors a pair', 'sectors', '{:.3f}'),
             column('of them atomic', 'atomics', '{:.3f}'),
+            column(f'{CARDS[0].name}, ms', 'ms', '{:.3f}'),
         ],
         rows,
     )

@@ -2,19 +2,18 @@
 
 CLOUD is the checkpoint of a fit, or `giants`: 300 random Gaussians that fill the image. PART is
 
+    sizes         print a line of JSON: the Gaussians, the image's pixels, and the pairs of a Gaussian and a pixel, inside the
+                  cut-off (`pairs`) and inside the footprint's box (`boxes`)
     image         project it into one view of its scan
     derivatives   that, and backpropagate an image of random derivatives
     steps N       N steps of its fit on that view: the gain from N to N + 1 is one step
-
-It prints a line of JSON: the Gaussians, the image's pixels, and the pairs of a Gaussian and a pixel, inside the cut-off (`pairs`)
-and inside the footprint's box (`boxes`).
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from typing import Any
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -38,7 +37,7 @@ from lingo_mi.studies.pairs import count_pairs
 VIEW = 3
 
 
-def giants() -> tuple[list[np.ndarray], Geometry]:
+def giants() -> tuple[Sequence[np.ndarray], Geometry]:
     """Random Gaussians with standard deviations of about 15 mm, and a scan of 512 x 512 pixels of 1 mm."""
     rng, count = np.random.default_rng(0), 300
     cloud = [
@@ -56,36 +55,35 @@ def main() -> None:
     name, part, *count = sys.argv[1:]
     use_variant('cuda_ad_mono')
     if part == 'steps':
-        found = steps(Fitted.from_checkpoint(name), int(count[0]))
-    elif name == 'giants':
-        found = image(*giants(), derivatives=part == 'derivatives')
-    else:
-        fitted = Fitted.from_checkpoint(name)
-        found = image(fitted.world_gaussians(), fitted.geometry, derivatives=part == 'derivatives')
-    print(json.dumps(found))
-
-
-def image(cloud: Any, geometry: Geometry, derivatives: bool) -> dict:
-    """Project a cloud into one view, and backpropagate."""
+        return steps(Fitted.from_checkpoint(name), int(count[0]))
+    fitted = None if name == 'giants' else Fitted.from_checkpoint(name)
+    cloud, geometry = giants() if fitted is None else (fitted.world_gaussians(), fitted.geometry)
     *vectors, density = (np.float32(x) for x in cloud)
     types = mi.Point3f, mi.Vector3f, mi.Vector4f
     gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
     view = View.of(geometry.rays(), VIEW, *geometry.nDetector, panel=False)
+    if part == 'sizes':
+        print(json.dumps(sizes(gaussians, view)))
+    else:
+        image(gaussians, view, derivatives=part == 'derivatives')
+
+
+def image(gaussians: Sequence, view: View, derivatives: bool) -> None:
+    """Project a cloud into one view, and backpropagate."""
     if derivatives:
         dr.enable_grad(gaussians)
     found = line_integrals(*gaussians, view=view, options=RenderOptions(FIT))
     dr.eval(found)
     if derivatives:
-        upstream = np.random.default_rng(1).normal(size=geometry.nDetector).astype(np.float32)
-        dr.set_grad(found, uploaded(upstream.ravel()))
+        upstream = np.random.default_rng(1).normal(size=dr.width(found)).astype(np.float32)
+        dr.set_grad(found, uploaded(upstream))
         dr.enqueue(dr.ADMode.Backward, found)
         dr.traverse(dr.ADMode.Backward)
         dr.eval([dr.grad(x) for x in gaussians])
     dr.sync_thread()
-    return _sizes(gaussians, view)
 
 
-def steps(fitted: Fitted, count: int) -> dict:
+def steps(fitted: Fitted, count: int) -> None:
     """Late steps of a fit, on one view with random pixels: what is counted does not depend on them."""
     geometry, rng = fitted.geometry.subset([VIEW]), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)))
@@ -93,11 +91,10 @@ def steps(fitted: Fitted, count: int) -> dict:
     for i in range(count):
         stepper.step(state, [0], fitted.settings.iterations - 1 - count + i, rng)
     dr.sync_thread()
-    return _sizes(state.gaussians(fitted.settings), stepper.targets[0].view)
 
 
-def _sizes(gaussians, view):
-    gaussians = [dr.detach(x) for x in gaussians]
+def sizes(gaussians: Sequence, view: View) -> dict:
+    """How much there is to do."""
     area = dr.sum(dr.float64_array_t(mi.Float)(project(*gaussians, view=view, extent=FIT).area))
     return dict(
         gaussians=dr.width(gaussians[-1]),
