@@ -22,3 +22,31 @@ def pass_on(values: Iterable, gradients: Iterable, flags: Any = dr.ADFlag.Defaul
             dr.set_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
     dr.traverse(dr.ADMode.Backward, flags)
+
+
+class Cuts:
+    """A computation cut into parts that are backpropagated one after another, last first, each in a kernel of its own.
+
+    A kernel needs registers for all values that its derivatives refer to, so a long one leaves room for few warps on a GPU.
+    """
+
+    def __init__(self):
+        self.parts = []
+
+    def __call__(self, *values: Any) -> Any:
+        """Copies of intermediate values, to go on with. No value may be given twice."""
+        copies = dr.detach(values)
+        dr.eval(copies)
+        dr.enable_grad(copies)
+        self.parts.append((values, copies))
+        return copies
+
+    def pass_on(self, values: Iterable, gradients: Iterable) -> None:
+        """Backpropagate given gradients, one per value, through all parts."""
+        keep = dr.ADFlag.ClearVertices  # parts may share the graph of what comes before them
+        pass_on(values, gradients, keep if self.parts else dr.ADFlag.Default)
+        while self.parts:
+            values, copies = self.parts.pop()
+            found = [dr.grad(copy) for copy in copies]
+            dr.eval(found)
+            pass_on(values, found, keep if self.parts else dr.ADFlag.Default)

@@ -75,9 +75,20 @@ class Footprints:
         return self.row_end > self.row_begin
 
 
+def _uncut(*values):
+    return values
+
+
 @full_float64()
 def project(
-    centre: Any, scale: Any, rotation: Any, density: Any, view: View, extent: float, widen: float = 0.0
+    centre: Any,
+    scale: Any,
+    rotation: Any,
+    density: Any,
+    view: View,
+    extent: float,
+    widen: float = 0.0,
+    cut: Any = _uncut,
 ) -> Footprints:
     """Footprints of N Gaussians in a view.
 
@@ -88,12 +99,13 @@ def project(
     density         Float [N], value at the centre
     extent          cut-off in standard deviations
     widen           variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
+    cut             called with intermediate values, gives what to go on with (see `backprop.Cuts`)
     """
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)
     Vector4d: Any = dr.float64_array_t(type(rotation))
-    rows = rows_of(Vector4d(rotation), Vector3d)
+    rows = cut(*rows_of(Vector4d(rotation), Vector3d))
     inverse = 1 / s
     a, b = view.u, view.v
     n = dr.cross(a, b)
@@ -102,12 +114,13 @@ def project(
         to_plane = p - view.corner
         depth = dr.dot(n, view.source)
         hit = to_plane - view.source * (dr.dot(n, to_plane) / depth)
-        w = inverse * rotate_inverse(rows, view.source)
+        across = (rotate_inverse(rows, step) for step in (a, b))
+        w, inverse, *across = cut(inverse * rotate_inverse(rows, view.source), inverse, *across)
         visible = dr.isfinite(dr.detach(dr.squared_norm(w) + dr.squared_norm(hit) + rho))
         straddles = ~visible
         norm = dr.rsqrt(dr.squared_norm(w))
         what = w * norm
-        na, nb = (dr.cross(what, inverse * rotate_inverse(rows, step)) for step in (a, b))
+        norm, na, nb = cut(norm, *(dr.cross(what, inverse * step) for step in across))
         e1 = e2 = e11 = e12 = e22 = dr.zeros(Float64, dr.width(p))
         factor = norm
     else:
@@ -131,16 +144,19 @@ def project(
         r = dr.select(visible, r, n)  # invisible ones: a safe value, to avoid division by zero below
         depth = dr.dot(n, r)
         k = plane / depth
-        hit = k * r - axis
-        w = inverse * rotate_inverse(rows, r)
+        r, k, depth, hit = cut(r, k, depth, k * r - axis)
+        across = (rotate_inverse(rows, step) for step in (a, b))
+        w, inverse, *across = cut(inverse * rotate_inverse(rows, r), inverse, *across)
         length = dr.norm(w)
         norm = 1 / (k * length)
-        wa, wb = (inverse * norm * rotate_inverse(rows, step) for step in (a, b))
+        wa, wb = (inverse * norm * step for step in across)
+        w, wa, wb, norm, length = cut(w, wa, wb, norm, length)
         na, nb = dr.cross(w, wa), dr.cross(w, wb)
         what = w / length
         e1, e2 = 2 * dr.dot(what, wa), 2 * dr.dot(what, wb)
         e11, e12, e22 = dr.squared_norm(wa), dr.dot(wa, wb), dr.squared_norm(wb)
         factor = length * dr.square(norm)
+        norm, na, nb, factor, e1, e2, e11, e12, e22 = cut(norm, na, nb, factor, e1, e2, e11, e12, e22)
 
     amplitude = rho * SQRT_2PI * norm
     # |na x nb|, from the determinant of W: for a needle, na and nb are nearly parallel and their product would cancel.

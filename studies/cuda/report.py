@@ -18,7 +18,7 @@ PASSES = dict(image='image', derivatives='derivatives', step='a step')
 
 
 def per_pair(kernels: list[dict], pairs: float) -> dict:
-    """Of the largest kernel: instructions of warps a pair, share of lanes at work, sectors a pair, those of atomics, and predicted ms."""
+    """Of the largest kernel: instructions of warps a pair, lanes at work, sectors a pair, those of atomics, predicted ms."""
     kernel = largest(kernels)
     instructions = sum(kernel['warp'].values())
     sectors = kernel['loads'] + kernel['stores'] + kernel['atomics']
