@@ -27,6 +27,9 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--json', type=Path, metavar='F', help='write all numbers there, for --beside')
     p.add_argument('--beside', type=Path, metavar='F', help="show another variant's results in columns of their own")
     p.add_argument('--steps', type=int, default=10_000, metavar='N', help='of the long fit (default: 10000)')
+    p.add_argument(
+        '--without', nargs='+', default=[], metavar='TEXT', help='leave out the cases whose names contain one of these'
+    )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
@@ -42,7 +45,7 @@ def main() -> int:
     from lingo_mi.studies.provenance import write_provenance
 
     beside = stored(args.beside) if args.beside else None
-    cases = all_cases(steps=args.steps)
+    cases = [case for case in all_cases(steps=args.steps) if not any(text in case.name for text in args.without)]
     results = [(case, measure(case)) for case in cases]
     missed = [(case.name, wrong) for case, result in results if (wrong := miss(case, result))]
     if beside:

@@ -77,6 +77,8 @@ def markdown(results: Sequence[tuple], beside: Stored | None = None) -> str:
         titles[2:2] = [f'image, {beside.title}']
         titles[-2:-2] = [f'derivatives, {beside.title}']
     lines = [INTRODUCTION, f'| {" | ".join(titles)} |', '|---' * len(titles) + '|']
+    if beside:
+        lines[1:1] = [f'Columns of {beside.title} are those of `{beside.variant}`, of derivatives the worst kind.\n']
     misses = beside.misses([case for case, _ in results]) if beside else {}
     for case, result in results:
         limits = [None] * 2 if result.image is None else [case.image, case.gradient]
