@@ -3,9 +3,13 @@
     lingo-mi accuracy
     lingo-mi accuracy --quick
     lingo-mi accuracy --docs docs
+    lingo-mi accuracy --presets --variant cuda_ad_mono --out out/cuda
+    lingo-mi accuracy --presets --beside out/cuda/accuracy.json
 
 Writes accuracy.json, accuracy.md and the plots to --out, and to accuracy.provenance.json how they were made. The full run takes
 6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go there and the tables into a page there, too.
+
+--presets measures the table of the presets alone, which needs no ray tracing. --beside adds another variant's errors to it.
 """
 
 import argparse
@@ -20,6 +24,10 @@ from lingo_mi.runtime import use_variant
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
+    p.add_argument('--presets', action='store_true', help='the presets alone: their table, no plots')
+    p.add_argument(
+        '--beside', type=Path, metavar='F', help="show another variant's errors with the presets: its accuracy.json"
+    )
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
     docs_arguments(p, 'accuracy.md', 'figures')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -30,17 +38,20 @@ def main() -> None:
     args = arguments()
     document, figures = docs_of(args)
     use_variant(args.variant)
-    from lingo_mi.studies.accuracy import FULL, QUICK, measure
+    from lingo_mi.studies.accuracy import FULL, QUICK, measure, measure_presets
     from lingo_mi.studies.accuracy.report import write
-    from lingo_mi.studies.accuracy.tables import TITLES
+    from lingo_mi.studies.accuracy.tables import TITLES, read_presets
     from lingo_mi.studies.markdown import check_places
 
     if document:
-        check_places(document, TITLES)
+        check_places(document, ['presets'] if args.presets else TITLES)
+    beside = read_presets(args.beside) if args.beside else None
+    sizes = QUICK if args.quick else FULL
+    if args.presets:
+        write(measure_presets(sizes), args.out, figures, document, beside)
+        print(f'{args.out}/: accuracy.json, accuracy.md')
+        return
     begun = time.perf_counter()
-    found = measure(
-        QUICK if args.quick else FULL,
-        lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr),
-    )
-    write(found, args.out, figures, document)
+    found = measure(sizes, lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr))
+    write(found, args.out, figures, document, beside)
     print(f'{args.out}/: accuracy.json, accuracy.md; {figures}/: pareto.png, scaling.png, fits.png')

@@ -2,10 +2,14 @@
 
     lingo-mi hard-cases
     lingo-mi hard-cases --markdown hard_cases.md
+    lingo-mi hard-cases --variant cuda_ad_mono --json cuda.json
+    lingo-mi hard-cases --variant llvm_ad_mono --beside cuda.json --markdown hard_cases.md
 
 Every line is a case that the tests assert: relative errors of the image, and of the derivatives by the Gaussians' parameters,
 in float32 against float64 (`lingo_mi.studies.hard_cases.measuring` says how they are counted). The exit code is 1 where a case
 misses its tolerance. Beside the page that --markdown names, FILE.provenance.json says how it was made.
+
+The table shows two variants where --beside names the results of another, as --json wrote them; its misses count, too.
 """
 
 import argparse
@@ -13,31 +17,46 @@ import sys
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
 
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--markdown', type=Path, metavar='F', help='write the table there, too')
+    p.add_argument('--json', type=Path, metavar='F', help='write all numbers there, for --beside')
+    p.add_argument('--beside', type=Path, metavar='F', help="show another variant's results in columns of their own")
+    p.add_argument('--steps', type=int, default=10_000, metavar='N', help='of the long fit (default: 10000)')
+    p.add_argument(
+        '--without', nargs='+', default=[], metavar='TEXT', help='leave out the cases whose names contain one of these'
+    )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
 
 def main() -> int:
     args = arguments()
-    use_variant(args.variant)
+    if args.steps < 1:
+        raise InputError(f'--steps must be at least 1, not {args.steps}')
+    variant = use_variant(args.variant)
     from lingo_mi.studies.hard_cases.cases import all_cases
     from lingo_mi.studies.hard_cases.measuring import measure, miss
-    from lingo_mi.studies.hard_cases.table import markdown
+    from lingo_mi.studies.hard_cases.table import markdown, store, stored
     from lingo_mi.studies.provenance import write_provenance
 
-    results = [(case, measure(case)) for case in all_cases(steps=10_000)]
-    missed = [(case, wrong) for case, result in results if (wrong := miss(case, result))]
-    for case, wrong in missed:
-        print(f'missed its tolerance: {case.name}: {wrong}', file=sys.stderr)
-    table = markdown(results)
+    beside = stored(args.beside) if args.beside else None
+    cases = [case for case in all_cases(steps=args.steps) if not any(text in case.name for text in args.without)]
+    results = [(case, measure(case)) for case in cases]
+    missed = [(case.name, wrong) for case, result in results if (wrong := miss(case, result))]
+    if beside:
+        missed += [(f'{name}, {beside.title}', wrong) for name, wrong in beside.misses(cases).items()]
+    for name, wrong in missed:
+        print(f'missed its tolerance: {name}: {wrong}', file=sys.stderr)
+    table = markdown(results, beside)
     print(table, end='')
     if args.markdown:
         args.markdown.write_text(table, encoding='utf-8')
         write_provenance(args.markdown)
+    if args.json:
+        store(args.json, variant, results)
     return int(bool(missed))

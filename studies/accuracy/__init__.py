@@ -13,12 +13,13 @@ from dataclasses import asdict
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies.accuracy import fits, images, scaling
 from lingo_mi.studies.accuracy.sizes import FULL, QUICK, Sizes
 from lingo_mi.studies.accuracy.workload import Workload
 from lingo_mi.studies.provenance import machine
 
-__all__ = ['FULL', 'QUICK', 'Sizes', 'measure']
+__all__ = ['FULL', 'QUICK', 'Sizes', 'measure', 'measure_presets']
 
 
 def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> dict:
@@ -38,10 +39,19 @@ def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> di
         initialisations=lambda: fits.initialisations(sizes),
         fits=lambda: fits.curves(sizes),
     )
-    conditions = dict(variant=mi.variant(), threads=dr.thread_count(), machine=machine(), sizes=asdict(sizes))
-    out: dict = dict(conditions=conditions)
+    out: dict = dict(conditions=_conditions(sizes))
     for name, part in parts.items():
         if progress:
             progress(name)
         out[name] = part()
     return out
+
+
+def measure_presets(sizes: Sizes) -> dict:
+    """Of `measure` the conditions and the presets' cut-offs, which need no ray tracing."""
+    work = Workload(sizes.gaussians, sizes.pixels, sizes.box)
+    return dict(conditions=_conditions(sizes), cutoff=images.cutoff(work, sizes, PRESETS.values()))
+
+
+def _conditions(sizes: Sizes) -> dict:
+    return dict(variant=mi.variant(), threads=dr.thread_count(), machine=machine(), sizes=asdict(sizes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import drjit as dr
@@ -21,11 +22,11 @@ EPSILONS = 1e-3, 1e-4, 1e-5
 EXTENT = 5.0
 
 
-def cutoff(work: Workload, sizes: Sizes) -> list[dict]:
+def cutoff(
+    work: Workload, sizes: Sizes, extents: Iterable[float] = (2.0, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)
+) -> list[dict]:
     """Cut-off from 2 to 8 standard deviations."""
-    rows = compare(
-        work, [by_integrator(f'{e:g}', work, extent=e) for e in (2.0, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0)], sizes
-    )
+    rows = compare(work, [by_integrator(f'{e:g}', work, extent=e) for e in extents], sizes)
     for row in rows:
         row['pairs'] = work.pairs(float(row['name']))
     return rows

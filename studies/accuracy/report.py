@@ -11,21 +11,25 @@ from lingo_mi.studies.markdown import insert_into
 from lingo_mi.studies.provenance import write_provenance
 
 
-def write(found: dict, folder: Path, figures: Path, document: Path | None = None) -> None:
+def write(found: dict, folder: Path, figures: Path, document: Path | None = None, beside: dict | None = None) -> None:
     """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables into a document.
 
-    document   a Markdown file with a place for each table of TITLES; None: no document
+    Of presets alone there is one table and no plot.
+
+    document   a Markdown file with a place for each table; None: no document
+    beside     another variant's presets, `tables.read_presets`
 
     `provenance` is written beside accuracy.md and beside the document.
     """
-    tables = make_tables(found)
-    for path in (folder, figures):
-        path.mkdir(parents=True, exist_ok=True)
+    tables = make_tables(found, beside)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / 'accuracy.json').write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
     text = '\n\n'.join(f'## {TITLES[name]}\n\n{table}' for name, table in tables.items())
     (folder / 'accuracy.md').write_text(f'# Accuracy against time\n\n{text}\n', encoding='utf-8')
     write_provenance(folder / 'accuracy.md')
-    draw(found, figures)
+    if 'methods' in found:
+        figures.mkdir(parents=True, exist_ok=True)
+        draw(found, figures)
     if document:
         insert_into(document, tables)
         write_provenance(document)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import reading
 from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies.closed_form import NAMES
 from lingo_mi.studies.markdown import table
@@ -25,8 +30,14 @@ TITLES = dict(
 )
 
 
-def make_tables(found: dict) -> dict[str, str]:
-    """Markdown tables by name, those of TITLES."""
+def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
+    """Markdown tables by name, those of TITLES; of presets alone, their own.
+
+    beside   another variant's presets, `read_presets`, whose errors are shown beside
+    """
+    presets = preset_table(found, beside)
+    if 'methods' not in found:
+        return dict(presets=presets)
     first = dict(
         cutoff='cut-off, σ',
         footprint='footprint',
@@ -39,7 +50,7 @@ def make_tables(found: dict) -> dict[str, str]:
     wrong = ('wrong rays', lambda r: f'{100 * r["wrong_rays"]:.2g} %')
     tables['marching'] = table([_COMPARE[0], wrong, *_COMPARE[1:]], found['marching'], first['marching'])
     tables['conditions'] = conditions(found['conditions'])
-    tables['presets'] = table(_PRESETS, presets(found['cutoff']))
+    tables['presets'] = presets
     tables['scaling'] = table(
         _SCALING, [dict(row, sweep=sweep) for sweep, rows in found['scaling'].items() for row in rows]
     )
@@ -59,7 +70,31 @@ def conditions(c: dict) -> str:
     )
 
 
-def presets(cutoff: list[dict]) -> list[dict]:
+def preset_table(found: dict, beside: dict | None = None) -> str:
+    """The table of the presets. beside   see `make_tables`"""
+    columns, rows = list(_PRESETS), preset_rows(found['cutoff'])
+    if beside:
+        title = beside['conditions']['variant'].split('_')[0].upper()
+        for row, other in zip(rows, preset_rows(beside['cutoff'])):
+            row.update(other_image=other['image'], other_worst=max(other[key] for key in NAMES))
+        # Before the times, which are those of the first variant alone.
+        columns[-2:-2] = [(f'image, L2, {title}', _error('other_image')), (f'worst ∂, {title}', _error('other_worst'))]
+    return table(columns, rows)
+
+
+def read_presets(path: Path) -> dict:
+    """The accuracy.json of another run. Raises InputError where it is none, or lacks a preset."""
+    with reading(path):
+        text = Path(path).read_text(encoding='utf-8')
+    try:
+        found = json.loads(text)
+        preset_table(found, found)
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise InputError(f'{path}: holds no presets; write it with lingo-mi accuracy --presets') from None
+    return found
+
+
+def preset_rows(cutoff: list[dict]) -> list[dict]:
     """The rows of the presets' cut-offs, times relative to the default's."""
     rows = {float(row['name']): row for row in cutoff}
     usual = rows[PRESETS['default']]

@@ -200,7 +200,7 @@ def _places():
 
 
 def _numbers():
-    note = 'added one by one in float32, a thousand at a time'
+    note = 'added one by one in float32, up to a thousand at a time'
     for mode in ('cone', 'parallel'):
         rays, shape = scanner(mode)
         cloud = random_cloud(np.random.default_rng(6), 1)

@@ -111,7 +111,7 @@ def of_scans(steps: int) -> Iterator[ScanCase]:
     yield ScanCase('1000 views', lambda: fit_to(measured(circular(1000), (8, 8)), 20), note=finite)
     yield ScanCase('views 1e-6 rad apart', lambda: fit_to(measured(np.arange(3) * 1e-6), 40), note=finite)
     yield ScanCase(
-        f'{steps} steps: views empty, saturated, noisy, repeated; Gaussians coincident',
+        'views empty, saturated, noisy, repeated; Gaussians coincident',
         lambda: fit_to(adversarial(), steps),
-        note=finite,
+        note=f'fit of {steps} steps ends finite',
     )

@@ -1,10 +1,15 @@
-"""The Markdown page of the hard cases."""
+"""The Markdown page of the hard cases, and their results in a file, so that a page can show those of two variants."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
-from lingo_mi.studies.hard_cases.measuring import PARAMETERS
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import reading, replacing
+from lingo_mi.studies.hard_cases.measuring import PARAMETERS, Result, miss
 
 INTRODUCTION = """# Hard cases
 
@@ -16,26 +21,80 @@ Gaussian, after all are converted to one unit (`lingo_mi.studies.hard_cases.meas
 """
 
 
-def markdown(results: Iterable[tuple]) -> str:
-    """The page. results   pairs of a case and what `measure` found"""
-    lines = [
-        INTRODUCTION,
-        '| case | image | at most | ' + ' | '.join(PARAMETERS) + ' | at most | remark |',
-        '|---' * 9 + '|',
-    ]
+@dataclass(frozen=True)
+class Stored:
+    """The results of an earlier run.
+
+    variant   Mitsuba's, that they were measured with
+    results   by the case's name
+    notes     of the cases, by name
+    """
+
+    variant: str
+    results: dict[str, Result]
+    notes: dict[str, str]
+
+    @property
+    def title(self) -> str:
+        """The variant's backend, such as CUDA."""
+        return self.variant.split('_')[0].upper()
+
+    def misses(self, cases: Sequence) -> dict[str, str]:
+        """What cases show that they may not, in words, by name; a case that was not measured misses nothing."""
+        found = {case.name: miss(case, self.results[case.name]) for case in cases if case.name in self.results}
+        return {name: wrong for name, wrong in found.items() if wrong}
+
+
+def store(path: Path, variant: str, results: Sequence[tuple]) -> None:
+    """Write results into a file that `stored` reads. results   pairs of a case and what `measure` found"""
+    cases = [dict(name=case.name, variant=variant, note=case.note, **asdict(result)) for case, result in results]
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(cases, indent=1) + '\n', encoding='utf-8')
+
+
+def stored(path: Path) -> Stored:
+    """What `store` wrote. Raises InputError where the file cannot be read or holds something else."""
+    with reading(path):
+        text = Path(path).read_text(encoding='utf-8')
+    try:
+        cases = json.loads(text)
+        (variant,) = {case.pop('variant') for case in cases}
+        notes = {case['name']: case.pop('note') for case in cases}
+        results = {case.pop('name'): Result(**case) for case in cases}
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise InputError(f'{path}: is no file of hard cases; write one with lingo-mi hard-cases --json') from None
+    return Stored(variant, results, notes)
+
+
+def markdown(results: Sequence[tuple], beside: Stored | None = None) -> str:
+    """The page.
+
+    results   pairs of a case and what `measure` found
+    beside    another variant's results, to be shown in columns of their own: the image and the worst derivative. What else is
+              different there is a remark: a miss, a shorter fit, a case that was not measured
+    """
+    titles = ['case', 'image', 'at most', *PARAMETERS, 'at most', 'remark']
+    if beside:
+        titles[2:2] = [f'image, {beside.title}']
+        titles[-2:-2] = [f'derivatives, {beside.title}']
+    lines = [INTRODUCTION, f'| {" | ".join(titles)} |', '|---' * len(titles) + '|']
+    if beside:
+        lines[1:1] = [f'Columns of {beside.title} are those of `{beside.variant}`, of derivatives the worst kind.\n']
+    misses = beside.misses([case for case, _ in results]) if beside else {}
     for case, result in results:
         limits = [None] * 2 if result.image is None else [case.image, case.gradient]
         numbers = [result.image, limits[0], *(result.gradients.get(name) for name in PARAMETERS), limits[1]]
-        remark = '; '.join(
-            filter(
-                None,
-                (
-                    result.refused and f'refused: {result.refused}',
-                    result.warned and f'warned: {result.warned}',
-                    case.note,
-                ),
-            )
-        )
-        cells = [case.name, *('' if x is None else f'{x:.0e}' for x in numbers), remark]
-        lines.append(f'| {" | ".join(cells)} |')
+        remarks = [
+            result.refused and f'refused: {result.refused}',
+            result.warned and f'warned: {result.warned}',
+            case.note,
+        ]
+        if beside:
+            other = beside.results.get(case.name)
+            numbers[1:1] = [other and other.image]
+            numbers[-1:-1] = [max(other.gradients.values(), default=None) if other else None]
+            note = beside.notes.get(case.name, 'not measured')
+            remarks += [f'{beside.title}: {x}' for x in (note != case.note and note, misses.get(case.name)) if x]
+        cells = ['' if x is None else f'{x:.0e}' for x in numbers]
+        lines.append(f'| {" | ".join([case.name, *cells, "; ".join(filter(None, remarks))])} |')
     return '\n'.join(lines) + '\n'

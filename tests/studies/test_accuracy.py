@@ -1,5 +1,6 @@
 """The integrator's knobs, the float64 truth of `closed_form`, the other methods, and the measurements of `accuracy`."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +13,10 @@ from helpers.script import run
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies import alternatives, oracle
-from lingo_mi.studies.accuracy import Sizes, measure
+from lingo_mi.studies.accuracy import Sizes, measure, measure_presets
 from lingo_mi.studies.accuracy.compare import by_function, by_integrator, compare, deviation
 from lingo_mi.studies.accuracy.report import write
-from lingo_mi.studies.accuracy.tables import BACKWARD, TITLES, make_tables
+from lingo_mi.studies.accuracy.tables import BACKWARD, TITLES, make_tables, read_presets
 from lingo_mi.studies.accuracy.workload import Workload
 from lingo_mi.studies.closed_form import NAMES, image_and_gradients, rays_and_gradients
 from lingo_mi.studies.oracle import random_cloud, relative
@@ -326,7 +327,11 @@ def test_presets_are_described_as_measured(variant):
     rows = text.split('<!-- table presets -->\n')[1].split('<!-- end presets -->')[0].splitlines()[2:]
     measured = {}
     for row in rows:
-        name, extent, image, *derivatives, forward, gradients = (cell.strip(' `') for cell in row.strip('|').split('|'))
+        cells = [cell.strip(' `') for cell in row.strip('|').split('|')]
+        name, extent, image, *derivatives, image_cuda, worst_cuda, forward, gradients = cells
+        # More is rounded where all add to one image, which shows where nothing is cut off.
+        assert float(image_cuda) < 4 * float(image)
+        assert float(worst_cuda) < 1.5 * max(map(float, derivatives))
         measured[name] = [
             extent,
             *(f'{x:.0e}' for x in (float(image), max(map(float, derivatives)))),
@@ -339,6 +344,28 @@ def test_presets_are_described_as_measured(variant):
         if line.split()[:1] and line.split()[0].strip('`') in PRESETS and len(line.split()) == 6
     }
     assert described == measured and list(measured) == list(PRESETS)
+
+
+def test_presets_of_two_variants(tmp_path, monkeypatch):
+    """The presets alone, by the command: their table with another run's errors, in place of that of the document."""
+    found = measure_presets(TINY)
+    other = json.loads(json.dumps(found))
+    other['conditions']['variant'] = 'cuda_ad_mono'
+    other['cutoff'][0].update(image=0.123, rotation=4.56)
+    there, document = tmp_path / 'there.json', tmp_path / 'accuracy.md'
+    there.write_text(json.dumps(other))
+    document.write_text('<!-- table presets -->\nold\n<!-- end presets -->\n')
+    monkeypatch.setattr('lingo_mi.studies.accuracy.measure_presets', lambda *_: found)
+    script, out = ROOT / 'scripts' / 'accuracy.py', tmp_path / 'out'
+    code, printed, err = run(script, '--presets', '--beside', there, '--out', out, '--document', document)
+    assert code == 0 and 'accuracy.json' in printed, err
+    head, _, draft, *rest = (line for line in document.read_text().splitlines() if line.startswith('|'))
+    cells = dict(zip(head.split(' | '), draft.split(' | ')))
+    assert cells['image, L2, CUDA'] == '1.2e-01' and cells['worst ∂, CUDA'] == '4.6e+00' and len(rest) == 2
+    assert read_presets(out / 'accuracy.json')['cutoff'] == found['cutoff'] and not list(tmp_path.rglob('*.png'))
+    there.write_text('{"cutoff": []}')
+    code, _, err = run(script, '--presets', '--beside', there, '--out', out)
+    assert code == 2 and 'holds no presets' in err
 
 
 @pytest.mark.traces_rays

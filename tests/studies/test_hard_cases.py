@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from helpers.script import FIT
 from helpers.script import run as run_script
-from lingo_mi.errors import AccuracyWarning
+from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
 from lingo_mi.fitting.device_state import DeviceState
@@ -44,7 +44,7 @@ from lingo_mi.studies.hard_cases.measuring import (
     weights_of,
 )
 from lingo_mi.studies.hard_cases.scans import adversarial, fit_to
-from lingo_mi.studies.hard_cases.table import markdown
+from lingo_mi.studies.hard_cases.table import markdown, store, stored
 from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
 
 CASES = all_cases()
@@ -91,6 +91,44 @@ def test_table():
     assert 'refused: Gaussian 0' in lines[3] and 'warned: the scales' in lines[4]
 
 
+def test_table_of_two_variants(tmp_path):
+    """Worst derivatives in one column; a miss, another note and a case that is not there are told in the remark."""
+    case = next(case for case in CASES if case.name == 'density 1e-12, cone')
+    fit = ScanCase('a fit', lambda: None, note='30 steps')
+    absent = ScanCase('absent', lambda: None)
+    good = Result(image=1e-7, gradients=dict(centre=1e-7, scale=2e-7, rotation=3e-7, density=4e-7))
+    there = replace(good, image=5e-7, gradients=dict(good.gradients, scale=6e-3))
+    store(tmp_path / 'there.json', 'cuda_ad_mono', [(case, there), (replace(fit, note='3 steps'), Result())])
+    beside = stored(tmp_path / 'there.json')
+    assert beside.title == 'CUDA' and beside.results[case.name] == there
+    assert beside.misses([case, fit, absent]) == {case.name: 'error of a derivative 6.0e-03, at most 1e-05'}
+    text = markdown([(case, good), (fit, Result()), (absent, Result())], beside)
+    head, _, *rows = ([cell.strip() for cell in line.split('|')] for line in text.splitlines() if line[:1] == '|')
+    by_title = dict(zip(head, rows[0]))
+    assert by_title['image, CUDA'] == '5e-07' and by_title['derivatives, CUDA'] == '6e-03'
+    assert by_title['image'] == '1e-07' and by_title['scale'] == '2e-07'
+    assert by_title['remark'] == 'CUDA: error of a derivative 6.0e-03, at most 1e-05'
+    assert [dict(zip(head, row))['remark'] for row in rows[1:]] == ['30 steps; CUDA: 3 steps', 'CUDA: not measured']
+
+
+@pytest.mark.parametrize(
+    'text', ['', '[]', '{}', '[{"name": "x"}]', '[{"name": "x", "variant": "v", "note": "", "y": 1}]']
+)
+def test_what_is_no_file_of_results(tmp_path, text):
+    (tmp_path / 'other.json').write_text(text)
+    with pytest.raises(InputError, match='no file of hard cases'):
+        stored(tmp_path / 'other.json')
+
+
+def test_committed_results_miss_nothing():
+    """All but the case that takes thousands of launches of a million threads each, too slow without a GPU."""
+    found = stored(FIT.parents[1] / 'docs' / 'tables' / 'hard_cases.cuda.json')
+    assert found.variant == 'cuda_ad_mono' and {case.name for case in CASES} - set(found.results) == {
+        '1 million coincident Gaussians'
+    }
+    assert not found.misses(CASES)
+
+
 def test_command(tmp_path, monkeypatch):
     """The page and how it was made; the exit code and a line for each case that misses its tolerance."""
     good = next(case for case in CASES if case.name == 'density 0, cone')
@@ -103,6 +141,17 @@ def test_command(tmp_path, monkeypatch):
     monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases)
     code, out, err = run_script(FIT.with_name('hard_cases.py'))
     assert code == 1 and '| too good |' in out and err == 'missed its tolerance: too good: not warned of\n'
+    there = tmp_path / 'there.json'
+    run_script(FIT.with_name('hard_cases.py'), '--json', there)
+    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases[:steps])
+    title = mi.variant().split('_')[0].upper()
+    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--beside', there, '--steps', 1)
+    assert code == 0 and not err and f'image, {title}' in out and 'too good' not in out
+    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--beside', there)
+    assert code == 1 and f'missed its tolerance: too good, {title}: not warned of' in err
+    code, out, _ = run_script(FIT.with_name('hard_cases.py'), '--without', 'good', 'nothing')
+    assert code == 0 and '| density 0, cone |' in out and 'too good' not in out
+    assert run_script(FIT.with_name('hard_cases.py'), '--steps', 0)[0] == 2
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
