@@ -42,12 +42,12 @@ def main() -> int:
     args = arguments()
     from lingo_mi.studies.cuda.assemble import assemble_all, find_ptxas
     from lingo_mi.studies.cuda.page import page
-    from lingo_mi.studies.cuda.suite import SHARE, run_tests, test_files
+    from lingo_mi.studies.cuda.suite import SHARE, all_files, run_tests
     from lingo_mi.studies.provenance import write_provenance
 
     find_ptxas()
     stand_in, outcomes = Path(shutil.which(args.stand_in) or '').resolve(), {}
-    files = [args.tests / name for name in SHARE] if args.share else test_files(args.tests)
+    files = [args.tests / name for name in SHARE] if args.share else all_files(args.tests)
     with tempfile.TemporaryDirectory() as folder:
         runs = {f'sm_{sm}': dict(SM=sm, DUMP=folder) for sm in args.sm}
         if args.noise:

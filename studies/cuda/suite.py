@@ -50,7 +50,7 @@ class Outcome:
         self.skipped += other.skipped
 
 
-def test_files(tests: Path) -> list[Path]:
+def all_files(tests: Path) -> list[Path]:
     """All test files but that of the examples: each is run as a program of its own, and shows nothing that no test asserts."""
     return sorted(p for p in Path(tests).rglob('test_*.py') if p.name != 'test_examples.py')
 

@@ -13,7 +13,7 @@ from lingo_mi.studies.cuda.assemble import Kernel, assemble_all, find_ptxas
 from lingo_mi.studies.cuda.count import KINDS, _counts, difference
 from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
 from lingo_mi.studies.cuda.page import page
-from lingo_mi.studies.cuda.suite import SHARE, Outcome, test_files
+from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files
 
 CHECK = FIT.with_name('cuda_check.py')
 TESTS = FIT.parents[1] / 'tests'
@@ -147,7 +147,7 @@ def test_page():
 
 
 def test_the_share_is_of_tests_that_exist():
-    files = {str(p.relative_to(TESTS)) for p in test_files(TESTS)}
+    files = {str(p.relative_to(TESTS)) for p in all_files(TESTS)}
     assert set(SHARE) < files and 'test_examples.py' not in files
 
 
