@@ -16,7 +16,8 @@ from lingo_mi.fitting import losses
 from lingo_mi.fitting.loss_scale import loss_scale
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.backprop import Cuts, leaves
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
@@ -85,9 +86,10 @@ def differentiate(
     bundles = []  # of rays: one, or several if the signal is a mean over them
 
     def image_along(rays):
-        footprints = forward.footprints(gaussians, rays)
+        cut = Cuts()
+        footprints = forward.footprints(gaussians, rays, cut)
         leaf = leaves(footprints.values)  # their derivatives make the statistic
-        bundles.append((footprints, leaf))
+        bundles.append((footprints, leaf, cut))
         return forward.integrals(replace(footprints, values=leaf), rays, share)
 
     image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
@@ -98,14 +100,15 @@ def differentiate(
     flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
     dr.backward(loss * weight * (1 / batch), flags=flags)
     # Outside `suspend_grad`, where gradients read as zero.
-    gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf in bundles]) for i in (-2, -1))
+    gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf, _ in bundles]) for i in (-2, -1))
     footprints = bundles[len(bundles) // 2][0]
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         visible = dr.select(footprints.visible, mi.Float(1), 0)
-    for footprints, leaf in bundles:  # one by one: a single kernel for all would take long to compile
-        pass_on(footprints.values, map(dr.grad, leaf), flags)
+    for footprints, leaf, cut in bundles:  # one by one: a single kernel for all would take long to compile
+        with full_float64():
+            cut.pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, visible
 

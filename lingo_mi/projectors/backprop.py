@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
 
 def leaves(values: Iterable) -> Any:
@@ -27,26 +28,32 @@ def pass_on(values: Iterable, gradients: Iterable, flags: Any = dr.ADFlag.Defaul
 class Cuts:
     """A computation cut into parts that are backpropagated one after another, last first, each in a kernel of its own.
 
-    A kernel needs registers for all values that its derivatives refer to, so a long one leaves room for few warps on a GPU.
+    A kernel needs registers for all values that its derivatives refer to, so a long one leaves room for few warps on a GPU. On
+    the CPU, where it would only take time, nothing is cut.
+
+    active   whether to cut; None: on a GPU
     """
 
-    def __init__(self):
-        self.parts = []
+    def __init__(self, active: bool | None = None):
+        self.active = dr.backend_v(mi.Float) == dr.JitBackend.CUDA if active is None else active
+        self.parts: list[tuple] = []
 
     def __call__(self, *values: Any) -> Any:
         """Copies of intermediate values, to go on with. No value may be given twice."""
+        if not self.active:
+            return values
         copies = dr.detach(values)
         dr.eval(copies)
         dr.enable_grad(copies)
         self.parts.append((values, copies))
         return copies
 
-    def pass_on(self, values: Iterable, gradients: Iterable) -> None:
-        """Backpropagate given gradients, one per value, through all parts."""
+    def pass_on(self, values: Iterable, gradients: Iterable, flags: Any = dr.ADFlag.Default) -> None:
+        """As the function `pass_on`, through all parts."""
         keep = dr.ADFlag.ClearVertices  # parts may share the graph of what comes before them
-        pass_on(values, gradients, keep if self.parts else dr.ADFlag.Default)
+        pass_on(values, gradients, keep if self.parts else flags)
         while self.parts:
             values, copies = self.parts.pop()
             found = [dr.grad(copy) for copy in copies]
             dr.eval(found)
-            pass_on(values, found, keep if self.parts else dr.ADFlag.Default)
+            pass_on(values, found, keep if self.parts else flags)

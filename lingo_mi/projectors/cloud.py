@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.errors import AccuracyWarning, InputError
-from lingo_mi.projectors.backprop import Cuts, leaves, pass_on
+from lingo_mi.projectors.backprop import Cuts, leaves
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project
 from lingo_mi.projectors.full_float64 import full_float64
@@ -151,10 +151,10 @@ def _read(*inputs, panel, **_) -> tuple[tuple[Any, ...], View]:
     return (*shapes, density), panel.view(inputs[-POSE:])
 
 
-def _footprints(*inputs, panel, options, **how):
+def _footprints(*inputs, panel, options, cut=None):
     gaussians, view = _read(*inputs, panel=panel)
     widen = PIXEL_VARIANCE if options.area else 0.0
-    footprints = project(*gaussians, view=view, extent=options.extent, widen=widen, **how)
+    footprints = project(*gaussians, view=view, extent=options.extent, widen=widen, cut=cut)
     return view, _affine(footprints) if options.footprint == 'affine' else footprints
 
 
@@ -195,12 +195,12 @@ def _by_inputs(*arrays, wanted, **settings):
     """Derivatives by the inputs. `arrays`: the inputs, then the result of `_gather`."""
     inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
-    cuts = Cuts() if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else None
-    view, footprints = _footprints(*inputs, **settings, **({} if cuts is None else dict(cut=cuts)))
+    cut = Cuts()
+    view, footprints = _footprints(*inputs, **settings, cut=cut)
     ends, gradients = list(footprints.values), list(by_values(found, dr.detach(footprints.values[3])))
     if by_lengths is not None:
         ends, gradients = [*ends, view.lengths()], [*gradients, by_lengths]
-    (pass_on if cuts is None else cuts.pass_on)(ends, gradients)
+    cut.pass_on(ends, gradients)
     return [dr.grad(x) for x in inputs]
 
 

@@ -35,6 +35,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
 from lingo_mi.projectors.view import View
@@ -75,10 +76,6 @@ class Footprints:
         return self.row_end > self.row_begin
 
 
-def _uncut(*values):
-    return values
-
-
 @full_float64()
 def project(
     centre: Any,
@@ -88,7 +85,7 @@ def project(
     view: View,
     extent: float,
     widen: float = 0.0,
-    cut: Any = _uncut,
+    cut: Cuts | None = None,
 ) -> Footprints:
     """Footprints of N Gaussians in a view.
 
@@ -99,8 +96,9 @@ def project(
     density         Float [N], value at the centre
     extent          cut-off in standard deviations
     widen           variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
-    cut             called with intermediate values, gives what to go on with (see `backprop.Cuts`)
+    cut             to backpropagate in parts, by its `pass_on`
     """
+    cut = cut or Cuts(False)
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)
     p, s, rho = Vector3d(centre), Vector3d(scale), Float64(density)

@@ -27,8 +27,9 @@ from lingo_mi.fitting.measured import weights_of
 from lingo_mi.fitting.poses import gathered, place
 from lingo_mi.fitting.step import Stepper
 from lingo_mi.fitting.view_loss import evaluate
-from lingo_mi.projectors.backprop import leaves, pass_on
+from lingo_mi.projectors.backprop import Cuts, leaves, pass_on
 from lingo_mi.projectors.footprint import project
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.splat import splat
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.scan import Scan
@@ -55,7 +56,8 @@ def kernels(function):
 def plain_view(self, gaussians, target, batch):
     """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
     s, extent, view = self.settings.loss, self.settings.model.extent, target.view
-    footprints = project(*gaussians, view, extent)
+    cut = Cuts()
+    footprints = project(*gaussians, view, extent, cut=cut)
     leaf = leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, extent) * view.lengths()
     loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
@@ -67,7 +69,8 @@ def plain_view(self, gaussians, target, batch):
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
         norm = norm * factor if s.loss_scale == 'statistic' else norm
         seen = dr.select(footprints.row_end > footprints.row_begin, mi.Float(1), 0)
-    pass_on(footprints.values, map(dr.grad, leaf))
+    with full_float64():
+        cut.pass_on(footprints.values, map(dr.grad, leaf))
     evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, seen
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.projectors.backprop import Cuts, pass_on
+from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
 from lingo_mi.studies.hard_cases.clouds import scanner
@@ -18,7 +18,7 @@ def test_values_that_several_parts_use():
     """d/dx of x y (x + sin(x y)) with y = x^2, cut at y and at the product; x is used in all three parts."""
     x = mi.Float(0.3, -1.1, 2.0)
     dr.enable_grad(x)
-    cuts = Cuts()
+    cuts = Cuts(True)
     (y,) = cuts(x * x)
     product, again = cuts(x * y, y)
     cuts.pass_on([product * (x + dr.sin(product)) + again], [mi.Float(1, 2, 3)])
@@ -35,12 +35,12 @@ def test_the_projection_in_parts(mode):
     assert isinstance(frames, Rays)
     cloud, view = random_cloud(np.random.default_rng(1), 12), View.of(frames, 0, *shape)
     found = []
-    for cuts in (None, Cuts()):
+    for cuts in (Cuts(False), Cuts(True)):
         gaussians = on_device(cloud)
         dr.enable_grad(gaussians)
-        footprints = project(*gaussians, view=view, extent=4.0, **({} if cuts is None else dict(cut=cuts)))
+        footprints = project(*gaussians, view=view, extent=4.0, cut=cuts)
         weights = [dr.cos(type(v)(dr.arange(mi.UInt32, 12) + k)) for k, v in enumerate(footprints.values)]
-        (pass_on if cuts is None else cuts.pass_on)(footprints.values, weights)
+        cuts.pass_on(footprints.values, weights)
         found.append([np.array(dr.grad(g), float) for g in gaussians])
     for whole, parts in zip(*found):
         assert np.abs(whole).max() > 0

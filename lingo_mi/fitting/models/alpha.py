@@ -17,6 +17,7 @@ from lingo_mi.fitting.models.base import SHAPE, ForwardModel
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.alpha import Discs, composite, flatten
+from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.radiance import radiance_towards
 from lingo_mi.projectors.view import View
 
@@ -68,7 +69,7 @@ class AlphaCompositing(ForwardModel):
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
         return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
 
-    def footprints(self, gaussians: tuple, rays: View) -> Discs:
+    def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Discs:
         centre, scale, rotation, opacity, *radiance = gaussians
         return flatten(centre, scale, rotation, opacity, radiance_towards(centre, rays, *radiance), rays)
 

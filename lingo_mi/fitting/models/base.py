@@ -12,6 +12,7 @@ import numpy as np
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.alpha import Discs
+from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.footprint import Footprints
 from lingo_mi.projectors.view import View
 
@@ -77,8 +78,11 @@ class ForwardModel(ABC):
         `footprints`. Differentiable."""
 
     @abstractmethod
-    def footprints(self, gaussians: tuple, rays: View) -> Footprints | Discs:
-        """Footprints of a cloud on a view's panel. The last two `values` are x and y in pixels. Differentiable."""
+    def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Footprints | Discs:
+        """Footprints of a cloud on a view's panel. The last two `values` are x and y in pixels. Differentiable.
+
+        cut   to backpropagate in parts, by its `pass_on`, where the model can
+        """
 
     @abstractmethod
     def integrals(self, footprints: Any, rays: View, share: Any = None) -> list:

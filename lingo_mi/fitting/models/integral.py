@@ -10,6 +10,7 @@ import numpy as np
 
 from lingo_mi.fitting.activations import inverse_softplus, softplus
 from lingo_mi.fitting.models.base import SHAPE, ForwardModel
+from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.footprint import Footprints, project
 from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.view import View
@@ -45,8 +46,8 @@ class LineIntegrals(ForwardModel):
     def gaussians(self, values: dict) -> tuple:
         return *self._shape(values), _softplus(values['density'])
 
-    def footprints(self, gaussians: tuple, rays: View) -> Footprints:
-        return project(*gaussians, view=rays, extent=self.settings.model.extent)
+    def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Footprints:
+        return project(*gaussians, view=rays, extent=self.settings.model.extent, cut=cut)
 
     def integrals(self, footprints: Footprints, rays: View, share: Any = None) -> list:
         amplitude, *others = footprints.values
