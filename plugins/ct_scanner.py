@@ -128,11 +128,11 @@ class CTScanner(mi.Sensor):
 
     def sample_ray(
         self,
-        time: mi.Float,
-        wavelength_sample: mi.Float,
+        time: Any,
+        wavelength_sample: Any,
         position_sample: mi.Point2f,
         aperture_sample: mi.Point2f,
-        active: mi.Bool | bool = True,
+        active: Any = True,
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         f = self.frame
         Vector3f = mi.Vector3f
@@ -150,16 +150,16 @@ class CTScanner(mi.Sensor):
 
     def sample_ray_differential(
         self,
-        time: mi.Float,
-        wavelength_sample: mi.Float,
+        time: Any,
+        wavelength_sample: Any,
         position_sample: mi.Point2f,
         aperture_sample: mi.Point2f,
-        active: mi.Bool | bool = True,
+        active: Any = True,
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         ray, weight = self.sample_ray(time, wavelength_sample, position_sample, aperture_sample, active)
         return mi.RayDifferential3f(ray), weight
 
-    def bbox(self) -> mi.BoundingBox3f:
+    def bbox(self) -> mi.ScalarBoundingBox3f:
         return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*np.array(self.frame.source).ravel()))
 
     def to_string(self) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 
@@ -47,9 +49,10 @@ def create(props: mi.Properties) -> mi.Object:
     It loads the values and hands them to Mitsuba's `heterogeneous` medium with a `gridvolume`; everything else
     (rendering with volume path tracers, `mi.traverse`, gradients) is Mitsuba's own. Place it in a shape of type `cube`.
     """
-    filename, phantom = props.get('filename', ''), props.get('phantom', '')
-    size, seed = props.get('size', 256), props.get('seed', 0)
-    mu_water, scale = props.get('mu_water', 0.0), props.get('scale', 1.0)
+    get: Any = props.get
+    filename, phantom = get('filename', ''), get('phantom', '')
+    size, seed = get('size', 256), get('seed', 0)
+    mu_water, scale = get('mu_water', 0.0), get('scale', 1.0)
     for key, value, kinds in (
         ('filename', filename, str),
         ('phantom', phantom, str),

@@ -75,7 +75,8 @@ def assemble(module: Path, sm: int, ptxas: Path) -> list[Kernel]:
 def assemble_all(folder: Path, sms: Iterable[int]) -> list[Kernel]:
     """The kernels of all PTX files in a folder, for each of some compute capabilities that their code is for."""
     ptxas = find_ptxas()
+    sms = list(sms)
     jobs = [(module, sm) for module in sorted(Path(folder).glob('*.ptx')) for sm in sms]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = pool.map(lambda job: assemble(*job, ptxas), jobs)
+        found = pool.map(lambda job: assemble(job[0], job[1], ptxas), jobs)
         return [kernel for kernels in found for kernel in kernels]

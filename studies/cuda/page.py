@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 from lingo_mi.studies.cuda.assemble import Kernel
 from lingo_mi.studies.cuda.suite import Outcome
@@ -54,13 +55,13 @@ def _kernels(kernels):
     largest = sorted(kernels, key=lambda k: -k.registers)[:LARGEST]
     rows = table(
         [
-            ('kernel', lambda k: f'`{k.name[6:18]}`'),
-            ('for', lambda k: f'sm_{k.sm}'),
-            ('PTX instructions', lambda k: f'{k.lines}'),
-            ('registers', lambda k: f'{k.registers}'),
-            ('bytes spilled', lambda k: f'{k.spilled}'),
+            ('kernel', lambda k: f'`{k["name"][6:18]}`'),
+            ('for', lambda k: f'sm_{k["sm"]}'),
+            ('PTX instructions', lambda k: f'{k["lines"]}'),
+            ('registers', lambda k: f'{k["registers"]}'),
+            ('bytes spilled', lambda k: f'{k["spilled"]}'),
         ],
-        largest,  # type: ignore[arg-type]
+        map(asdict, largest),
     )
     errors = [f'- `{k.name}`, sm_{k.sm}: {k.error}' for k in kernels if k.error]
     return [summary, 'Those with the most registers:', rows, *(['\n'.join(errors)] if errors else [])]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -58,7 +59,7 @@ def main() -> None:
         return steps(Fitted.from_checkpoint(name), int(count[0]))
     fitted = None if name == 'giants' else Fitted.from_checkpoint(name)
     cloud, geometry = giants() if fitted is None else (fitted.world_gaussians(), fitted.geometry)
-    *vectors, density = (np.float32(x) for x in cloud)
+    *vectors, density = (np.asarray(x, np.float32) for x in cloud)
     types = mi.Point3f, mi.Vector3f, mi.Vector4f
     gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
     view = View.of(geometry.rays(), VIEW, *geometry.nDetector, panel=False)
@@ -95,7 +96,8 @@ def steps(fitted: Fitted, count: int) -> None:
 
 def sizes(gaussians: Sequence, view: View) -> dict:
     """How much there is to do."""
-    area = dr.sum(dr.float64_array_t(mi.Float)(project(*gaussians, view=view, extent=FIT).area))
+    Float64: Any = dr.float64_array_t(mi.Float)
+    area = dr.sum(Float64(project(*gaussians, view=view, extent=FIT).area))
     return dict(
         gaussians=dr.width(gaussians[-1]),
         pixels=view.width * view.height,
