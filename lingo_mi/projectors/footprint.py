@@ -142,9 +142,9 @@ def project(
         r = dr.select(visible, r, n)  # invisible ones: a safe value, to avoid division by zero below
         depth = dr.dot(n, r)
         k = plane / depth
-        r, k, depth, hit = cut(r, k, depth, k * r - axis)
+        hit = k * r - axis
         across = (rotate_inverse(rows, step) for step in (a, b))
-        w, inverse, *across = cut(inverse * rotate_inverse(rows, r), inverse, *across)
+        w, inverse, k, depth, hit, *across = cut(inverse * rotate_inverse(rows, r), inverse, k, depth, hit, *across)
         length = dr.norm(w)
         norm = 1 / (k * length)
         wa, wb = (inverse * norm * step for step in across)
@@ -154,7 +154,6 @@ def project(
         e1, e2 = 2 * dr.dot(what, wa), 2 * dr.dot(what, wb)
         e11, e12, e22 = dr.squared_norm(wa), dr.dot(wa, wb), dr.squared_norm(wb)
         factor = length * dr.square(norm)
-        norm, na, nb, factor, e1, e2, e11, e12, e22 = cut(norm, na, nb, factor, e1, e2, e11, e12, e22)
 
     amplitude = rho * SQRT_2PI * norm
     # |na x nb|, from the determinant of W: for a needle, na and nb are nearly parallel and their product would cancel.
