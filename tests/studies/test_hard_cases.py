@@ -121,11 +121,9 @@ def test_what_is_no_file_of_results(tmp_path, text):
 
 
 def test_committed_results_miss_nothing():
-    """All but the case that takes thousands of launches of a million threads each, too slow without a GPU."""
+    """All cases are there, and none misses its tolerance."""
     found = stored(FIT.parents[1] / 'docs' / 'tables' / 'hard_cases.cuda.json')
-    assert found.variant == 'cuda_ad_mono' and {case.name for case in CASES} - set(found.results) == {
-        '1 million coincident Gaussians'
-    }
+    assert found.variant == 'cuda_ad_mono' and {case.name for case in CASES} <= set(found.results)
     assert not found.misses(CASES)
 
 
