@@ -51,7 +51,7 @@ class Outcome:
 
 
 def all_files(tests: Path) -> list[Path]:
-    """All test files but that of the examples: each is run as a program of its own, and shows nothing that no test asserts."""
+    """All test files but that of the examples, whose programs choose their variant themselves and are slow here."""
     return sorted(p for p in Path(tests).rglob('test_*.py') if p.name != 'test_examples.py')
 
 
