@@ -18,7 +18,6 @@ def count_pairs(gaussians: Sequence, view: View, extent: float) -> float:
     gaussians   centre, scale, rotation and density as Dr.Jit arrays
     extent      cut-off in standard deviations
     """
-    centre, scale, rotation, density = gaussians
-    f: Any = project(centre, scale, rotation, density, view, extent)
+    f: Any = project(gaussians, view, extent)
     Float64: Any = dr.float64_array_t(mi.Float)
     return float(dr.sum(Float64(mi.Float(f.row_end - f.row_begin) * f.width))[0])

@@ -24,7 +24,7 @@ import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +35,33 @@ from lingo_mi.geometry import astra, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
 from lingo_mi.geometry.rays import Index, Rays, checked_views
-from lingo_mi.geometry.trajectories import helix, scanner_rays
+from lingo_mi.geometry.trajectories import Motion, helix, scanner_rays
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class Placement(Motion, total=False):
+    """Where scanner and volume lie, as `Geometry.cone` describes it."""
+
+    offOrigin: ArrayLike
+
+
+class ViewNumbers(Placement):
+    """What every view may have of its own."""
+
+    angles: ArrayLike
+
+
+class ConeNumbers(Placement):
+    """A cone beam but for its angles."""
+
+    DSO: float
+    DSD: float
+    nDetector: ArrayLike
+    dDetector: ArrayLike
+    nVoxel: ArrayLike
+    dVoxel: ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,31 +101,31 @@ class Geometry(ABC):
     @classmethod
     def cone(
         cls, *, DSO: float, DSD: float, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
-        angles: ArrayLike, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
-        COR: float = 0.0, tilt: float = 0.0,
+        angles: ArrayLike, **placement: Unpack[Placement],
     ) -> Geometry:  # fmt: skip
         """A cone beam whose source moves on a circle about z.
 
-        DSO, DSD      distances from the source to the axis and to the panel, mm: DSD >= DSO > 0
-        angles        [n] radians, n >= 1; whole numbers over more than four turns cause a warning, as they look like degrees
-        offDetector   shift of the panel, (v, u), mm, positive v up
-        rotDetector   the panel turned by (roll, pitch, yaw), radians; COR: an axis off centre, mm; tilt: the source lifted
-                      out of the plane of rotation, radians. `trajectories.scanner_rays` defines them
+        DSO, DSD    distances from the source to the axis and to the panel, mm: DSD >= DSO > 0
+        angles      [n] radians, n >= 1; whole numbers over more than four turns cause a warning, as they look like degrees
+        placement   offOrigin, (x, y, z) mm, the centre of the volume; offDetector, (v, u) mm, the shift of the panel, positive
+                    v up; rotDetector, (roll, pitch, yaw) radians, by which it is turned; COR, mm, of an axis off centre; tilt,
+                    radians, by which the source is lifted out of the plane of rotation; height, mm, once or for every view.
+                    All are 0 unless given; `trajectories.Motion` defines them
 
-        The other arguments are those of the class. Without rotDetector, COR and tilt it is a `CircularGeometry`. Raises
-        InputError for numbers that make no scan.
+        The other arguments are those of the class. Without rotDetector, COR, tilt and height it is a `CircularGeometry`.
+        Raises InputError for numbers that make no scan.
 
             Geometry.cone(DSO=1000, DSD=1500, nDetector=(384, 512), dDetector=0.8, nVoxel=256, dVoxel=1, angles=circular(90))
         """
-        scan = dict(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
-        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
-        return cls._moving('cone', scan, rotDetector=rotDetector, COR=COR, tilt=tilt)
+        scan = dict(
+            DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel, angles=angles
+        )
+        return cls._placed('cone', scan | placement)
 
     @classmethod
     def parallel(
-        cls, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
-        angles: ArrayLike, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
-        COR: float = 0.0, tilt: float = 0.0,
+        cls, *, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike, angles: ArrayLike,
+        **placement: Unpack[Placement],
     ) -> Geometry:  # fmt: skip
         """A parallel beam that turns about z; the arguments are those of `cone`, without the distances.
 
@@ -107,51 +133,49 @@ class Geometry(ABC):
 
             Geometry.parallel(nDetector=(1, 512), dDetector=1, nVoxel=(256, 256, 1), dVoxel=1, angles=circular(90, 180))
         """
-        scan = dict(DSO=0.0, DSD=0.0, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
-        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
-        return cls._moving('parallel', scan, rotDetector=rotDetector, COR=COR, tilt=tilt)
+        scan = dict(nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel, angles=angles)
+        return cls._placed('parallel', dict(DSO=0.0, DSD=0.0) | scan | placement)
 
     @classmethod
-    def helix(
-        cls, *, DSO: float, DSD: float, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
-        angles: ArrayLike, pitch: float, offOrigin: ArrayLike = 0.0, offDetector: ArrayLike = 0.0, rotDetector: ArrayLike = 0.0,
-        COR: float = 0.0, tilt: float = 0.0,
-    ) -> Geometry:  # fmt: skip
+    def helix(cls, *, angles: ArrayLike, pitch: float, **scan: Unpack[ConeNumbers]) -> Geometry:
         """A cone beam whose source and panel climb `pitch` mm a turn, at z = 0 for the angle 0.
 
         angles   [n] radians, beyond 2 pi where there are several turns; negative ones lie below z = 0
+        scan     DSO, DSD, nDetector, dDetector, nVoxel, dVoxel and the placement, as for `cone`
 
-        The other arguments are those of `cone`. Raises InputError for numbers that make no scan.
+        Raises InputError for numbers that make no scan.
 
             turns = circular(180, total=1440, start=-720)   # four turns about the middle
             Geometry.helix(DSO=600, DSD=1000, nDetector=256, dDetector=1, nVoxel=128, dVoxel=1, angles=turns, pitch=32)
         """
-        scan = dict(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
-        scan |= dict(angles=angles, offOrigin=offOrigin, offDetector=offDetector)
-        return cls._moving('cone', scan, rotDetector=rotDetector, COR=COR, tilt=tilt, height=helix(angles, pitch))
+        pitch = _numbers('pitch', pitch, float, 1)[0]
+        return cls._placed('cone', dict(scan, angles=angles), pitch)
 
     @classmethod
-    def _moving(cls, mode: str, scan: dict[str, Any], **motion: Any) -> Geometry:
-        """The circle of the numbers `scan`, or what `motion` makes of it where any of that is not zero."""
+    def _placed(cls, mode: str, scan: dict[str, Any], pitch: float = 0.0) -> Geometry:
+        """The circle of the numbers `scan`, or what its motion makes of it where any of that is not zero."""
+        motion = {name: scan.pop(name) for name in ('rotDetector', 'COR', 'height', 'tilt') if name in scan}
         circle = CircularGeometry(mode=mode, **scan)
         _warn_of_degrees(circle.angles)
+        if pitch:
+            motion['height'] = helix(circle.angles, pitch) + motion.get('height', 0.0)
         if not any(np.any(value) for value in motion.values()):
             return circle
-        motion['rotDetector'] = _numbers('rotDetector', motion['rotDetector'], float, 3)
+        if 'rotDetector' in motion:
+            motion['rotDetector'] = _numbers('rotDetector', motion['rotDetector'], float, 3)
         return cls.per_view(**circle.numbers(), **motion)
 
     @classmethod
     def per_view(
         cls, *, DSO: ArrayLike, DSD: ArrayLike, nDetector: ArrayLike, dDetector: ArrayLike, nVoxel: ArrayLike, dVoxel: ArrayLike,
-        angles: ArrayLike, mode: str = 'cone', offOrigin: ArrayLike = 0.0, **motion: ArrayLike,
+        mode: str = 'cone', **views: Unpack[ViewNumbers],
     ) -> Geometry:  # fmt: skip
         """A scan whose numbers may change from view to view, in TIGRE's terms.
 
-        DSO, DSD    mm, one number or [n]
-        angles      [n] radians or [n, 3] Euler angles
-        offOrigin   (x, y, z) mm; or [n, 3], TIGRE's way to move the object: the grid then stays at their mean, and the
-                    scanner moves by what is left, the other way round
-        motion      offDetector, rotDetector, COR, height, tilt, once or for every view: see `trajectories.scanner_rays`
+        DSO, DSD   mm, one number or [n]
+        views      angles, [n] radians or [n, 3] Euler angles; offDetector, rotDetector, COR, height and tilt, once or for
+                   every view, as `trajectories.Motion` has them; offOrigin, (x, y, z) mm, or [n, 3], TIGRE's way to move the
+                   object: the grid then stays at their mean, and the scanner moves by what is left, the other way round
 
         Raises InputError for numbers that make no scan.
 
@@ -161,12 +185,20 @@ class Geometry(ABC):
             raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
         sizes: dict[str, Any] = dict(nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
         panel = CircularGeometry(DSO=1.0, DSD=1.0, angles=np.zeros(1), **sizes)  # one number may stand for both
-        rays = scanner_rays(angles, DSO, DSD, panel.nDetector, panel.dDetector, mode == 'parallel', **motion)
+        motion: dict[str, Any] = dict(views)
+        origin = np.asarray(motion.pop('offOrigin', 0.0), float)
+        rays = scanner_rays(
+            DSO=DSO,
+            DSD=DSD,
+            nDetector=panel.nDetector,
+            dDetector=panel.dDetector,
+            parallel=mode == 'parallel',
+            **motion,
+        )
         if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
             raise InputError(
                 'a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)'
             )
-        origin = np.asarray(offOrigin, float)
         if origin.ndim == 2:
             if origin.shape != (len(rays), 3):
                 raise InputError(
@@ -409,7 +441,13 @@ class CircularGeometry(Geometry):
     def rays(self) -> Rays:
         """The rays of all views in the world frame, mm."""
         return scanner_rays(
-            self.angles, self.DSO, self.DSD, self.nDetector, self.dDetector, self.mode == 'parallel', self.offDetector
+            self.angles,
+            self.DSO,
+            self.DSD,
+            self.nDetector,
+            self.dDetector,
+            self.mode == 'parallel',
+            offDetector=self.offDetector,
         )
 
     def subset(self, index: Index) -> CircularGeometry:
@@ -493,7 +531,9 @@ def _numbers(name: str, value: ArrayLike, kind: type, length: int) -> tuple:
     if len(array) == 1:
         array = np.repeat(array, length)
     if len(array) != length or not np.all(np.isfinite(array)):
-        raise InputError(f'{name} must be {length} finite numbers, not {value!r}')
+        raise InputError(
+            f'{name} must be {"one finite number" if length == 1 else f"{length} finite numbers"}, not {value!r}'
+        )
     if kind is int and np.any(array % 1):
         raise InputError(f'{name} must be whole numbers, not {value!r}')
     return tuple(kind(x) for x in array)

@@ -24,7 +24,7 @@ def circle_of(rays: Rays, nDetector: tuple[int, int]) -> dict[str, Any] | None:
     offset = (float(np.mean(centre[:, 2])), float(np.mean(centre[:, 1] * c - centre[:, 0] * s)))
     if not rays.parallel and not DSD >= DSO > 0:
         return None
-    like = scanner_rays(angles, DSO, DSD, nDetector, (step_v, step_u), rays.parallel, offset)
+    like = scanner_rays(angles, DSO, DSD, nDetector, (step_v, step_u), rays.parallel, offDetector=offset)
     # A beam's direction moves what it meets at a distance.
     reach = np.linalg.norm(rays.corner, axis=1).max() if rays.parallel else 1
     allowed = SAME * min(step_v, step_u)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, TypedDict
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.rays import Rays
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
@@ -54,26 +59,9 @@ def rotation(axis: str, angle: ArrayLike) -> np.ndarray:
     return out
 
 
-def scanner_rays(
-    angles: ArrayLike,
-    DSO: ArrayLike,
-    DSD: ArrayLike,
-    nDetector: tuple[int, int],
-    dDetector: tuple[float, float],
-    parallel: bool = False,
-    offDetector: ArrayLike = (0.0, 0.0),
-    rotDetector: ArrayLike = (0.0, 0.0, 0.0),
-    COR: ArrayLike = 0.0,
-    height: ArrayLike = 0.0,
-    tilt: ArrayLike = 0.0,
-) -> Rays:
-    """The rays of a scanner's views in the world frame of `lingo_mi.geometry.base`, from TIGRE's numbers.
+class Motion(TypedDict, total=False):
+    """What moves a scanner's source and panel off the plain circle: once, or for every view with a first axis of n.
 
-    Each argument but `parallel`, `nDetector` and `dDetector` may be given once or per view, with a first axis of n.
-
-    angles       [n] radians, or [n, 3] Euler angles: the view is turned by Rz(a1) Ry(a2) Rz(a3)
-    DSO, DSD     distances from the source to the axis and to the panel, mm
-    nDetector, dDetector   pixels and pixel size in mm, (v, u)
     offDetector  (v, u), mm: shift of the panel, positive v up; after its rotation
     rotDetector  (roll, pitch, yaw), radians: the panel is turned by Rz(roll) Ry(pitch) Rx(yaw) about its centre, in the
                  frame (towards the source, u, up). Roll turns it about the vertical, yaw in its own plane
@@ -81,17 +69,42 @@ def scanner_rays(
     height       shift of source and panel along z, mm (a helix)
     tilt         radians by which the source is lifted out of the plane of rotation, the panel sunk (laminography)
 
-    The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code), but for `height` and `tilt`,
-    which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite sign. The beam of a parallel
-    scan is not turned by rotDetector. Raises InputError where an argument has neither one value nor one a view.
+    All are 0 where they are not given. The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code),
+    but for `height` and `tilt`, which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite
+    sign. The beam of a parallel scan is not turned by rotDetector.
+    """
+
+    offDetector: ArrayLike
+    rotDetector: ArrayLike
+    COR: ArrayLike
+    height: ArrayLike
+    tilt: ArrayLike
+
+
+def scanner_rays(
+    angles: ArrayLike, DSO: ArrayLike, DSD: ArrayLike, nDetector: tuple[int, int], dDetector: tuple[float, float],
+    parallel: bool = False, **motion: Unpack[Motion],
+) -> Rays:  # fmt: skip
+    """The rays of a scanner's views in the world frame of `lingo_mi.geometry.base`, from TIGRE's numbers.
+
+    angles       [n] radians, or [n, 3] Euler angles: the view is turned by Rz(a1) Ry(a2) Rz(a3)
+    DSO, DSD     distances from the source to the axis and to the panel, mm; once or for every view
+    nDetector, dDetector   pixels and pixel size in mm, (v, u)
+    motion       see `Motion`
+
+    Raises InputError where an argument has neither one value nor one a view.
 
         scanner_rays(circular(50), 1000, 1500, (384, 512), (0.8, 0.8), tilt=0.1)
     """
-    angles = np.asarray(angles, float)
+    moves: dict[str, Any] = dict(offDetector=(0, 0), rotDetector=(0, 0, 0), COR=0, height=0, tilt=0)
+    for name in motion.keys() - moves.keys():
+        raise TypeError(f'{name!r} is no number of a scanner; what moves one is {", ".join(moves)}')
+    moves |= motion
+    angles = np.atleast_1d(_numbers('angles', angles))
     n = len(angles)
 
     def each(name, value, *shape):
-        value = np.asarray(value, float)
+        value = _numbers(name, value)
         if value.shape not in (shape, (n, *shape)):
             raise InputError(
                 f'{name} must be {" x ".join(map(str, shape)) or "one"} number{"s" * bool(shape)}, or that for '
@@ -101,10 +114,10 @@ def scanner_rays(
 
     euler = angles if angles.ndim == 2 else np.stack([angles, np.zeros(n), np.zeros(n)], 1)
     euler = each('angles', euler, 3)
-    DSO, DSD, COR = each('DSO', DSO), each('DSD', DSD), each('COR', COR)
-    height, tilt = each('height', height), each('tilt', tilt)
-    off = each('offDetector', offDetector, 2)
-    roll, pitch, yaw = each('rotDetector', rotDetector, 3).T
+    DSO, DSD = each('DSO', DSO), each('DSD', DSD)
+    COR, height, tilt = (each(name, moves[name]) for name in ('COR', 'height', 'tilt'))
+    off = each('offDetector', moves['offDetector'], 2)
+    roll, pitch, yaw = each('rotDetector', moves['rotDetector'], 3).T
     (dv, du), (nv, nu) = dDetector, nDetector
 
     # At the angle 0: the source on the x axis, u along y, rows down.
@@ -118,3 +131,10 @@ def scanner_rays(
     corner = centre - nu / 2 * du * u - nv / 2 * dv * v
     source = -out if parallel else DSO[:, None] * out + shift
     return Rays(source, corner, du * u, dv * v, parallel)
+
+
+def _numbers(name: str, value: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise InputError(f'{name} must be made of numbers, not {value!r}') from None

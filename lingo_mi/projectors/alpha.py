@@ -66,7 +66,8 @@ def flatten(centre: Any, scale: Any, rotation: Any, opacity: Any, radiance: Any,
     rotation            Vector4f [N], quaternion (x, y, z, w)
     opacity, radiance   Float [N]
     """
-    footprints = project(centre, scale, rotation, dr.zeros(mi.Float, dr.width(opacity)), view, EXTENT, WIDEN)
+    nothing = dr.zeros(mi.Float, dr.width(opacity))
+    footprints = project((centre, scale, rotation, nothing), view, EXTENT, WIDEN)
     _, mx, my, shear, *_, x, y = footprints.values
     Float64 = type(x)
     x, y = mi.Float(x + Float64(footprints.column) + 0.5), mi.Float(y + Float64(footprints.row) + 0.5)

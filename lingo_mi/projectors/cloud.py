@@ -154,7 +154,7 @@ def _read(*inputs, panel, **_) -> tuple[tuple[Any, ...], View]:
 def _footprints(*inputs, panel, options, cut=None):
     gaussians, view = _read(*inputs, panel=panel)
     widen = PIXEL_VARIANCE if options.area else 0.0
-    footprints = project(*gaussians, view=view, extent=options.extent, widen=widen, cut=cut)
+    footprints = project(gaussians, view, options.extent, widen, cut)
     return view, _affine(footprints) if options.footprint == 'affine' else footprints
 
 

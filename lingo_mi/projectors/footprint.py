@@ -29,6 +29,7 @@ kappa-ellipsoid lies between source and detector. Other Gaussians are left to `s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,27 +78,17 @@ class Footprints:
 
 
 @full_float64()
-def project(
-    centre: Any,
-    scale: Any,
-    rotation: Any,
-    density: Any,
-    view: View,
-    extent: float,
-    widen: float = 0.0,
-    cut: Cuts | None = None,
-) -> Footprints:
+def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, cut: Cuts | None = None) -> Footprints:
     """Footprints of N Gaussians in a view.
 
-    Names in the functional API: means = centre, scales = scale, quaternions = rotation here.
-
-    centre, scale   Point3f, Vector3f [N]; standard deviations
-    rotation        Vector4f [N], quaternion (x, y, z, w), normalised here
-    density         Float [N], value at the centre
-    extent          cut-off in standard deviations
-    widen           variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
-    cut             to backpropagate in parts, by its `pass_on`
+    gaussians   centre Point3f [N]; scale Vector3f [N], standard deviations; rotation Vector4f [N], quaternion (x, y, z, w),
+                normalised here; density Float [N], value at the centre. The functional API calls them means, scales,
+                quaternions and density
+    extent      cut-off in standard deviations
+    widen       variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
+    cut         to backpropagate in parts, by its `pass_on`
     """
+    centre, scale, rotation, density = gaussians
     cut = cut or Cuts(False)
     Vector3d = mi.Vector3d
     Float64: Any = dr.value_t(Vector3d)

@@ -97,7 +97,7 @@ def steps(fitted: Fitted, count: int) -> None:
 def sizes(gaussians: Sequence, view: View) -> dict:
     """How much there is to do."""
     Float64: Any = dr.float64_array_t(mi.Float)
-    area = dr.sum(Float64(project(*gaussians, view=view, extent=FIT).area))
+    area = dr.sum(Float64(project(gaussians, view, FIT).area))
     return dict(
         gaussians=dr.width(gaussians[-1]),
         pixels=view.width * view.height,

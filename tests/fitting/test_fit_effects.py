@@ -57,7 +57,7 @@ def plain_view(self, gaussians, target, batch):
     """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
     s, extent, view = self.settings.loss, self.settings.model.extent, target.view
     cut = Cuts()
-    footprints = project(*gaussians, view, extent, cut=cut)
+    footprints = project(gaussians, view, extent, cut=cut)
     leaf = leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, extent) * view.lengths()
     loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)

@@ -88,6 +88,8 @@ def test_helix_by_hand():
     np.testing.assert_allclose(g.rays().source[5], [0, 900, 10], atol=1e-9)
     np.testing.assert_allclose(g.rays().centre(g.nDetector)[5], [0, -500, 10], atol=1e-9)
     assert isinstance(Geometry.helix(**CONE, pitch=0.0), CircularGeometry)
+    moved = Geometry.helix(**CONE | dict(angles=turns), pitch=40.0, height=5.0)
+    np.testing.assert_allclose(moved.rays().source[:, 2] - g.rays().source[:, 2], 5, atol=1e-12)
 
 
 def test_poses_choose_their_kind():
@@ -111,13 +113,24 @@ def test_poses_choose_their_kind():
         (Geometry.cone, dict(angles=[]), 'at least one angle'),
         (Geometry.cone, dict(tilt=np.nan), 'view 0 holds NaN'),
         (Geometry.parallel, dict(offDetector=(1, 2, 3)), 'offDetector must be 2'),
-        (Geometry.helix, dict(pitch=np.nan), 'view 0 holds NaN'),
+        (Geometry.cone, dict(COR='far'), 'COR must be made of numbers'),
+        (Geometry.cone, dict(height=[1, 2]), 'each of 3 views'),
+        (Geometry.helix, dict(pitch=np.nan), 'pitch must be one finite number'),
+        (Geometry.helix, dict(pitch='steep'), 'pitch must be one finite number'),
+        (Geometry.per_view, dict(DSO='far'), 'DSO must be made of numbers'),
+        (Geometry.per_view, dict(angles='all'), 'angles must be made of numbers'),
     ],
 )
 def test_bad_numbers(make, change, match):
-    numbers = {'cone': CONE, 'parallel': PARALLEL, 'helix': CONE | dict(pitch=1.0)}[make.__name__]
+    numbers = dict(parallel=PARALLEL, helix=CONE | dict(pitch=1.0)).get(make.__name__, CONE)
     with pytest.raises(InputError, match=match):
         make(**numbers | change)
+
+
+@pytest.mark.parametrize('make', [Geometry.cone, Geometry.per_view])
+def test_unknown_names_are_refused(make):
+    with pytest.raises(TypeError, match='height_of_source'):
+        make(**CONE, height_of_source=1.0)
 
 
 # ---- what both kinds do ------------------------------------------------------------------------------------

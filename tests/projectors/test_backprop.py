@@ -38,7 +38,7 @@ def test_the_projection_in_parts(mode):
     for cuts in (Cuts(False), Cuts(True)):
         gaussians = on_device(cloud)
         dr.enable_grad(gaussians)
-        footprints = project(*gaussians, view=view, extent=4.0, cut=cuts)
+        footprints = project(gaussians, view, extent=4.0, cut=cuts)
         weights = [dr.cos(type(v)(dr.arange(mi.UInt32, 12) + k)) for k, v in enumerate(footprints.values)]
         cuts.pass_on(footprints.values, weights)
         found.append([np.array(dr.grad(g), float) for g in gaussians])

@@ -250,7 +250,7 @@ def adjoint(function, inputs, directions, rng):
 def test_tangent_of_the_splat_is_the_adjoint_of_its_gradient(name):
     frames, shape = VIEWS[name]
     rng = np.random.default_rng(10)
-    footprints = project(*on_device(random_cloud(rng, 15)), View.of(frames, 0, *shape), EXTENT)
+    footprints = project(on_device(random_cloud(rng, 15)), View.of(frames, 0, *shape), EXTENT)
     columns = [np.broadcast_to(v.numpy(), 15) for v in footprints.values]  # a parallel beam's zeros are scalars
     assert len(columns) == len(NAMES)
     values = [mi.Float(c.tolist()) for c in columns]

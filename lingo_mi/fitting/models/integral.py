@@ -47,7 +47,7 @@ class LineIntegrals(ForwardModel):
         return *self._shape(values), _softplus(values['density'])
 
     def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Footprints:
-        return project(*gaussians, view=rays, extent=self.settings.model.extent, cut=cut)
+        return project(gaussians, rays, self.settings.model.extent, cut=cut)
 
     def integrals(self, footprints: Footprints, rays: View, share: Any = None) -> list:
         amplitude, *others = footprints.values
