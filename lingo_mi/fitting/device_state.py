@@ -1,4 +1,4 @@
-"""A fit's state on the device: activation, Adam, and transfer to and from the host."""
+"""A fit's state on the device, and its transfer to and from the host."""
 
 from __future__ import annotations
 
@@ -56,21 +56,6 @@ class DeviceState:
         """Whether all parameters are finite; waits for the device."""
         total: Any = sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values())
         return bool(dr.all(dr.isfinite(total)))
-
-    def adam(self, gradients: dict, settings: Settings, iteration: int) -> None:
-        """One Adam step (Kingma and Ba 2015); `iteration` counts from 0."""
-        b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
-        # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
-        c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
-        for name, g in gradients.items():
-            m = b1 * self.first[name] + (1 - b1) * g
-            v = b2 * self.second[name] + (1 - b2) * g * g
-            rate = dr.opaque(mi.Float, settings.rate(name, iteration))
-            self.values[name] = dr.detach(self.values[name]) - rate * (m * c1) / (
-                dr.sqrt(v * c2) + settings.adam.epsilon
-            )
-            self.first[name], self.second[name] = m, v
-        dr.eval(self.values, self.first, self.second, self.gradient, self.visits)
 
 
 def upload(columns: dict) -> dict:

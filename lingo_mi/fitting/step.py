@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, modelled_effects, trusted, weights_of
@@ -91,7 +92,7 @@ class Stepper:
             gradients['centre'].z, gradients['scale'].z = 0, 0
             gradients['rotation'].x, gradients['rotation'].y = 0, 0
         self.forward.hold_back(gradients, iteration)
-        state.adam(gradients, s, iteration)
+        adam_step(state, gradients, s, iteration)
         return total
 
     def corrected(self) -> Geometry:

@@ -1,0 +1,29 @@
+"""Adam, with a learning rate a parameter (Kingma and Ba, "Adam: a method for stochastic optimization", 2015)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.settings import Settings
+
+
+def adam_step(state: DeviceState, gradients: dict[str, Any], settings: Settings, iteration: int) -> None:
+    """Move the parameters of `state` that have gradients, and their moments.
+
+    gradients   of the loss, by parameter
+    iteration   counts from 0
+    """
+    b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
+    # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
+    c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
+    for name, g in gradients.items():
+        m = b1 * state.first[name] + (1 - b1) * g
+        v = b2 * state.second[name] + (1 - b2) * g * g
+        rate = dr.opaque(mi.Float, settings.rate(name, iteration))
+        state.values[name] = dr.detach(state.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + settings.adam.epsilon)
+        state.first[name], state.second[name] = m, v
+    dr.eval(state.values, state.first, state.second, state.gradient, state.visits)
