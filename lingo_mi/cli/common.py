@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, brief
 from lingo_mi.file_access import require_writable
 
 
@@ -19,7 +19,7 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, like any other bad input."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f'error: {message} (see --help)\n')
+        self.exit(2, f'error: {brief(message, 250)} (see --help)\n')
 
 
 def guard(main: Callable[[], int | None]) -> None:
@@ -30,7 +30,7 @@ def guard(main: Callable[[], int | None]) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', RuntimeWarning)
-            warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
+            warnings.showwarning = lambda message, *_: print(f'warning: {brief(message, 1000)}', file=sys.stderr)
             sys.exit(main() or 0)
     except InputError as error:
         print(f'error: {error}', file=sys.stderr)
@@ -39,10 +39,11 @@ def guard(main: Callable[[], int | None]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
-        print(f'error: {f"{error.filename}: " if error.filename else ""}{error.strerror or error}', file=sys.stderr)
+        said = f'{f"{error.filename}: " if error.filename else ""}{error.strerror or error}'
+        print(f'error: {brief(said)}', file=sys.stderr)
         sys.exit(2)
     except MemoryError as error:
-        print(f'error: not enough memory ({error})', file=sys.stderr)
+        print(f'error: not enough memory ({brief(error, 250)})', file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         print(f'interrupted{": " + str(stop) if str(stop) else ""}', file=sys.stderr)

@@ -15,6 +15,7 @@ Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes 
 
 from __future__ import annotations
 
+import os
 from os import PathLike
 
 import numpy as np
@@ -22,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import reading, replacing
+from lingo_mi.memory import require_room
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'
@@ -187,7 +189,7 @@ def _header(stream, where):
     if lines[:1] != [['format', 'binary_little_endian', '1.0']]:
         fail('is not in the format binary_little_endian 1.0')
     elements = [line for line in lines if line[0] == 'element']
-    if len(elements) != 1 or elements[0][1:2] != ['vertex'] or not elements[0][-1].isdigit():
+    if len(elements) != 1 or elements[0][1:2] != ['vertex'] or len(elements[0]) != 3 or not elements[0][2].isdigit():
         fail("must have the one element 'vertex'")
     fields = [line for line in lines if line[0] == 'property']
     if any(len(f) != 3 or f[1] not in _TYPES for f in fields) or len({f[-1] for f in fields}) != len(fields):
@@ -206,12 +208,14 @@ def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
         missing = [name for name in (*_CENTRE, 'density', *_SCALE, *_ROT) if name not in (dtype.names or ())]
         if missing:
             raise InputError(f'{path}: has no property {missing[0]}; write the cloud with lingo_mi')
+        size = os.fstat(stream.fileno()).st_size - stream.tell()
+        if size != n * dtype.itemsize:
+            raise InputError(
+                f'{path}: has {size} bytes of data, but {n} Gaussians need '
+                f'{n * dtype.itemsize}; it is truncated or damaged, write it again'
+            )
+        require_room(size + 80 * n, path)
         body = stream.read()
-    if len(body) != n * dtype.itemsize:
-        raise InputError(
-            f'{path}: has {len(body)} bytes of data, but {n} Gaussians need '
-            f'{n * dtype.itemsize}; it is truncated or damaged, write it again'
-        )
     rows = np.frombuffer(body, dtype)
 
     def take(names):

@@ -332,7 +332,7 @@ BAD = {
     'projections NaN': (plain(train={'projections': NAN, 'angles': np.arange(3.0)}), 'NaN'),
     'projections 2D': (plain(train={'projections': NAN[0], 'angles': np.arange(3.0)}), '3 dimensions'),
     'projections ragged': (plain(train={'projections': [[1], [1, 2]], 'angles': [1.0, 2.0]}), 'not an array'),
-    'projections text': (plain(train={'projections': ['a', 'b', 'c'], 'angles': np.arange(3.0)}), 'real numbers'),
+    'projections text': (plain(train={'projections': ['a', 'b', 'c'], 'angles': np.arange(3.0)}), 'not an array'),
     'no views': (plain(train={'projections': np.ones((0, 4, 5)), 'angles': np.ones(0)}, numTrain=0), 'no views'),
     'angles count': (plain(train={'projections': NAN * 0 + 1, 'angles': np.arange(2.0)}), 'agree|NaN'),
     'numTrain': (plain(numTrain=7), 'agree'),
