@@ -83,16 +83,23 @@ def read_voxels(
         try:
             with open(path, 'rb') as file:
                 file.seek(start)
+                gzipped = file.read(2) == b'\x1f\x8b'
+                file.seek(start)
                 if packing == 'bzip2':
-                    content = bz2.BZ2File(file).read(size)
-                elif file.read(2) == b'\x1f\x8b':
-                    file.seek(start)
-                    content = gzip.GzipFile(fileobj=file).read(size)
+                    content = read_exactly(bz2.BZ2File(file), path, 0, size, finish=True)
+                elif gzipped:
+                    content = read_exactly(gzip.GzipFile(fileobj=file), path, 0, size, finish=True)
                 else:
-                    file.seek(start)
-                    content = zlib.decompressobj().decompress(file.read(), size)
-        except (EOFError, zlib.error, gzip.BadGzipFile, OSError) as error:
+                    content = _inflated(file.read(), size)
+        except (EOFError, zlib.error, OSError) as error:
             raise InputError(f'{path}: is damaged: its data cannot be unpacked ({error}); fetch it again') from None
-    if len(content) < size:
-        raise InputError(f'{path}: is truncated or damaged: its data end too early; fetch it again')
     return np.frombuffer(content, dtype).reshape(tuple(shape), order='F')
+
+
+def _inflated(content: bytes, size: int) -> bytes:
+    """`size` bytes of zlib's. Raises EOFError where it ends before or behind them, or its checksum is missing."""
+    unpacker = zlib.decompressobj()
+    out = unpacker.decompress(content, size)
+    if unpacker.decompress(unpacker.unconsumed_tail, 1) or len(out) < size or not unpacker.eof:
+        raise EOFError('they do not have the size that the header says')
+    return out
