@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import stat
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -124,6 +126,19 @@ def require_writable(folder: Path, path: Path, mend: str = 'choose another place
     finally:
         for part in reversed(made):
             part.rmdir()
+
+
+@contextmanager
+def quiet(library: str) -> Iterator[None]:
+    """Holds back what a library logs of a file and warns of: what matters of it is in the InputError."""
+    logger = logging.getLogger(library)
+    before, logger.disabled = logger.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            yield
+    finally:
+        logger.disabled = before
 
 
 def beside(file: PathLike | str, name: Any) -> Path:

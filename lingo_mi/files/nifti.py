@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, reading
+from lingo_mi.file_access import one_line, quiet, reading
 from lingo_mi.files.voxels import MOST_DEFLATED, read_exactly, require_claim
 
 _TO_MM = {'meter': 1000.0, 'mm': 1.0, 'micron': 1e-3, 'unknown': 1.0}
@@ -33,7 +33,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     packed = path.name.lower().endswith('.gz')
     with reading(path):
         try:
-            with gzip.open(path) if packed else open(path, 'rb') as stream:
+            with quiet('nibabel.global'), gzip.open(path) if packed else open(path, 'rb') as stream:
                 header = _header(stream.read(_LONGEST_HEADER), pair)
             shape = tuple(int(n) for n in header.get_data_shape())
             dtype, start = header.get_data_dtype(), int(header.get_data_offset())

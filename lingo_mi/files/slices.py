@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, optional, reading
+from lingo_mi.file_access import one_line, optional, quiet, reading
 from lingo_mi.files.voxels import LPS_TO_RAS, require_claim
 from lingo_mi.memory import require_room
 
+_KINDS = {'imagej', 'shaped', 'uniform', 'volumetric', 'bigtiff'}  # of TIFF files, in tifffile's words
 _DEFLATED_DICOM = '1.2.840.10008.1.2.1.99'
 # What a byte may stand for in the compressions that bound it, by TIFF's numbers: none, LZW, deflate twice, PackBits.
 _RATIO = {1: 1, 5: 4096, 8: 1032, 32946: 1032, 32773: 128}
@@ -26,7 +27,10 @@ def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     with reading(folder, folder=True):
         tiffs = sorted((f for f in folder.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=_natural)
-    return (read_tiff(tiffs), None) if tiffs else _dicom(folder)
+    if tiffs:
+        return read_tiff(tiffs), None
+    with quiet('pydicom'):
+        return _dicom(folder)
 
 
 def _natural(path):
@@ -36,7 +40,9 @@ def _natural(path):
 
 def _tiff_file(tifffile, path):
     try:
-        with reading(path), tifffile.TiffFile(path) as file:
+        # What some microscopes' own descriptions say is not followed: to other files, or to more images than there are.
+        others = {f'is_{kind}': False for kind in tifffile.TIFF.FILE_FLAGS - _KINDS}
+        with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False, **others) as file:
             series = file.series[0]
             compressions = {int(page.compression) for page in series.pages if page is not None}
             ratio = max((_RATIO.get(kind, math.inf) for kind in compressions), default=math.inf)
