@@ -90,11 +90,18 @@ def _per_view(values, name, where, n, length, default=0.0):
     return np.broadcast_to(array.ravel(), length) if length > 1 else np.float64(array.ravel()[0])
 
 
+def _dimensions(value) -> int:
+    try:
+        return np.ndim(value)
+    except ValueError:  # lists of several lengths, which are refused where they are read
+        return 0
+
+
 def moves(values: dict, n: int) -> bool:
     """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
     lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
     several = any(
-        np.ndim(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
+        _dimensions(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
         for k, length in lengths.items()
         if values.get(k) is not None
     )

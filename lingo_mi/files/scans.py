@@ -185,7 +185,7 @@ def _line_integrals(projections, values, where, projections_path):
     if i0 <= 0:
         raise InputError(f'{where}: I0 must be positive, not {i0:g}')
     if not projections.min() > 0:
-        bad = tuple(int(i) for i in np.argwhere(projections <= 0)[0])
+        bad = tuple(int(i) for i in np.argwhere(~(projections > 0))[0])
         raise InputError(
             f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
             'so it has no logarithm; mask or repair dead pixels first'

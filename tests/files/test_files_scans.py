@@ -125,6 +125,9 @@ def test_intensity(tmp_path):
     intensity = 1e4 * np.exp(-PROJECTIONS)
     dataset = read_scan(npy(tmp_path, intensity, input='intensity', I0=1e4))
     np.testing.assert_allclose(dataset.train.projections, PROJECTIONS, rtol=1e-6)
+    intensity[1, 2, 3] = np.nan
+    np.save(tmp_path / 'mask.npy', np.ones(intensity.shape, bool))
+    assert '(1, 2, 3)' in refused(npy(tmp_path, intensity, input='intensity', I0=1e4, valid='mask.npy'), 'not positive')
     intensity[1, 2, 3] = 0
     assert '(1, 2, 3)' in refused(npy(tmp_path, intensity, input='intensity', I0=1e4), 'not positive')
 
@@ -148,6 +151,8 @@ def test_intensity(tmp_path):
         ({'pitch': 10**400}, 'pitch must be'),
         ({'tilt': 10**400}, 'tilt must be'),
         ({'mode': [1]}, 'mode must be'),
+        ({'offDetector': [[1], [1, 2]]}, 'offDetector must be'),
+        ({'DSO': [[1], [1, 2]]}, 'DSO must be'),
         ({'valid': '/etc/hostname'}, 'beside it'),
         ({'valid': '../mask.npy'}, 'beside it'),
         ({'DSO': 'far'}, 'DSO must be'),
