@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.errors import InputError
 
 
 def parse(name: str, text: str, like: Any) -> Any:
@@ -33,7 +33,7 @@ def parse(name: str, text: str, like: Any) -> Any:
         kind = {bool: 'true or false', int: 'a whole number', float: 'a number', tuple: 'two numbers, first,last'}[
             type(like)
         ]
-        raise InputError(f'{name} must be {kind}, not {shown(text)}') from None
+        raise InputError(f'{name} must be {kind}, not {text!r}') from None
 
 
 def checked(name: str, value: Any, like: Any) -> Any:
@@ -47,7 +47,7 @@ def checked(name: str, value: Any, like: Any) -> Any:
     if isinstance(like, tuple):
         pair = value.tolist() if isinstance(value, np.ndarray) else value
         if not (isinstance(pair, list | tuple) and len(pair) == 2 and all(map(_is_number, pair))):
-            raise InputError(f'{name} takes two numbers, first and last, such as {like}, not {shown(value)}')
+            raise InputError(f'{name} takes two numbers, first and last, such as {like}, not {value!r}')
         return tuple(map(_plain, pair))
     if isinstance(like, bool):
         good, kind = isinstance(value, bool | np.bool_), 'True or False'
@@ -59,7 +59,7 @@ def checked(name: str, value: Any, like: Any) -> Any:
     else:
         good, kind = isinstance(value, str), 'text'
     if not good:
-        raise InputError(f'{name} must be {kind}, not {shown(value)}')
+        raise InputError(f'{name} must be {kind}, not {value!r}')
     return _plain(value)
 
 
@@ -70,7 +70,7 @@ def whole(name: str, value: Any, least: int) -> int:
     except TypeError:
         number = least - 1
     if number < least or isinstance(value, bool):
-        raise InputError(f'{name} must be a whole number from {least} on, not {shown(value)}')
+        raise InputError(f'{name} must be a whole number from {least} on, not {value!r}')
     return number
 
 

@@ -12,11 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.errors import InputError
 
-LARGEST = (
-    1e12  # mm: lengths beyond it, or below its inverse, are no scanner's, and their products leave float64's range
-)
 Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
 
 
@@ -31,9 +28,7 @@ def checked_views(index: Index, count: int) -> Index:
     whole = views.dtype.kind in 'iu' and (views.size == 0 or -count <= views.min() and views.max() < count)
     mask = views.dtype.kind == 'b' and len(views) == count
     if views.ndim != 1 or not (whole or mask or views.size == 0):
-        raise InputError(
-            f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {shown(index)}'
-        )
+        raise InputError(f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {index!r}')
     return views if views.size else views.astype(int)
 
 
@@ -136,7 +131,6 @@ class Rays:
 def _faults(source, corner, u, v, parallel) -> Iterator[tuple[str, Any]]:
     """What may be wrong with poses, each with the views [n] where it is; later ones count on the earlier."""
     yield 'holds NaN or infinity', ~np.isfinite(np.concatenate([source, corner, u, v], 1)).all(1)
-    yield f'holds a number beyond {LARGEST:g}', (np.abs(np.concatenate([source, corner, u, v], 1)) > LARGEST).any(1)
     normal = np.cross(u, v)
     area = np.linalg.norm(normal, axis=1)
     steps = np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.errors import InputError
 from lingo_mi.geometry.rays import Rays
 
 if TYPE_CHECKING:
@@ -136,5 +136,5 @@ def scanner_rays(
 def _numbers(name: str, value: ArrayLike) -> np.ndarray:
     try:
         return np.asarray(value, float)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f'{name} must be made of numbers, not {shown(value)}') from None
+    except (TypeError, ValueError):
+        raise InputError(f'{name} must be made of numbers, not {value!r}') from None
