@@ -52,7 +52,7 @@ def checked(name: str, value: Any, like: Any) -> Any:
     if isinstance(like, bool):
         good, kind = isinstance(value, bool | np.bool_), 'True or False'
     elif isinstance(like, int):
-        good, kind = _is_number(value) and math.isfinite(value) and value == int(value), 'a whole number'
+        good, kind = _is_number(value) and _is_whole(value), 'a whole number'
         value = int(value) if good else value
     elif isinstance(like, float):
         good, kind = _is_number(value), 'a number'
@@ -82,6 +82,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def _is_number(value):
     return isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+
+
+def _is_whole(value):
+    return isinstance(value, int) or bool(math.isfinite(value) and value == int(value))
 
 
 def _plain(value):

@@ -278,7 +278,7 @@ class Settings:
         """All values by their flat names, as in files and on command lines."""
         return {name: value for _, values in self._parts() for name, value in values.items()}
 
-    def changed(self, **values: Any) -> Settings:
+    def changed(self, /, **values: Any) -> Settings:
         """A copy with new values, by flat name. Values may be strings, as from a command line.
 
         Raises InputError for an unknown name or a value of the wrong kind.

@@ -1,6 +1,7 @@
 """The fit on tiny scans: it descends, resumes to the bit, compiles nothing late, and refuses what it must."""
 
 import errno
+import json
 import os
 from dataclasses import replace
 
@@ -8,9 +9,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
@@ -316,19 +317,20 @@ def test_an_unfinished_fit_is_its_mean_so_far(scan, tmp_path):
 def test_files_that_are_no_fit(scan, stored):
     with pytest.raises(InputError, match='no such file'):
         Fitted.from_checkpoint(stored.with_name('none.npz'))
-    state, extra, arrays = checkpoint.load(stored)
+    content = contents(stored)
+    extra = json.loads(str(content['extra']))
     for damaged, message in (
         (extra | dict(effects=True), 'modelled effects'),
         ({k: v for k, v in extra.items() if k != 'unit'}, 'by this version'),
-        (extra | dict(settings=extra['settings'] | dict(renamed=1)), 'by this version'),
+        (extra | dict(settings=extra['settings'] | dict(renamed=1)), "unknown setting 'renamed'"),
     ):
-        checkpoint.save(stored, state, damaged, arrays)
+        write_as_before(stored, content, damaged)
         with pytest.raises(InputError, match=message) as caught:
             Fitted.from_checkpoint(stored)
         assert '\n' not in str(caught.value)
     del extra['effects']  # as earlier versions wrote it
-    checkpoint.save(stored, state, extra, arrays)
-    assert len(Fitted.from_checkpoint(stored).state) == len(state)
+    write_as_before(stored, content, extra)
+    assert len(Fitted.from_checkpoint(stored).state) == len(content['born'])
 
 
 def test_progress_shows_the_absolute_measures(tmp_path):
