@@ -15,12 +15,11 @@ extra                         text: plain values as JSON, named in `_PLAIN`
 from __future__ import annotations
 
 import math
-import reprlib
 from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry.base import Geometry
@@ -52,7 +51,7 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
     for name in expected.keys() - set(_OF_EFFECTS) - arrays.keys():
         raise InputError(f'{name} is missing')
     for name in arrays.keys() - allowed.keys():
-        raise InputError(f'{_short(name)} does not belong there')
+        raise InputError(f'{shown(name)} does not belong there')
     for name, array in arrays.items():
         _require_array(name, array, *allowed[name])
     _require(len(arrays['born']) > 0 and len(arrays['array.initial']) > 0, 'it holds no Gaussian')
@@ -88,7 +87,7 @@ def _require_array(name: str, array: np.ndarray, kind: str, shape: tuple):
     of_kind = array.dtype.kind == 'i' if kind == 'int' else array.dtype == kind
     if not of_kind or array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape)):
         wanted = ', '.join('n' if n is None else str(n) for n in shape)
-        raise InputError(f'{name} must be {kind} [{wanted}], not {_short(array.dtype)} {list(array.shape)}')
+        raise InputError(f'{name} must be {kind} [{wanted}], not {shown(array.dtype)} {list(array.shape)}')
     _require(array.dtype.kind != 'f' or np.isfinite(array).all(), f'{name} holds NaN or infinity')
     never_negative = name in ('gradient', 'seen', 'array.poses.steps') or '.second' in f'.{name}'
     _require(not never_negative or not array.size or array.min() >= 0, f'{name} holds negative numbers')
@@ -99,22 +98,22 @@ def _require_plain(extra: Any):
     _require(isinstance(extra, dict), 'extra must be a dictionary')
     version = extra.get('version', VERSION)
     if version != VERSION or isinstance(version, bool):
-        raise InputError(f'its version is {_short(version)}, but this program reads {VERSION}')
+        raise InputError(f'its version is {shown(version)}, but this program reads {VERSION}')
     for name, (wanted, good) in _PLAIN.items():
         if name not in extra:
             if 'version' not in extra and name in ('unit', 'effects'):
                 continue
             raise InputError(f'{name} is missing')
         if not good(extra[name]):
-            raise InputError(f'{name} must be {wanted}, not {_short(extra[name])}')
+            raise InputError(f'{name} must be {wanted}, not {shown(extra[name])}')
     if strange := extra.keys() - _PLAIN.keys() - {'version'}:
-        raise InputError(f'{_short(min(strange))} does not belong there')
+        raise InputError(f'{shown(min(strange))} does not belong there')
     try:
         settings = settings_of(extra)
         seen = len(geometry_of(extra))
     except InputError as error:
         raise InputError(f'in its settings or its scanner, {error}') from None
-    _require(seen == extra['views'], f'views is {_short(extra["views"])}, but the scanner has {seen}')
+    _require(seen == extra['views'], f'views is {shown(extra["views"])}, but the scanner has {seen}')
     steps = [entry['iteration'] for entry in extra['history']]
     _require(extra['iteration'] <= settings.iterations, "iteration is beyond the settings' iterations")
     _require(steps == sorted(set(steps)) and max(steps, default=0) <= extra['iteration'], 'history is out of order')
@@ -199,8 +198,3 @@ _PLAIN = {
 def _require(good: Any, message: str):
     if not good:
         raise InputError(message)
-
-
-def _short(value: Any) -> str:
-    text = reprlib.repr(value)
-    return text if len(text) <= 60 else f'{text[:57]}...'

@@ -12,6 +12,7 @@ import pytest
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
+from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
@@ -50,6 +51,19 @@ def test_a_small_scan_bounds_the_number_of_gaussians(scan, whole):
     few = SHORT.changed(values_per_gaussian=scan.projections.size / 65, n_points=500, init='lingo')
     assert len(run(scan, few, some_points(scan.geometry), seed=3).state) <= 65
     assert len(initial_cloud(scan, few)) == 65
+
+
+def test_more_than_the_scan_or_the_memory_has(scan, monkeypatch):
+    with pytest.raises(InputError, match='at most the 3 of the scan, not 4'):
+        initial_cloud(scan, SHORT.changed(batch=4))
+    with pytest.raises(InputError, match='at most the 3 of the scan, not 1000000'):
+        run(scan, SHORT.changed(batch=10**6), some_points(scan.geometry))
+    monkeypatch.setattr(limits, 'room', lambda: 2**20)
+    for settings in (SHORT.changed(init='lingo', n_points=10**8), METHODS['3dgs'].changed(n_points=3000)):
+        with pytest.raises(InputError, match='lower n_points'):
+            initial_cloud(scan, settings)
+    limits.bounded(SHORT.changed(n_points=2000), scan)
+    limits.bounded(METHODS['xgaussian'], scan)
 
 
 def test_progress_and_measure_are_called(scan):
