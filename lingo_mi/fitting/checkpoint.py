@@ -12,6 +12,7 @@ import json
 import math
 import os
 import stat
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -115,7 +116,13 @@ def _array(content: bytes) -> np.ndarray:
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, columns_first, kind = read[np.lib.format.read_magic(file)](file)
-    except (KeyError, MemoryError, SyntaxError, TypeError):  # of the header, which is an expression
+    except (
+        KeyError,
+        MemoryError,
+        SyntaxError,
+        TypeError,
+        tokenize.TokenError,
+    ):  # of the header, which is an expression
         raise InputError('an entry is no array') from None
     begin = file.tell()
     if kind.hasobject or any(n < 0 for n in shape) or math.prod(shape) * kind.itemsize != len(content) - begin:

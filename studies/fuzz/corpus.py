@@ -6,6 +6,7 @@ import gzip
 import io
 import json
 import pickle
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -231,8 +232,6 @@ RTK = (
 
 
 def exr(image: np.ndarray) -> bytes:
-    import tempfile
-
     from lingo_mi.files.images import write_exr
 
     with tempfile.TemporaryDirectory() as folder:
@@ -243,21 +242,12 @@ def exr(image: np.ndarray) -> bytes:
 
 def others() -> dict[str, list[Sample]]:
     """Samples of the other readers, by their names."""
-    import tempfile
-
     from lingo_mi.files.ply import write_ply
-    from lingo_mi.fitting import checkpoint
-    from lingo_mi.fitting.state import State
 
     rng = np.random.default_rng(2)
     with tempfile.TemporaryDirectory() as folder:
-        ply, kept = Path(folder, 'c.ply'), Path(folder, checkpoint.CHECKPOINT)
+        ply = Path(folder, 'c.ply')
         write_ply(ply, rng.normal(size=(5, 3)), np.ones((5, 3)), np.tile([0.0, 0, 0, 1], (5, 1)), np.ones(5))
-        values = dict(centre=rng.normal(size=(5, 3)).astype('f4'), density=np.ones((5, 1), 'f4'))
-        state = State(values, values, values, np.zeros(5, 'f4'), np.zeros(5, 'f4'), np.zeros(5, bool))
-        checkpoint.save(
-            kept, state, dict(iteration=7, history=[{'loss': 0.5}], rng={'state': 3}), dict(order=np.arange(5))
-        )
         vectors = np.array([[0.0, 900, 0, 0, -500, 0, 1, 0, 0, 0, 0, -1]] * 3)
         table = '\n'.join(' '.join(map(str, row)) for row in vectors).encode()
         matrices = np.tile(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 900]]), (3, 1, 1))
@@ -270,8 +260,47 @@ def others() -> dict[str, list[Sample]]:
                 Sample('p.npy', {'p.npy': npy(vectors)}),
                 Sample('p.npy', {'p.npy': npy(matrices)}),
             ],
-            'checkpoint': [Sample(kept.name, {kept.name: kept.read_bytes()})],
+            'checkpoint': _checkpoints(),
         }
+
+
+def _checkpoints():
+    """As it is written, with a checksum, and as earlier versions wrote it, without: there a mutation gets further."""
+    from lingo_mi.fitting.models import forward_model
+    from lingo_mi.fitting.settings import Settings
+    from lingo_mi.geometry.base import Geometry
+    from lingo_mi.scene.description import describe
+
+    geometry = Geometry.cone(DSO=10, DSD=15, nDetector=4, dDetector=1, nVoxel=4, dVoxel=1, angles=np.arange(3) / 2)
+    extra = dict(
+        seed=0, rng=np.random.default_rng(0).bit_generator.state, iteration=7, seconds=1.5, info={}, settings={}, unit=1.0,
+        history=[dict(iteration=7, seconds=1.0, loss=0.5, gaussians=5)], effects=False, views=3, scanner=describe(geometry),
+        signal=0.5,
+    )  # fmt: skip
+    sizes = forward_model(Settings()).parameters.items()
+    groups = ('values', 'first', 'second', *(['array.average'] if Settings().adam.average > 0 else []))
+    arrays = {f'{group}.{name}': np.full((5, size), 0.5, np.float32) for group in groups for name, size in sizes}
+    arrays |= dict(gradient=np.zeros(5, np.float32), seen=np.ones(5, np.float32), born=np.zeros(5, bool))
+    arrays |= {'array.initial': np.ones((5, 3), np.float32), 'array.order': np.arange(3)}
+    before = Structured(arrays | dict(extra=extra), _checkpoint)
+    return [Sample('c.npz', {'c.npz': before}), Sample('c.npz', {'c.npz': _checkpoint(before.data, checksum=True)})]
+
+
+def _checkpoint(data: dict, checksum: bool = False) -> bytes:
+    from lingo_mi.fitting.checkpoint import save
+    from lingo_mi.fitting.state import State
+
+    if not checksum:
+        return npz(data | dict(extra=np.array(json.dumps(data.get('extra'), default=_listed))))
+    groups = (
+        {name[len(group) + 1 :]: array for name, array in data.items() if name.startswith(group + '.')}
+        for group in ('values', 'first', 'second')
+    )
+    state = State(*groups, gradient=data['gradient'], visits=data['seen'], born=data['born'])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'c.npz')
+        save(path, state, data['extra'], {name[6:]: array for name, array in data.items() if name.startswith('array.')})
+        return path.read_bytes()
 
 
 SCENE = b"""<scene version="3.0.0">

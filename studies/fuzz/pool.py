@@ -42,12 +42,16 @@ class Tally:
             self.failures[number] = result
 
 
+def _command(memory: int) -> list[str]:
+    return [sys.executable, '-m', 'lingo_mi.studies.fuzz.child', str(memory)]
+
+
 class _Child:
     """A process that reads cases: see `lingo_mi.studies.fuzz.child`."""
 
     def __init__(self, memory: int):
         self.process = subprocess.Popen(
-            [sys.executable, '-m', 'lingo_mi.studies.fuzz.child', str(memory)],
+            _command(memory),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ
