@@ -21,9 +21,12 @@ MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 def _floats(value) -> np.ndarray:
     """Raises ValueError, TypeError or OverflowError for anything but numbers, also for true and false."""
-    if _has_truth(value) or isinstance(value, np.ndarray) and value.dtype.kind not in 'uif':
+    if isinstance(value, np.ndarray) and value.dtype.kind not in 'uif':
         raise ValueError
-    return np.asarray(value, float)
+    array = np.asarray(value, float)  # first: it refuses what is nested too deep to be looked through
+    if _has_truth(value):
+        raise ValueError
+    return array
 
 
 def _has_truth(value) -> bool:
@@ -51,7 +54,7 @@ def _counts(values: dict, name: str, where: PathLike | str, length: int) -> np.n
     if values.get(name) is None:
         raise InputError(f'{where}: {name} is missing; add it')
     array = _numbers(values, name, where, length)
-    if not np.array_equal(array, np.round(array)):
+    if not (np.isfinite(array).all() and np.array_equal(array, np.round(array))):
         raise InputError(f'{where}: {name} must be whole numbers, not {shown(values[name])}')
     return array
 

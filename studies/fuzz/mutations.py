@@ -174,6 +174,6 @@ def _data(value: Any, rng: Random) -> Any:
         for _ in range(rng.choice((5, 50, 500))):
             value = [value]
         return value
-    if way < 0.3 and isinstance(value, np.ndarray):
+    if way < 0.3 and isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in 'buif':
         return rng.choice((value[:-1], value[..., None], value.astype('f8') * 1e300, value.astype('i2'), value.T))
     return rng.choice(DATA)

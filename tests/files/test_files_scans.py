@@ -151,6 +151,8 @@ def test_intensity(tmp_path):
         ({'pitch': 10**400}, 'pitch must be'),
         ({'tilt': 10**400}, 'tilt must be'),
         ({'mode': [1]}, 'mode must be'),
+        ({'nDetector': float('inf')}, 'nDetector must be whole'),
+        ({'nVoxel': float('nan')}, 'nVoxel must be whole'),
         ({'offDetector': [[1], [1, 2]]}, 'offDetector must be'),
         ({'DSO': [[1], [1, 2]]}, 'DSO must be'),
         ({'valid': '/etc/hostname'}, 'beside it'),
