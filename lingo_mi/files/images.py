@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -61,7 +62,8 @@ def _shape(header: bytes, path: PathLike | str) -> tuple[tuple[int, int], int]:
 
     Raises InputError for a damaged header, and for files of another kind than scan lines.
     """
-    window, pixel = (), 0
+    window: Any = ()
+    pixel = 0
     try:
         magic, version = struct.unpack_from('<ii', header)
         if magic != 20000630 or version & _NO_SCAN_LINES:

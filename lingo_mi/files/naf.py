@@ -158,10 +158,13 @@ for _core in ('numpy.core', 'numpy._core'):  # NumPy 1, NumPy 2
     _NAMES[f'{_core}.numeric', '_frombuffer'] = _FrombufferName()
 
 
-class _Unpickler(pickle._Unpickler):
+_PythonUnpickler: Any = getattr(pickle, '_Unpickler')  # noqa: B009 - not declared
+
+
+class _Unpickler(_PythonUnpickler):
     """In Python: it looks at the keys of dictionaries before they are hashed, which of nested tuples may take for ever."""
 
-    dispatch: ClassVar[dict] = dict(pickle._Unpickler.dispatch)
+    dispatch: ClassVar[dict] = dict(_PythonUnpickler.dispatch)
 
     def load_build(self):
         if not isinstance(self.stack[-2], _Array | _DType):
@@ -210,7 +213,8 @@ def _scan(stream):
     for count, (code, argument, _) in enumerate(pickletools.genops(stream)):
         if count > _MOST:
             raise _Refused(f'more than {_MOST} instructions')
-        if 'PUT' in code.name and int(argument) > count:
+        place: Any = argument
+        if 'PUT' in code.name and int(place) > count:
             raise _Refused(f'place {argument} of the memo')
 
 

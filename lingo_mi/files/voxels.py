@@ -9,7 +9,7 @@ import os
 import zlib
 from collections.abc import Sequence
 from os import PathLike
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +41,10 @@ def require_claim(path: PathLike | str, shape: Sequence[int], dtype: np.dtype, r
     return count * dtype.itemsize
 
 
-def read_exactly(stream: IO[bytes], path: PathLike | str, skip: int, size: int, finish: bool = False) -> bytes:
+def read_exactly(stream: Any, path: PathLike | str, skip: int, size: int, finish: bool = False) -> bytes:
     """`size` bytes of an unpacked stream, after `skip` others. Raises InputError where it ends before.
 
+    stream   a file that unpacks what is read of it
     finish   whether to go on to its end, where gzip's checksum is; what follows must be short
     """
     while skip > 0:

@@ -145,8 +145,8 @@ def _views(path):
             raise InputError(f'{path}: defines entities, which no geometry of RTK needs; remove them')
         parser, depth = ElementTree.XMLPullParser(('start', 'end')), 0
         parser.feed(text)
-        for event, _ in parser.read_events():
-            depth += 1 if event == 'start' else -1
+        for event in parser.read_events():
+            depth += 1 if event[0] == 'start' else -1
             if depth > 3:
                 raise InputError(f'{path}: is no {ROOT}: it is nested more than 3 deep')
         root = ElementTree.fromstring(text)

@@ -9,7 +9,7 @@ import pickle
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ class Sample:
     """Files of one reader, by name below a folder; `target` is what the reader is given, the folder itself for ''."""
 
     target: str
-    files: dict[str, bytes | Structured]
+    files: Mapping[str, bytes | Structured]
 
 
 def npy(array: Any) -> bytes:
@@ -122,7 +122,7 @@ def volumes() -> dict[str, list[Sample]]:
     return out | _tiff() | _dicom()
 
 
-def _saved_pair(image):
+def _saved_pair(image) -> dict[str, Any]:
     maps = image.make_file_map({'header': io.BytesIO(), 'image': io.BytesIO()})
     image.to_file_map(maps)
     return maps
@@ -147,16 +147,18 @@ def _tiff():
 
 
 def _dicom():
-    import pydicom
+    from pydicom import Dataset
+    from pydicom.dataset import FileMetaDataset
+    from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian
 
     files = {}
     for z in range(2):
-        data = pydicom.Dataset()
-        data.file_meta = pydicom.dataset.FileMetaDataset()
-        data.file_meta.TransferSyntaxUID = pydicom.uid.ExplicitVRLittleEndian
-        data.file_meta.MediaStorageSOPClassUID = data.SOPClassUID = pydicom.uid.CTImageStorage
-        data.file_meta.MediaStorageSOPInstanceUID = data.SOPInstanceUID = f'1.2.3.{z}'
-        data.file_meta.ImplementationClassUID = '1.2.3'
+        data = Dataset()
+        data.file_meta = FileMetaDataset()
+        data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        data.file_meta.MediaStorageSOPClassUID = data.SOPClassUID = CTImageStorage
+        data.file_meta.MediaStorageSOPInstanceUID = data.SOPInstanceUID = UID(f'1.2.3.{z}')
+        data.file_meta.ImplementationClassUID = UID('1.2.3')
         data.SeriesInstanceUID = '1.2.3'
         data.Rows, data.Columns, data.SamplesPerPixel = 5, 4, 1
         data.PhotometricInterpretation = 'MONOCHROME2'
