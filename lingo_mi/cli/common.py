@@ -11,8 +11,12 @@ from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from lingo_mi.errors import InputError, brief
+import numpy as np
+
+from lingo_mi.errors import InputError, brief, shown
 from lingo_mi.file_access import require_writable
+
+MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 
 
 class Parser(argparse.ArgumentParser):
@@ -93,8 +97,23 @@ def check_input(args: argparse.Namespace) -> None:
         raise InputError(f'--views must be at least 1, not {args.views}')
     if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
         raise InputError('--shape, --dtype and --mu-water go with --volume')
+    if args.dtype and not _of_numbers(args.dtype):
+        raise InputError(f'--dtype must be a NumPy type of real numbers, such as uint8, not {shown(args.dtype)}')
     if args.projections and args.volume:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
+
+
+def _of_numbers(dtype: str) -> bool:
+    try:
+        return np.dtype(dtype).kind in {*'buif'}
+    except (TypeError, ValueError, SyntaxError):
+        return False
+
+
+def check_seed(seed: int) -> None:
+    """Raises InputError for a --seed that not every generator of random numbers takes."""
+    if not 0 <= seed <= MOST_SEED:
+        raise InputError(f'--seed must not be negative, nor above {MOST_SEED}, but is {shown(seed)}')
 
 
 def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0) -> Any:

@@ -20,8 +20,8 @@ def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
 
     Raises InputError unless n is from 1 to `limits.MOST_VIEWS`, and for angles of too many turns.
     """
-    count = limits.lengths('the number of views', n)
-    if count.ndim or count % 1 != 0 or count < 1:
+    count = limits.numbers('the number of views', n)
+    if count.ndim or not count >= 1 or np.isfinite(count) and count % 1:
         raise InputError(f'a scan needs a whole number of views, at least one view, not {shown(n)}')
     if count > limits.MOST_VIEWS:
         raise InputError(f'a scan has at most {limits.MOST_VIEWS} views, not {shown(n)}')

@@ -14,6 +14,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from lingo_mi.errors import InputError, shown
+from lingo_mi.files.ply import require_elements
 
 MOST_BYTES = 64 * 2**20  # 100 000 views with a pose each are 20 MB
 MOST_ELEMENTS = 20_000
@@ -75,7 +76,7 @@ class _Look:
             elif tag == 'include':
                 more.append(self.filled(given.get('filename', '')))
             elif tag == 'string' and given.get('name') == 'filename':
-                self.require_an_end(path, self.filled(given.get('value', '')))
+                self.require_readable(path, self.filled(given.get('value', '')))
 
         def end(tag):
             nonlocal depth
@@ -109,10 +110,12 @@ class _Look:
             if name and os.path.lexists(path) and not path.is_dir():
                 yield path
 
-    def require_an_end(self, scene: Path, name: str):
+    def require_readable(self, scene: Path, name: str):
         for path in self.places(name):
             if path.exists() and not path.is_file():
                 raise InputError(f'{scene}: {name} is no regular file, but a device or a pipe; name another')
+            if path.suffix.lower() == '.ply' and path.exists():
+                require_elements(path)
 
 
 def _require_scene(path: Path):
