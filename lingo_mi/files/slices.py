@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +40,32 @@ def _natural(path):
     return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
 
 
+def _require_chain(path):
+    """Raises InputError where a TIFF file's list of images goes round in circles: all of it cannot be longer than the file."""
+    left = os.path.getsize(path)
+    with open(path, 'rb') as stream:
+        head = stream.read(16).ljust(16, b'\0')
+        order = '>' if head[:2] == b'MM' else '<'
+        big = head[2:4] in (b'\0+', b'+\0')
+        count, entry, link = ('Q', 20, 'Q') if big else ('H', 12, 'I')
+        (at,) = struct.unpack_from(order + link, head, 8 if big else 4)
+        while 0 < at < os.path.getsize(path):
+            stream.seek(at)
+            (entries,) = struct.unpack_from(order + count, stream.read(8).ljust(8, b'\0'))
+            stream.seek(at + struct.calcsize(order + count) + min(entries * entry, left))
+            following = stream.read(struct.calcsize(order + link))
+            if len(following) < struct.calcsize(order + link):
+                return
+            left -= stream.tell() - at
+            if left < 0:
+                raise InputError(f'{path}: is a damaged TIFF file: its list of images has no end; write it again')
+            (at,) = struct.unpack(order + link, following)
+
+
 def _tiff_file(tifffile, path):
     try:
+        with reading(path):
+            _require_chain(path)
         # What some microscopes' own descriptions say is not followed: to other files, or to more images than there are.
         others = {f'is_{kind}': False for kind in tifffile.TIFF.FILE_FLAGS - _KINDS}
         with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False, **others) as file:

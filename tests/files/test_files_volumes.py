@@ -3,6 +3,7 @@
 import ast
 import builtins
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -376,6 +377,25 @@ def test_a_tiff_that_describes_more_images_than_it_has(tmp_path, description):
     except InputError as error:
         assert 'truncated or damaged' in str(error)
     assert time.monotonic() - start < 5
+
+
+@pytest.mark.parametrize('bigtiff', [False, True])
+@pytest.mark.parametrize('byteorder', '<>')
+def test_a_tiff_whose_images_have_no_end(tmp_path, bigtiff, byteorder):
+    tifffile = needs('tifffile')
+    path = tmp_path / 'v.tif'
+    tifffile.imwrite(path, COUNTS.transpose(2, 1, 0), photometric='minisblack', bigtiff=bigtiff, byteorder=byteorder)
+    np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
+    with tifffile.TiffFile(path) as file:
+        places = [page.offset for page in file.pages]
+    content, (link, count, entry) = path.read_bytes(), (('Q', 'Q', 20) if bigtiff else ('I', 'H', 12))
+    for at in places[1:]:  # from the last image back to another
+        (entries,) = struct.unpack_from(byteorder + count, content, places[-1])
+        end = places[-1] + struct.calcsize(byteorder + count) + entries * entry
+        circle = bytearray(content)
+        struct.pack_into(byteorder + link, circle, end, at)
+        path.write_bytes(circle)
+        refused(path, 'has no end')
 
 
 def dicom_slice(path, z, pixels, **changes):
