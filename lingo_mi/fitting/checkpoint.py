@@ -7,7 +7,6 @@ check sums that a zip archive keeps of its entries and compares while they are r
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 import os
@@ -17,6 +16,7 @@ import zlib
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from lingo_mi.fitting.checkpoint_schema import VERSION, require_sound
 from lingo_mi.fitting.state import State
 
 METRICS, CHECKPOINT = 'metrics.json', 'checkpoint.npz'  # files of a result
+CHUNK = 2**18  # bytes that are read at a time
 
 
 def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = None) -> None:
@@ -36,7 +37,7 @@ def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = 
     """
     path = Path(path)
     columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
-    content = dict(
+    content: dict[str, Any] = dict(
         gradient=state.gradient,
         seen=state.visits,  # the name of earlier versions
         born=state.born,
@@ -67,7 +68,7 @@ def load(path: PathLike | str) -> tuple[State, dict, dict]:
     """
     try:
         data, summed = _read(path)
-        extra = json.loads(str(data.pop('extra')))
+        extra = json.loads(_text(data.pop('extra')))
         require_sound(data, extra)
         if not summed and 'version' in extra:
             raise InputError('checksum is missing')
@@ -99,29 +100,39 @@ def _read(path: PathLike | str) -> tuple[dict[str, np.ndarray], bool]:
         entries = archive.infolist()
         if any(e.compress_type for e in entries) or sum(e.file_size for e in entries) > status.st_size:
             raise InputError('its entries are compressed, or larger than the file')
-        data = {e.filename.removesuffix('.npy'): _array(archive.read(e)) for e in entries}
+        data = {e.filename.removesuffix('.npy'): _array(archive, e) for e in entries}
     if len(data) < len(entries):
         raise InputError('an entry is there twice')
     stored, sums = data.pop('checksum', None), {e.filename.removesuffix('.npy'): e.CRC for e in entries}
     sums.pop('checksum', None)
-    if stored is not None and str(stored) != _checksum(sums.items()):
+    if stored is not None and _text(stored) != _checksum(sums.items()):
         raise InputError('its checksum is wrong')
     return data, stored is not None
 
 
-def _array(content: bytes) -> np.ndarray:
-    """The array in a .npy file. Raises InputError where its header claims another size than it has, or objects."""
-    file = io.BytesIO(content)
+def _text(array: np.ndarray) -> str:
+    """The text in an array of one. Raises InputError where there is none."""
+    if array.ndim or array.dtype.kind != 'U':
+        raise InputError('extra and checksum must be texts')
+    return array.item()
+
+
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    """The array in an entry. Raises InputError where its header claims another size than it has, or objects."""
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    try:
-        shape, columns_first, kind = read[np.lib.format.read_magic(file)](file)
-    except (KeyError, MemoryError, SyntaxError, TypeError):  # of the header, which is an expression
-        raise InputError('an entry is no array') from None
-    begin = file.tell()
-    if kind.hasobject or any(n < 0 for n in shape) or math.prod(shape) * kind.itemsize != len(content) - begin:
-        raise InputError('an entry claims another size than it has')
-    flat = np.frombuffer(content, kind, math.prod(shape), begin) if kind.itemsize else np.empty(shape, kind)
-    return flat.reshape(shape, order='F' if columns_first else 'C').copy()
+    with archive.open(entry) as file:
+        try:
+            shape, columns_first, kind = read[np.lib.format.read_magic(file)](file)
+        except (KeyError, MemoryError, SyntaxError, TypeError):  # of the header, which is an expression
+            raise InputError('an entry is no array') from None
+        count = math.prod(shape)
+        if kind.hasobject or any(n < 0 for n in shape) or count * kind.itemsize != entry.file_size - file.tell():
+            raise InputError('an entry claims another size than it has')
+        values = np.empty(count, kind)
+        content = values.view(np.uint8) if count * kind.itemsize else np.empty(0, np.uint8)
+        for at in range(0, len(content), CHUNK):  # which stay in a cache, while the archive sums them
+            content[at : at + CHUNK] = np.frombuffer(file.read(CHUNK), np.uint8)
+    return values.reshape(shape, order='F' if columns_first else 'C')
 
 
 def _checksum(sums: Iterable[tuple[str, int]]) -> str:
