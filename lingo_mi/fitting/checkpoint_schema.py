@@ -42,8 +42,7 @@ def geometry_of(extra: dict) -> Geometry:
 def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
     """Raises InputError, which says what is wrong, unless the arrays of a checkpoint, by name, and its plain values belong to a
     fit that can go on."""
-    _require_plain(extra)
-    settings = settings_of(extra)
+    settings = _require_plain(extra)
     expected = _expected(settings, extra['views'], arrays['born'].size if 'born' in arrays else 0)
     allowed = dict(expected)
     if not extra.get('effects', True):
@@ -93,8 +92,8 @@ def _require_array(name: str, array: np.ndarray, kind: str, shape: tuple):
     _require(not never_negative or not array.size or array.min() >= 0, f'{name} holds negative numbers')
 
 
-def _require_plain(extra: Any):
-    """The plain values, each in its range; those that a later program wrote too are left alone."""
+def _require_plain(extra: Any) -> Settings:
+    """The settings, once all plain values are in their ranges."""
     _require(isinstance(extra, dict), 'extra must be a dictionary')
     version = extra.get('version', VERSION)
     if version != VERSION or isinstance(version, bool):
@@ -117,6 +116,7 @@ def _require_plain(extra: Any):
     steps = [entry['iteration'] for entry in extra['history']]
     _require(extra['iteration'] <= settings.iterations, "iteration is beyond the settings' iterations")
     _require(steps == sorted(set(steps)) and max(steps, default=0) <= extra['iteration'], 'history is out of order')
+    return settings
 
 
 def _count(value: Any, least: int = 0, most: float = math.inf) -> bool:

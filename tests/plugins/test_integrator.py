@@ -548,7 +548,7 @@ def test_unknown_key_of_a_scanner():
         mi.load_dict(dict(SCANNER, DS0=3))
 
 
-@pytest.mark.parametrize('extent', [0.5, 21.0, float('nan')])
+@pytest.mark.parametrize('extent', [0.5, 21.0, float('nan'), 1e308, 'far', '5'])
 def test_extent_out_of_range(extent):
     with pytest.raises(Exception, match='extent is in standard deviations'):
         mi.load_dict(dict(type='lingo_xray', extent=extent))
