@@ -28,7 +28,7 @@ def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
     for name, degrees in (('start', start), ('total', total)):
         if limits.angles(name, np.radians(limits.lengths(name, degrees))).ndim:
             raise InputError(f'{name} must be one number of degrees, not {shown(degrees)}')
-    return np.radians(start + total * np.arange(int(count)) / int(count))
+    return np.radians(float(start) + float(total) * np.arange(int(count)) / int(count))
 
 
 def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
