@@ -226,7 +226,7 @@ def require_elements(path: PathLike | str) -> None:
             elif line[:1] == [b'format']:
                 as_text = line[1:2] == [b'ascii']
         left = os.fstat(stream.fileno()).st_size - stream.tell()
-    if not elements or not elements[0][0] or not all(size for _, size in elements):
+    if not elements or not all(size for _, size in elements):
         fail('its header announces no elements, or some without properties')
     if sum(count * size for count, size in elements) > left:
         fail(f'its header announces more than its {left} bytes of data')
