@@ -1,11 +1,42 @@
 """The one exception for input that a user can mend, and the one warning of numbers that are not as good as promised."""
 
+LONGEST = 299  # characters of a message
+
+
+def brief(text: object, longest: int = LONGEST) -> str:
+    """A text on one line of printable characters, its middle left out where it is longer than `longest`.
+
+    What it names stays at the start and how to mend it at the end, also where a file's own text stands between.
+    """
+    text = str(text)
+    if len(text) > 4 * longest:  # before it is looked at character by character
+        text = text[: 2 * longest] + text[-2 * longest :]
+    line = ' '.join(text.split())
+    line = ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in line)
+    if len(line) <= longest:
+        return line
+    end = longest // 3
+    return f'{line[: longest - end - 3]} … {line[-end:]}'
+
+
+def shown(value: object) -> str:
+    """The start of a value's repr, for messages that quote what a file says; its type where it has none."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError, MemoryError):  # an integer of too many digits
+        return f'that {type(value).__name__}'
+    return text if len(text) <= 80 else text[:77] + '...'
+
 
 class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, where, and how to mend it.
 
-    Scripts print it and exit with code 2 (see `lingo_mi.cli.common.guard`).
+    Scripts print it and exit with code 2 (see `lingo_mi.cli.common.guard`). The message is made one line of less than 300
+    characters here, whatever it quotes.
     """
+
+    def __init__(self, message: object = ''):
+        super().__init__(brief(message))
 
 
 class AccuracyWarning(UserWarning):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
+import stat
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 
 
 def one_line(error: BaseException | str) -> str:
@@ -19,9 +22,21 @@ def one_line(error: BaseException | str) -> str:
 
 
 @contextmanager
-def reading(path: PathLike | str) -> Iterator[None]:
-    """Turns what the file system says about `path` while it is read into an InputError."""
+def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
+    """Turns what the file system says about `path` while it is read into an InputError.
+
+    folder   whether it must be a folder; else it must be a regular file: a device has no end, and a pipe may never begin
+    """
     try:
+        try:
+            kind = os.stat(path).st_mode
+        except ValueError:  # a zero byte, or text that is no file name
+            raise InputError(f'{path}: is no name of a file; correct it') from None
+        if folder != stat.S_ISDIR(kind):
+            what = 'a file, not a folder' if folder else 'a folder, not a file'
+            raise InputError(f'{path}: cannot be read (it is {what}); check the path')
+        if not folder and not stat.S_ISREG(kind):
+            raise InputError(f'{path}: cannot be read (it is a device or a pipe); give a regular file')
         yield
     except FileNotFoundError as error:
         raise InputError(f'{error.filename or path}: there is no such file; check the path') from None
@@ -111,6 +126,32 @@ def require_writable(folder: Path, path: Path, mend: str = 'choose another place
     finally:
         for part in reversed(made):
             part.rmdir()
+
+
+@contextmanager
+def quiet(library: str) -> Iterator[None]:
+    """Holds back what a library logs of a file and warns of: what matters of it is in the InputError."""
+    logger = logging.getLogger(library)
+    before, logger.disabled = logger.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            yield
+    finally:
+        logger.disabled = before
+
+
+def beside(file: PathLike | str, name: Any) -> Path:
+    """The path of a file that `file` names, which lies beside it or in a folder below.
+
+    Raises InputError for any other: what a stranger's file names is not looked for in the rest of the system.
+    """
+    path = Path(name) if isinstance(name, str) else None
+    if path is None or not name or path.is_absolute() or path.drive or '..' in path.parts:
+        raise InputError(
+            f'{file}: names the file {shown(name)}; give the name of one beside it or in a folder below, without ..'
+        )
+    return Path(file).parent / path
 
 
 def as_path(name: str, value: Any) -> Path:

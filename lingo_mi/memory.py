@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import os
 import sys
+from os import PathLike
 from pathlib import Path
 
+from lingo_mi.errors import InputError
 from lingo_mi.gpu import gpu
 
 
@@ -15,7 +17,22 @@ def room() -> float:
     control groups that this process is in, and what its limit of address space leaves; infinity where none of them is known."""
     if sys.modules.get('mitsuba') and (sys.modules['mitsuba'].variant() or '').startswith('cuda'):
         return gpu().memory
+    return host_room()
+
+
+def host_room() -> float:
+    """Bytes: the smallest of the machine's memory, the limits of the control groups that this process is in, and what its
+    limit of address space leaves; infinity where none of them is known."""
     return min(_machine(), *_control_groups(), _address_space())
+
+
+def require_room(needed: float, where: PathLike | str) -> None:
+    """Raises InputError, in the name of a file, where reading it would need more bytes than this process may take."""
+    if needed > (room := host_room()):
+        raise InputError(
+            f'{where}: says that it needs {needed / 2**30:,.1f} GiB of memory, but this process may take '
+            f'{room / 2**30:,.1f} GiB; if it is not damaged, crop it or use a machine with more memory'
+        )
 
 
 def _machine() -> float:

@@ -7,11 +7,12 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable
+from dataclasses import MISSING, fields
 from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 
 
 def parse(name: str, text: str, like: Any) -> Any:
@@ -33,7 +34,7 @@ def parse(name: str, text: str, like: Any) -> Any:
         kind = {bool: 'true or false', int: 'a whole number', float: 'a number', tuple: 'two numbers, first,last'}[
             type(like)
         ]
-        raise InputError(f'{name} must be {kind}, not {text!r}') from None
+        raise InputError(f'{name} must be {kind}, not {shown(text)}') from None
 
 
 def checked(name: str, value: Any, like: Any) -> Any:
@@ -47,19 +48,19 @@ def checked(name: str, value: Any, like: Any) -> Any:
     if isinstance(like, tuple):
         pair = value.tolist() if isinstance(value, np.ndarray) else value
         if not (isinstance(pair, list | tuple) and len(pair) == 2 and all(map(_is_number, pair))):
-            raise InputError(f'{name} takes two numbers, first and last, such as {like}, not {value!r}')
+            raise InputError(f'{name} takes two numbers, first and last, such as {like}, not {shown(value)}')
         return tuple(map(_plain, pair))
     if isinstance(like, bool):
         good, kind = isinstance(value, bool | np.bool_), 'True or False'
     elif isinstance(like, int):
-        good, kind = _is_number(value) and math.isfinite(value) and value == int(value), 'a whole number'
+        good, kind = _is_number(value) and _is_whole(value), 'a whole number'
         value = int(value) if good else value
     elif isinstance(like, float):
         good, kind = _is_number(value), 'a number'
     else:
         good, kind = isinstance(value, str), 'text'
     if not good:
-        raise InputError(f'{name} must be {kind}, not {value!r}')
+        raise InputError(f'{name} must be {kind}, not {shown(value)}')
     return _plain(value)
 
 
@@ -70,8 +71,24 @@ def whole(name: str, value: Any, least: int) -> int:
     except TypeError:
         number = least - 1
     if number < least or isinstance(value, bool):
-        raise InputError(f'{name} must be a whole number from {least} on, not {value!r}')
+        raise InputError(f'{name} must be a whole number from {least} on, not {shown(value)}')
     return number
+
+
+def require_ranges(part: Any, **ranges: tuple[float, float]) -> None:
+    """Raises InputError unless the fields of a dataclass that have a default are of its kind, and every number in its range.
+
+    ranges   (least, most), both of them allowed, of every such field that holds a number or two
+
+        require_ranges(self, iterations=(1, 1e9), rate=(0, 1))
+    """
+    for f in (f for f in fields(part) if f.default is not MISSING):
+        value = checked(f.name, getattr(part, f.name), f.default)
+        if isinstance(value, bool | str):
+            continue
+        least, most = ranges[f.name]
+        if not all(least <= x <= most for x in (value if isinstance(value, tuple) else (value,))):
+            raise InputError(f'{f.name} must lie in [{least:g}, {most:g}], not {shown(value)}')
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -82,6 +99,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def _is_number(value):
     return isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+
+
+def _is_whole(value):
+    return isinstance(value, int) or bool(math.isfinite(value) and value == int(value))
 
 
 def _plain(value):

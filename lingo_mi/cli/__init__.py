@@ -21,6 +21,7 @@ COMMANDS = {
     'effects': 'measure what modelling the effects of a real detector is worth',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
     'bench-recon': 'time reconstruction on voxels against other packages',
+    'fuzz': 'give every reader mutated files: a value, or one line that refuses it',
     'cuda-check': 'check the CUDA backend where there is no GPU',
 }
 

@@ -11,15 +11,19 @@ from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from lingo_mi.errors import InputError
+import numpy as np
+
+from lingo_mi.errors import InputError, brief, shown
 from lingo_mi.file_access import require_writable
+
+MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, like any other bad input."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f'error: {message} (see --help)\n')
+        self.exit(2, f'error: {brief(message, 250)} (see --help)\n')
 
 
 def guard(main: Callable[[], int | None]) -> None:
@@ -30,7 +34,7 @@ def guard(main: Callable[[], int | None]) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', RuntimeWarning)
-            warnings.showwarning = lambda message, *_: print(f'warning: {message}', file=sys.stderr)
+            warnings.showwarning = lambda message, *_: print(f'warning: {brief(message, 1000)}', file=sys.stderr)
             sys.exit(main() or 0)
     except InputError as error:
         print(f'error: {error}', file=sys.stderr)
@@ -39,10 +43,11 @@ def guard(main: Callable[[], int | None]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
-        print(f'error: {f"{error.filename}: " if error.filename else ""}{error.strerror or error}', file=sys.stderr)
+        said = f'{f"{error.filename}: " if error.filename else ""}{error.strerror or error}'
+        print(f'error: {brief(said)}', file=sys.stderr)
         sys.exit(2)
     except MemoryError as error:
-        print(f'error: not enough memory ({error})', file=sys.stderr)
+        print(f'error: not enough memory ({brief(error, 250)})', file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt as stop:
         print(f'interrupted{": " + str(stop) if str(stop) else ""}', file=sys.stderr)
@@ -92,8 +97,23 @@ def check_input(args: argparse.Namespace) -> None:
         raise InputError(f'--views must be at least 1, not {args.views}')
     if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
         raise InputError('--shape, --dtype and --mu-water go with --volume')
+    if args.dtype and not _of_numbers(args.dtype):
+        raise InputError(f'--dtype must be a NumPy type of real numbers, such as uint8, not {shown(args.dtype)}')
     if args.projections and args.volume:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
+
+
+def _of_numbers(dtype: str) -> bool:
+    try:
+        return np.dtype(dtype).kind in {*'buif'}
+    except (TypeError, ValueError, SyntaxError):
+        return False
+
+
+def check_seed(seed: int) -> None:
+    """Raises InputError for a --seed that not every generator of random numbers takes."""
+    if not 0 <= seed <= MOST_SEED:
+        raise InputError(f'--seed must not be negative, nor above {MOST_SEED}, but is {shown(seed)}')
 
 
 def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0) -> Any:

@@ -17,6 +17,7 @@ from pathlib import Path
 from lingo_mi.cli.common import (
     Parser,
     check_input,
+    check_seed,
     command_line,
     definitions,
     input_arguments,
@@ -77,8 +78,7 @@ def main() -> None:
     from lingo_mi.scene.load import defaults, load_scene
 
     check_input(args)
-    if args.seed < 0:
-        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    check_seed(args.seed)
     defined = definitions(args.define)
     args.scene = scene_path(args.scene)
     own = defaults(args.scene)  # a name of the scene goes before a setting's

@@ -5,8 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from lingo_mi import phantoms
-from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
+from lingo_mi.cli.common import Parser, check_seed
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry.limits import MOST_VIEWS
+from lingo_mi.memory import room
+from lingo_mi.phantoms.x3d_scan import PIXELS
 
 EPILOG = """\
 phantoms:
@@ -84,6 +87,9 @@ def check(args: argparse.Namespace) -> None:
         raise InputError('nothing to write: give --out, --projections or both')
     if args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
+    check_seed(args.seed)
+    if args.projections:
+        check_views(args.views)
     if args.projections and args.kind == 'naf' and args.projections.suffix not in ('.pickle', '.pkl'):
         raise InputError(f'{args.projections}: --kind naf writes a pickle; give a name that ends in .pickle')
     beside = None
@@ -106,6 +112,18 @@ def check(args: argparse.Namespace) -> None:
             raise InputError(
                 f'{args.out}: only gaussians and mesh can be written as PLY; give a name that ends in .nii.gz'
             )
+
+
+def check_views(views: int) -> None:
+    """Raises InputError for more training and test views than a scan has, or than this process has memory for."""
+    if views > MOST_VIEWS:
+        raise InputError(f'--views must be at most {MOST_VIEWS}, not {shown(views)}')
+    needed = 2 * 2 * views * 4 * PIXELS**2  # as they are made, and again as they are written
+    if needed > (has := room()):
+        raise InputError(
+            f'--views {views}: as many training and as many test views need at least {needed / 2**30:,.1f} GiB of memory, '
+            f'but this process may take {has / 2**30:,.1f} GiB; take fewer'
+        )
 
 
 def bolts_beside(path: Path) -> Path:

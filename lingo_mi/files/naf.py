@@ -19,17 +19,24 @@ functions run.
 from __future__ import annotations
 
 import math
+import mmap
+import os
 import pickle
+import pickletools
 from os import PathLike
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import one_line, reading, replacing
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
+from lingo_mi.memory import require_room
 from lingo_mi.scan import Dataset
+
+_MOST = 1_000_000  # instructions of a pickle, and values in it; an array is one of a few instructions
+_LONGEST_TEXT = 10_000
 
 
 class _Refused(Exception):
@@ -151,7 +158,38 @@ for _core in ('numpy.core', 'numpy._core'):  # NumPy 1, NumPy 2
     _NAMES[f'{_core}.numeric', '_frombuffer'] = _FrombufferName()
 
 
-class _Unpickler(pickle.Unpickler):
+_PythonUnpickler: Any = getattr(pickle, '_Unpickler')  # noqa: B009 - not declared
+
+
+class _Unpickler(_PythonUnpickler):
+    """In Python: it looks at the keys of dictionaries before they are hashed, which of nested tuples may take for ever."""
+
+    dispatch: ClassVar[dict] = dict(_PythonUnpickler.dispatch)
+
+    def load_build(self):
+        if not isinstance(self.stack[-2], _Array | _DType):
+            raise _Refused('a state for something that has none')
+        super().load_build()
+
+    def _set_items(self):
+        _plain_keys(self.stack[::2])
+        self.load_setitems()
+
+    def _set_item(self):
+        _plain_keys(self.stack[-2:-1])
+        self.load_setitem()
+
+    def _dict(self):
+        _plain_keys(self.stack[::2])
+        self.load_dict()
+
+    def _set(self):
+        raise _Refused('a set')
+
+    dispatch |= {pickle.BUILD[0]: load_build, pickle.SETITEMS[0]: _set_items, pickle.SETITEM[0]: _set_item}
+    dispatch |= {pickle.DICT[0]: _dict}
+    dispatch |= dict.fromkeys((code[0] for code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)), _set)
+
     def find_class(self, module, name):
         try:
             return _NAMES[module, name]
@@ -162,16 +200,48 @@ class _Unpickler(pickle.Unpickler):
         raise _Refused('a persistent object')
 
 
-def _resolve(value, depth=0):
-    """`value` with real arrays in place of their stand-ins. Anything but plain data is refused."""
+def _plain_keys(keys):
+    for key in keys:
+        if not isinstance(key, (str, bytes, int, float)):
+            raise _Refused(f'a dictionary with a key of type {type(key).__name__}')
+        _plain(key)
+
+
+def _scan(stream):
+    """Reads the pickle's instructions without following them. Refuses more than a scan needs, and places in the memo beyond
+    their number: the memo is a table up to its last place."""
+    for count, (code, argument, _) in enumerate(pickletools.genops(stream)):
+        if count > _MOST:
+            raise _Refused(f'more than {_MOST} instructions')
+        place: Any = argument
+        if 'PUT' in code.name and int(place) > count:
+            raise _Refused(f'place {argument} of the memo')
+
+
+def _resolve(value, left, depth=0):
+    """`value` with real arrays in place of their stand-ins. Anything but plain data is refused.
+
+    left   [how many values it may still hold]: one that is used again counts again
+    """
+    left[0] -= 1
+    if left[0] < 0:
+        raise _Refused(f'more than {_MOST} values')
     if depth > 32:
         raise _Refused('data nested more than 32 deep')
     if isinstance(value, _Array):
         return value.value
     if isinstance(value, dict):
-        return {key: _resolve(v, depth + 1) for key, v in value.items()}
+        return {key: _resolve(v, left, depth + 1) for key, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(_resolve(v, depth + 1) for v in value)
+        return type(value)(_resolve(v, left, depth + 1) for v in value)
+    return _plain(value)
+
+
+def _plain(value):
+    if isinstance(value, (str, bytes, bytearray)) and len(value) > _LONGEST_TEXT:
+        raise _Refused(f'a text of {len(value)} characters')
+    if isinstance(value, int) and value.bit_length() > 1024:
+        raise _Refused(f'a whole number of {value.bit_length()} bits')
     if value is None or isinstance(value, (bool, int, float, complex, str, bytes, bytearray, np.generic)):
         return value
     if isinstance(value, _DType):
@@ -188,14 +258,18 @@ def load_pickle(path: PathLike | str) -> Any:
     """
     with reading(path), open(path, 'rb') as stream:
         try:
-            return _resolve(_Unpickler(stream).load())
+            if os.path.getsize(path):
+                with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+                    _scan(mapped)
+            require_room(2 * os.path.getsize(path), path)
+            return _resolve(_Unpickler(stream).load(), [_MOST])
         except _Refused as refused:
             raise InputError(
                 f'{path}: the pickle asks for {one_line(refused)}, which plain scan data does '
                 'not need; do not trust this file, or export it again as arrays and '
                 'numbers'
             ) from None
-        except OSError:
+        except (OSError, InputError):
             raise
         except Exception as error:  # a damaged pickle may fail in any way at all
             raise InputError(
@@ -210,21 +284,28 @@ def _split(data, name, where):
     arrays = []
     for key, ndim in (('projections', 3), ('angles', 1)):
         label = f"{where}: {name}['{key}']"
-        try:
-            array = np.asarray(split[key])
-        except ValueError:
-            raise InputError(f'{label} is not an array; store {ndim} dimensions of numbers') from None
+        array = _as_array(split[key], label, ndim)
         if array.shape[:1] == (0,):
             raise InputError(f'{label} has no views; give at least one')
         arrays.append(numeric(array, label, ndim))
     projections, angles = arrays
     count = data.get('numTrain' if name == 'train' else 'numVal')
+    if count is not None and not isinstance(count, (int, float, np.integer, np.floating)):
+        raise InputError(f'{where}: the number of views must be one number, not {shown(count)}')
     if len(angles) != len(projections) or count not in (None, len(angles)):
         raise InputError(
             f"{where}: '{name}' has {len(projections)} projections and {len(angles)} angles, "
             f'and the file announces {"none" if count is None else count}; these must agree'
         )
     return projections, angles
+
+
+def _as_array(value, label, ndim) -> np.ndarray:
+    try:
+        # Of lists with texts NumPy would make texts, all as long as the longest.
+        return value if isinstance(value, np.ndarray) else np.asarray(value, float)
+    except (ValueError, TypeError, OverflowError, MemoryError):
+        raise InputError(f'{label} is not an array; store {ndim} dimensions of numbers') from None
 
 
 def read(path: PathLike | str) -> Dataset:
@@ -249,7 +330,8 @@ def read(path: PathLike | str) -> Dataset:
         scans[name] = make_scan(geometry, projections.astype(np.float32) * np.float32(1000), path)
     volume = data.get('image')
     if volume is not None:
-        volume = numeric(np.asarray(volume), f"{path}: 'image'", 3)
+        label = f"{path}: 'image'"
+        volume = numeric(_as_array(volume, label, 3), label, 3)
     return make_dataset(scans['train'], scans.get('val', scans.get('test')), volume, path)
 
 

@@ -15,6 +15,7 @@ Clouds fitted by alpha compositing have no density: `write_radiance_ply` writes 
 
 from __future__ import annotations
 
+import os
 from os import PathLike
 
 import numpy as np
@@ -22,10 +23,12 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import reading, replacing
+from lingo_mi.memory import require_room
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'
 _ROT = 'rot_0', 'rot_1', 'rot_2', 'rot_3'
+_LONGEST_LINE, _LONGEST_HEADER = 4096, 1 << 20
 _REST = 15  # coefficients of the harmonics of degrees 1 to 3, of each of three colours
 _PROPERTIES = (*_CENTRE, 'nx', 'ny', 'nz', 'f_dc_0', 'f_dc_1', 'f_dc_2', 'opacity', 'density', *_SCALE, *_ROT)
 _TYPES = {
@@ -187,12 +190,46 @@ def _header(stream, where):
     if lines[:1] != [['format', 'binary_little_endian', '1.0']]:
         fail('is not in the format binary_little_endian 1.0')
     elements = [line for line in lines if line[0] == 'element']
-    if len(elements) != 1 or elements[0][1:2] != ['vertex'] or not elements[0][-1].isdigit():
+    if len(elements) != 1 or elements[0][1:2] != ['vertex'] or len(elements[0]) != 3 or not elements[0][2].isdigit():
         fail("must have the one element 'vertex'")
     fields = [line for line in lines if line[0] == 'property']
     if any(len(f) != 3 or f[1] not in _TYPES for f in fields) or len({f[-1] for f in fields}) != len(fields):
         fail('has lists, unknown types or repeated names among its properties')
     return int(elements[0][2]), np.dtype([(f[2], _TYPES[f[1]]) for f in fields])
+
+
+def require_elements(path: PathLike | str) -> None:
+    """Raises InputError unless a PLY file of any kind has a header with elements, and room for them: Mitsuba's readers end the
+    process where there are none."""
+
+    def fail(what):
+        raise InputError(f'{path}: is a damaged PLY file: {what}; write it again')
+
+    elements, as_text = [], True  # [count, least bytes of one]
+    with reading(path), open(path, 'rb') as stream:
+        line = stream.readline(_LONGEST_LINE).split()
+        if line != [b'ply']:
+            fail('it does not begin with ply')
+        while line != [b'end_header']:
+            line = stream.readline(_LONGEST_LINE).split()
+            if not line and stream.tell() >= os.fstat(stream.fileno()).st_size or stream.tell() > _LONGEST_HEADER:
+                fail('its header has no end')
+            if line[:1] == [b'element']:
+                if len(line) != 3 or not line[2].isdigit() or len(line[2]) > 18:
+                    fail('an element has no count')
+                elements.append([int(line[2]), 0])
+            elif line[:1] == [b'property']:
+                if not elements:
+                    fail('a property is that of no element')
+                kind = _TYPES.get(line[1].decode('ascii', 'replace') if len(line) == 3 else '')
+                elements[-1][1] += 1 if kind is None or as_text else np.dtype(kind).itemsize
+            elif line[:1] == [b'format']:
+                as_text = line[1:2] == [b'ascii']
+        left = os.fstat(stream.fileno()).st_size - stream.tell()
+    if not elements or not all(size for _, size in elements):
+        fail('its header announces no elements, or some without properties')
+    if sum(count * size for count, size in elements) > left:
+        fail(f'its header announces more than its {left} bytes of data')
 
 
 def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -206,12 +243,14 @@ def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
         missing = [name for name in (*_CENTRE, 'density', *_SCALE, *_ROT) if name not in (dtype.names or ())]
         if missing:
             raise InputError(f'{path}: has no property {missing[0]}; write the cloud with lingo_mi')
+        size = os.fstat(stream.fileno()).st_size - stream.tell()
+        if size != n * dtype.itemsize:
+            raise InputError(
+                f'{path}: has {size} bytes of data, but {n} Gaussians need '
+                f'{n * dtype.itemsize}; it is truncated or damaged, write it again'
+            )
+        require_room(size + 80 * n, path)
         body = stream.read()
-    if len(body) != n * dtype.itemsize:
-        raise InputError(
-            f'{path}: has {len(body)} bytes of data, but {n} Gaussians need '
-            f'{n * dtype.itemsize}; it is truncated or damaged, write it again'
-        )
     rows = np.frombuffer(body, dtype)
 
     def take(names):

@@ -70,5 +70,5 @@ def _table(path):
         return np.array([[float(x) for x in row] for row in rows if row], float)
     except InputError:
         raise
-    except ValueError as error:  # also for rows of different lengths, and for bytes that are not text
+    except (ValueError, MemoryError) as error:  # also for rows of different lengths, and for bytes that are not text
         raise InputError(f'{path}: is no table of 12 numbers a view ({one_line(error)})') from None

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import new_folder, one_line, reading
+from lingo_mi.file_access import beside, new_folder, one_line, reading
 from lingo_mi.files import arrays
 from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.scan import Dataset
@@ -25,7 +25,7 @@ from lingo_mi.scan import Dataset
 META = 'meta_data.json'
 
 
-def _views(meta, split, folder, where):
+def _views(meta, split, where):
     listed = meta.get(f'proj_{split}')
     if not listed:
         return None
@@ -34,11 +34,12 @@ def _views(meta, split, folder, where):
     projections, angles = [], []
     for i, view in enumerate(listed):
         try:
-            file, angle = folder / view['file_path'], float(view['angle'])
-        except (TypeError, KeyError, ValueError):
+            name, angle = view['file_path'], float(view['angle'])
+        except (TypeError, KeyError, ValueError, OverflowError):
             raise InputError(
                 f"{where}: entry {i} of proj_{split} must have a 'file_path' and an 'angle' in radians"
             ) from None
+        file = beside(where, name)
         image = arrays.load(file, 2)
         if projections and image.shape != projections[0].shape:
             raise InputError(
@@ -64,17 +65,17 @@ def read(path: PathLike | str) -> Dataset:
             meta = json.loads(where.read_text(encoding='utf-8'))
     except InputError:
         raise
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f'{where}: is not valid JSON ({one_line(error)}); correct or regenerate it') from None
     if not isinstance(meta, dict) or not isinstance(meta.get('scanner'), dict):
         raise InputError(f"{where}: has no 'scanner'; add the dictionary of the scan geometry")
-    train = _views(meta, 'train', folder, where)
+    train = _views(meta, 'train', where)
     if train is None:
         raise InputError(f"{where}: 'proj_train' lists no views; give at least one")
     volume = meta.get('vol', meta.get('ct'))
     if volume is not None:
-        volume = arrays.load(folder / str(volume), 3)
-    return make_dataset(train, _views(meta, 'test', folder, where), volume, where)
+        volume = arrays.load(beside(where, volume), 3)
+    return make_dataset(train, _views(meta, 'test', where), volume, where)
 
 
 def write(path: PathLike | str, dataset: Dataset) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix
@@ -20,19 +20,33 @@ MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
 
 
 def _floats(value) -> np.ndarray:
-    """Raises ValueError or TypeError for anything but numbers, also for true and false."""
-    if np.asarray(value).dtype == bool:
+    """Raises ValueError, TypeError or OverflowError for anything but numbers, also for true and false."""
+    if isinstance(value, np.ndarray) and value.dtype.kind not in 'uif':
         raise ValueError
-    return np.asarray(value, float)
+    array = np.asarray(value, float)  # first: it refuses what is nested too deep to be looked through
+    if _has_truth(value):
+        raise ValueError
+    return array
+
+
+def _has_truth(value) -> bool:
+    return isinstance(value, bool) or isinstance(value, list | tuple) and any(map(_has_truth, value))
+
+
+def _mode(values: dict, where: PathLike | str) -> str:
+    mode = values.get('mode')
+    if mode is not None and not isinstance(mode, str):
+        raise InputError(f'{where}: mode must be cone or parallel, not {shown(mode)}')
+    return mode or 'cone'
 
 
 def _numbers(values: dict, name: str, where: PathLike | str, length: int) -> np.ndarray:
     try:
         array = _floats(values[name]).ravel()
-    except (TypeError, ValueError):
-        raise InputError(f'{where}: {name} must be numbers, not {values[name]!r}') from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f'{where}: {name} must be numbers, not {shown(values[name])}') from None
     if array.size not in (1, length):
-        raise InputError(f'{where}: {name} must be {length} numbers, not {values[name]!r}')
+        raise InputError(f'{where}: {name} must be {length} numbers, not {shown(values[name])}')
     return np.broadcast_to(array, length)
 
 
@@ -40,8 +54,8 @@ def _counts(values: dict, name: str, where: PathLike | str, length: int) -> np.n
     if values.get(name) is None:
         raise InputError(f'{where}: {name} is missing; add it')
     array = _numbers(values, name, where, length)
-    if not np.array_equal(array, np.round(array)):
-        raise InputError(f'{where}: {name} must be whole numbers, not {values[name]!r}')
+    if not (np.isfinite(array).all() and np.array_equal(array, np.round(array))):
+        raise InputError(f'{where}: {name} must be whole numbers, not {shown(values[name])}')
     return array
 
 
@@ -66,7 +80,7 @@ def _per_view(values, name, where, n, length, default=0.0):
         return np.full(length, default) if length > 1 else np.float64(default)
     try:
         array = _floats(values[name])
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
     shape = (n, length) if length > 1 else (n,)
     if array.shape == shape and np.isfinite(array).all():
@@ -74,16 +88,23 @@ def _per_view(values, name, where, n, length, default=0.0):
     if array.size not in (1, length) or array.ndim > 1 or not np.isfinite(array).all():
         raise InputError(
             f'{where}: {name} must be {length} number{"s" * (length > 1)}, or that for each of {n} views, not '
-            f'{str(values[name])[:80]}'
+            f'{shown(values[name])}'
         )
     return np.broadcast_to(array.ravel(), length) if length > 1 else np.float64(array.ravel()[0])
+
+
+def _dimensions(value) -> int:
+    try:
+        return np.ndim(value)
+    except ValueError:  # lists of several lengths, which are refused where they are read
+        return 0
 
 
 def moves(values: dict, n: int) -> bool:
     """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
     lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
     several = any(
-        np.ndim(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
+        _dimensions(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)
         for k, length in lengths.items()
         if values.get(k) is not None
     )
@@ -154,7 +175,7 @@ def to_geometry(
             )
         n_detector, d_detector = n_detector[::-1], d_detector[::-1]
     n_voxel = _counts(values, 'nVoxel', where, 3)
-    mode = values.get('mode') or 'cone'
+    mode = _mode(values, where)
     for name in ('DSO', 'DSD'):
         if values.get(name) is None:
             if mode != 'parallel':
@@ -203,11 +224,11 @@ def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) ->
     if values.get('dDetector') is not None or values.get('sDetector') is not None:
         step = _steps(values, 'Detector', n_detector, where)
     origin = np.zeros(3) if values.get('offOrigin') is None else _numbers(values, 'offOrigin', where, 3)
-    mode = values.get('mode') or 'cone'
+    mode = _mode(values, where)
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
     try:
         if mode not in ('cone', 'parallel'):
-            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
+            raise InputError(f"mode must be 'cone' or 'parallel', not {shown(mode)}")
         return Geometry.from_poses(
             views(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin
         )

@@ -40,15 +40,16 @@ cone beam with one row.
 
 from __future__ import annotations
 
+import math
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import new_folder, one_line, reading, replacing
-from lingo_mi.files import arrays, naf, r2
+from lingo_mi.errors import InputError, shown
+from lingo_mi.file_access import beside, new_folder, reading, replacing
+from lingo_mi.files import arrays, naf, plain_yaml, r2
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import (
@@ -64,6 +65,7 @@ from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.parsing import nearest
 from lingo_mi.scan import Dataset, Scan
 
 _KEYS = {
@@ -97,29 +99,27 @@ _KEYS = {
 
 
 def _load_yaml(path) -> dict:
-    try:
-        with reading(path):
-            values = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except InputError:
-        raise
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: is not valid YAML ({one_line(error)}); correct it') from None
+    values = plain_yaml.load(path)
     if not isinstance(values, dict):
         raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
     unknown = sorted(str(key) for key in values.keys() - _KEYS)
     if unknown:
         raise InputError(
-            f'{path}: {one_line(unknown[0])} is not a name of the scan geometry or not '
-            f'supported; the names are {", ".join(sorted(_KEYS))}'
+            f'{path}: {unknown[0]} is not a name of the scan geometry or not '
+            f"supported{nearest(unknown[0], _KEYS)}; the names are TIGRE's, see docs/how_to/own_projections.md"
         )
     return values
 
 
 def _number(values, key, default, where):
     value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise InputError(f'{where}: {key} must be one number, not {value!r}')
-    return float(value)
+    try:
+        number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f'{where}: {key} must be one number, not {shown(value)}')
+    return number
 
 
 def _geometry(values, n, where, test=False):
@@ -131,7 +131,7 @@ def _geometry(values, n, where, test=False):
 
     def views(n_detector, step, parallel, origin):
         if isinstance(poses, str):
-            found = read_poses(Path(where).parent / poses, n_detector, step, parallel, origin)
+            found = read_poses(beside(where, poses), n_detector, step, parallel, origin)
         else:
             found = astra.from_vectors(poses, n_detector, parallel)
         if len(found) != n:
@@ -147,7 +147,7 @@ def _angles(values, key, n, where):
         return circular(n, _number(values, 'totalAngle', 360.0, where), _number(values, 'startAngle', 0.0, where))
     try:
         angles = np.radians(np.asarray(values[key], float))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f'{where}: {key} must be a list of numbers, in degrees') from None
     if angles.shape not in ((n,), (n, 3)):
         raise InputError(
@@ -163,8 +163,8 @@ def _valid(values, shape, where):
     if name is None:
         return None
     if not isinstance(name, str):
-        raise InputError(f'{where}: valid must be the name of a .npy file, not {name!r}')
-    path = Path(where).parent / name
+        raise InputError(f'{where}: valid must be the name of a .npy file, not {shown(name)}')
+    path = beside(where, name)
     mask = arrays.load(path, None)
     if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
         raise InputError(
@@ -176,7 +176,7 @@ def _valid(values, shape, where):
 def _line_integrals(projections, values, where, projections_path):
     kind = values.get('input', 'line_integral')
     if kind not in ('line_integral', 'intensity'):
-        raise InputError(f'{where}: input must be line_integral or intensity, not {kind!r}')
+        raise InputError(f'{where}: input must be line_integral or intensity, not {shown(kind)}')
     if kind == 'line_integral':
         return projections
     if values.get('I0') is None:
@@ -185,7 +185,7 @@ def _line_integrals(projections, values, where, projections_path):
     if i0 <= 0:
         raise InputError(f'{where}: I0 must be positive, not {i0:g}')
     if not projections.min() > 0:
-        bad = tuple(int(i) for i in np.argwhere(projections <= 0)[0])
+        bad = tuple(int(i) for i in np.argwhere(~(projections > 0))[0])
         raise InputError(
             f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
             'so it has no logarithm; mask or repair dead pixels first'
@@ -313,9 +313,9 @@ def _read_htc(path, name):
             'angles_deg), the only .npz scan that can be read; give .npy with a .yml beside it'
         )
     if name not in names:
-        raise InputError(f'{path}: has no sinogram {name!r}; it has {", ".join(names)}')
+        raise InputError(f'{path}: has no sinogram {shown(name)}; it has {", ".join(names)}')
     sinogram = arrays.numeric(data[f'sinogram_{name}'], f'{path}: sinogram_{name}', 2)
-    degrees = arrays.numeric(data['angles_deg'], f'{path}: angles_deg', 1)
+    degrees = arrays.numeric(data['angles_deg'], f'{path}: angles_deg', 1).astype(float)
     if len(degrees) != len(sinogram):
         raise InputError(
             f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these must agree'

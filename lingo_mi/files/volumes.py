@@ -16,9 +16,9 @@ Values become density by these rules, the first that applies:
 
 from __future__ import annotations
 
-import gzip
 import hashlib
-import re
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -29,15 +29,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, optional, reading, replacing
-from lingo_mi.files import arrays
+from lingo_mi.errors import InputError, shown
+from lingo_mi.file_access import reading, replacing
+from lingo_mi.files import arrays, metaimage, nifti, nrrd, slices
 from lingo_mi.files.arrays import numeric
+from lingo_mi.files.voxels import LPS_TO_RAS, read_voxels
 from lingo_mi.geometry.base import Geometry
 
 _OURS = 'lingo_mi: '
-_TO_MM = {'meter': 1000.0, 'mm': 1.0, 'micron': 1e-3, 'unknown': 1.0}
-_LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Raw files known by their content: SHA-1 of the git blob -> shape [x, y, z], type. The first is the
 # rotational C-arm scan `foot` of the volvis.org collection.
 _KNOWN_RAW = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uint8')}
@@ -109,66 +108,14 @@ def _density(data, path, hu, mu_water):
     return (data if keep else data / np.float32(high)), 'normalised'
 
 
-# ---- formats: each returns (numeric array [x, y, z], affine or None) ---------------------------------------
-
-
-def _nifti(path):
-    import nibabel
-
-    description, to_mm = '', 1.0
-    try:
-        with reading(path):
-            image: Any = nibabel.load(path)
-            data = np.asanyarray(image.dataobj)
-            if path.name.endswith('.gz'):
-                _check_sum(path)
-            if isinstance(image, nibabel.Nifti1Image):
-                description = bytes(image.header['descrip'].item()).decode('utf-8', 'replace')
-                to_mm = _TO_MM.get(str(image.header.get_xyzt_units()[0]), 1.0)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged header fails inside nibabel in many ways
-        raise InputError(f'{path}: is damaged or not a NIfTI file ({one_line(error)}); fetch it again') from None
-    while data.ndim > 3 and data.shape[-1] == 1:
-        data = data[..., 0]
-    return data, np.diag([to_mm, to_mm, to_mm, 1.0]) @ image.affine, description
-
-
-def _check_sum(path):
-    """Raises BadGzipFile if the content does not match its checksum, which nibabel does not read."""
-    with gzip.open(path) as file:
-        while file.read(1 << 20):
-            pass
-
-
-def _itk(path):
-    sitk = optional('SimpleITK')
-    with reading(path):
-        open(path, 'rb').close()
-    try:
-        image = sitk.ReadImage(str(path))
-    except RuntimeError as error:
-        raise InputError(
-            f'{path}: cannot be read by SimpleITK ({one_line(error).split("ERROR: ")[-1]}); '
-            'check the header, and for .mhd the raw file that it names'
-        ) from None
-    if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1:
-        raise InputError(
-            f'{path}: has {image.GetDimension()} dimensions and '
-            f'{image.GetNumberOfComponentsPerPixel()} values a voxel; a 3D volume of single '
-            'values is needed'
-        )
-    affine = np.eye(4)
-    affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
-    affine[:3, 3] = image.GetOrigin()
-    return sitk.GetArrayFromImage(image).transpose(2, 1, 0), _LPS_TO_RAS @ affine
+# ---- NumPy's archive and raw bytes -------------------------------------------------------------------------
 
 
 def _npz(path):
-    volumes = {name: a for name, a in arrays.load_many(path).items() if a.ndim == 3}
+    volumes = [a for a in arrays.load_many(path).values() if a.ndim == 3]
     if len(volumes) != 1:
         raise InputError(f'{path}: holds {len(volumes)} arrays of 3 dimensions; save exactly one')
-    return next(iter(volumes.values()))
+    return volumes[0]
 
 
 def git_blob_sha1(content: bytes) -> str:
@@ -178,124 +125,35 @@ def git_blob_sha1(content: bytes) -> str:
 
 def _raw(path, shape, dtype):
     with reading(path):
-        content = Path(path).read_bytes()
+        size = os.path.getsize(path)
     if shape is None or dtype is None:
-        known = _KNOWN_RAW.get(git_blob_sha1(content))
+        known = None
+        if size in {math.prod(s) * np.dtype(d).itemsize for s, d in _KNOWN_RAW.values()}:
+            with reading(path):
+                known = _KNOWN_RAW.get(git_blob_sha1(Path(path).read_bytes()))
         if known is None:
             raise InputError(f'{path}: raw bytes have no header; give the shape (x, y, z) and the dtype')
         shape, dtype = known
     try:
-        dtype, shape = np.dtype(dtype), tuple(int(n) for n in shape)
-    except (TypeError, ValueError):
+        given, shape = dtype, tuple(int(n) for n in shape)
+        dtype = np.dtype(given)
+    except Exception:  # of a text that is no type, NumPy raises many kinds, SyntaxError among them
         raise InputError(
-            f'{path}: shape {shape!r} or dtype {dtype!r} is not understood; give for example (256, 256, 256) and uint8'
+            f'{path}: shape {shown(shape)} or dtype {shown(dtype)} is not understood; give for example (256, 256, 256) '
+            'and uint8'
         ) from None
-    if len(shape) != 3 or min(shape) < 1:
-        raise InputError(f'{path}: the shape must be 3 positive numbers (x, y, z), not {shape}')
-    expected = int(np.prod(shape)) * dtype.itemsize
-    if len(content) != expected:
+    if dtype.kind not in 'buif':
         raise InputError(
-            f'{path}: has {len(content)} bytes, but {shape} of {dtype} needs {expected}; correct the shape or the dtype'
+            f'{path}: the dtype of raw bytes must be one of real numbers, such as uint8, not {shown(given)}'
         )
-    return np.frombuffer(content, dtype).reshape(shape[::-1]).transpose(2, 1, 0)
-
-
-def _natural(path):
-    """Sorts slice_9 before slice_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
-
-
-def _tiff_file(tifffile, path):
-    try:
-        with reading(path):
-            return tifffile.imread(path)
-    except InputError:
-        raise
-    except Exception as error:  # damaged files fail inside tifffile and its codecs in many ways
-        raise InputError(f'{path}: is damaged or not a TIFF file ({one_line(error)}); write it again') from None
-
-
-def _tiff(files, path):
-    tifffile = optional('tifffile')
-    slices = [_tiff_file(tifffile, file) for file in files]
-    if len(slices) == 1:
-        return (slices[0][None] if slices[0].ndim == 2 else slices[0]).transpose()
-    for file, image in zip(files, slices):
-        if image.ndim != 2 or image.shape != slices[0].shape:
-            raise InputError(
-                f'{file}: has the shape {image.shape}, but the slices of a folder must be 2D '
-                f'and of one size (the first is {slices[0].shape})'
-            )
-    return np.stack(slices).transpose()
-
-
-def _dicom(folder):
-    pydicom = optional('pydicom')
-    slices = []
-    for file in sorted(f for f in folder.iterdir() if f.is_file()):
-        try:
-            with reading(file):
-                data = pydicom.dcmread(file)
-        except pydicom.errors.InvalidDicomError:
-            continue  # notes and indices in the same folder
-        if 'PixelData' in data:
-            slices.append((file, data))
-    if not slices:
-        raise InputError(f'{folder}: holds neither DICOM nor TIFF slices; give the folder that directly holds them')
-    series = {str(s.get('SeriesInstanceUID')) for _, s in slices}
-    if len(series) > 1:
-        raise InputError(f'{folder}: holds {len(series)} DICOM series; put one series in a folder of its own')
-    try:
-        return _stack_dicom(folder, slices)
-    except (AttributeError, KeyError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise
+    if len(shape) != 3 or min(shape) < 1:
+        raise InputError(f'{path}: the shape must be 3 positive numbers (x, y, z), not {shown(shape)}')
+    expected = math.prod(shape) * dtype.itemsize
+    if size != expected:
         raise InputError(
-            f'{folder}: a DICOM slice lacks geometry or has unreadable pixels '
-            f'({one_line(error)}); export the series again, uncompressed'
-        ) from None
-
-
-def _stack_dicom(folder, slices):
-    first = slices[0][1]
-    x_axis, y_axis = np.reshape(np.asarray(first.ImageOrientationPatient, float), (2, 3))
-    normal = np.cross(x_axis, y_axis)
-    row_step, column_step = (float(d) for d in first.PixelSpacing)  # between rows (y), between columns (x)
-    for file, s in slices:
-        if (
-            (s.Rows, s.Columns) != (first.Rows, first.Columns)
-            or int(s.get('NumberOfFrames', 1)) != 1
-            or not np.allclose(np.asarray(s.PixelSpacing, float), [row_step, column_step], rtol=1e-4)
-            or not np.allclose(np.asarray(s.ImageOrientationPatient, float), [*x_axis, *y_axis], atol=1e-3)
-        ):
-            raise InputError(f'{file}: differs from the other slices in size, pixel spacing or orientation; remove it')
-    slices = sorted(
-        ((np.asarray(s.ImagePositionPatient, float) @ normal, file, s) for file, s in slices), key=lambda item: item[0]
-    )
-    depth = np.array([d for d, _, _ in slices])
-    steps = np.diff(depth)
-    if len(steps) == 0:
-        step = float(first.SliceThickness)
-    else:
-        step = float(np.median(steps))
-        uneven = np.abs(steps - step) > max(0.01 * step, 1e-3)
-        if step <= 0 or uneven.any():
-            i = int(np.argmax(uneven))
-            raise InputError(
-                f'{folder}: the slices are not evenly spaced: {steps[i]:g} mm from '
-                f'{slices[i][1].name} to {slices[i + 1][1].name}, {step:g} mm elsewhere; '
-                'add the missing or remove the extra slices'
-            )
-    data = np.stack(
-        [
-            np.float32(s.get('RescaleSlope', 1)) * s.pixel_array + np.float32(s.get('RescaleIntercept', 0))
-            for _, _, s in slices
-        ]
-    )
-    affine = np.eye(4)
-    affine[:3, :3] = np.stack([x_axis * column_step, y_axis * row_step, normal * step], 1)
-    affine[:3, 3] = np.asarray(slices[0][2].ImagePositionPatient, float)
-    return data.transpose(2, 1, 0), _LPS_TO_RAS @ affine
+            f'{path}: has {size} bytes, but {shape} of {dtype} needs {expected}; correct the shape or the dtype'
+        )
+    return read_voxels(path, 0, shape, dtype)
 
 
 # ---- in and out --------------------------------------------------------------------------------------------
@@ -311,7 +169,7 @@ def read_volume(
 ) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
-    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd (SimpleITK); .npy, .npz with one 3D array,
+    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd; .npy, .npz with one 3D array,
                [x, y, z]; .tif, .tiff or a folder of them, [z][y, x], sorted by name (tifffile); a folder of
                DICOM slices, sorted by position (pydicom); .raw, or any file if shape and dtype are given
     mu_water   attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1]
@@ -328,29 +186,25 @@ def read_volume(
     path = Path(path)
     name, description, affine = path.name.lower(), '', None
     if mu_water is not None and not (np.isfinite(mu_water) and mu_water > 0):
-        raise InputError(f'mu_water must be positive, in 1/mm, not {mu_water!r}; water at 60 keV has 0.0206')
+        raise InputError(f'mu_water must be positive, in 1/mm, not {shown(mu_water)}; water at 60 keV has 0.0206')
     if (shape is None) != (dtype is None) and not name.endswith('.raw'):
         raise InputError(f'{path}: the shape and the dtype of raw bytes go together; give both or neither')
     if path.is_dir():
-        with reading(path):
-            tiffs = sorted((f for f in path.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=_natural)
-        if tiffs:
-            data = _tiff(tiffs, path)
-        else:
-            data, affine = _dicom(path)
-            hu = True if hu is None else hu
+        data, affine = slices.read_folder(path)
+        hu = True if hu is None and affine is not None else hu  # DICOM's
     elif shape is not None and dtype is not None or name.endswith('.raw'):
         data = _raw(path, shape, dtype)
     elif name.endswith(('.nii', '.nii.gz', '.hdr', '.img')):
-        data, affine, description = _nifti(path)
+        data, affine, description = nifti.read(path)
     elif name.endswith(('.nrrd', '.nhdr', '.mha', '.mhd')):
-        data, affine = _itk(path)
+        data, affine = (nrrd if name.endswith(('.nrrd', '.nhdr')) else metaimage).read(path)
+        affine = LPS_TO_RAS @ affine
     elif name.endswith('.npy'):
         data = arrays.load(path, 3)
     elif name.endswith('.npz'):
         data = _npz(path)
     elif name.endswith(('.tif', '.tiff')):
-        data = _tiff([path], path)
+        data = slices.read_tiff([path])
     elif name.endswith('.dcm'):
         raise InputError(f'{path}: is a single DICOM slice; give the folder of the series')
     else:
@@ -364,7 +218,7 @@ def read_volume(
     if affine is None:
         steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))
         if steps.shape not in ((1,), (3,)) or not (np.isfinite(steps).all() and steps.min() > 0):
-            raise InputError(f'spacing must be one or three positive numbers, in mm, not {spacing!r}')
+            raise InputError(f'spacing must be one or three positive numbers, in mm, not {shown(spacing)}')
         affine = centred_affine(data.shape, np.broadcast_to(steps, 3))
     elif spacing is not None:
         raise InputError(f'{path}: carries its own voxel size; leave spacing out')

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.memory import room
 from lingo_mi.scan import Scan
+
+BYTES = 500  # that a fit needs at least for each Gaussian: 14 parameters, their moments and derivatives, and copies
 
 
 def bounded(settings: Settings, scan: Scan) -> Settings:
@@ -15,19 +20,32 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
 
     The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
     no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. Settings in units of the
-    scene's radius are converted to lengths. Raises InputError if the source is inside the volume.
+    scene's radius are converted to lengths. Raises InputError if the source is inside the volume, for a step of more views than
+    the scan has, and for more Gaussians at the start than this process has memory for.
     """
     g = scan.geometry
+    if settings.batch > len(scan):
+        raise InputError(
+            f'batch is the number of views in a step: at most the {len(scan)} of the scan, not {settings.batch}'
+        )
     settings = forward_model(settings).with_lengths(g)
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:
         most = min(max(int(scan.projections.size / control.values_per_gaussian), 1), control.max_gaussians)
         settings = settings.changed(max_gaussians=most, n_points=min(settings.start.n_points, most))
+    points = settings.start.n_points
+    if settings.start.init == 'r2':  # takes no voxel twice
+        points = min(points, math.prod(g.nVoxel))
+    if settings.start.init != 'cuboid' and points * BYTES > (has := room()):
+        raise InputError(
+            f'{points} Gaussians need at least {points * BYTES / 2**30:,.1f} GiB of memory, but this process may take '
+            f'{has / 2**30:,.1f} GiB: lower n_points'
+        )
     if g.mode == 'parallel':
         return settings
     rays = g.normalised_rays()
-    room = np.linalg.norm(rays.source, axis=1).min() - np.linalg.norm(g.half)
-    largest = 0.9 * room / settings.model.extent
+    clear = np.linalg.norm(rays.source, axis=1).min() - np.linalg.norm(g.half)
+    largest = 0.9 * clear / settings.model.extent
     if largest <= bounds.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
     return settings.changed(scale_max=min(bounds.scale_max, largest))

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 
 from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import average, checkpoint
+from lingo_mi.fitting.checkpoint_schema import geometry_of, settings_of
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.poses import Poses
@@ -110,29 +110,20 @@ class Fitted:
         Raises InputError if the file is missing or not a checkpoint, or if the fit has modelled effects that are not given.
         """
         state, extra, arrays = checkpoint.load(path)
-        try:
-            settings = _settings(extra['settings'])
-            scanner, unit, seed = (extra[name] for name in ('scanner', 'unit', 'seed'))
-            seconds, info = (extra[name] for name in ('seconds', 'info'))
-            history = [current_names(entry) for entry in extra['history']]
-            initial = arrays['initial']
-        except (AttributeError, KeyError, TypeError, InputError):
-            raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; fit again') from None
+        if 'unit' not in extra:
+            raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; fit again')
+        settings, geometry = settings_of(extra), geometry_of(extra)
         if effects is None and extra.get('effects', bool(arrays.keys() & {'share', 'scattered'})):
             raise InputError(
                 f'{path}: the fit has modelled effects of its scan, which a checkpoint does not keep: give them too, '
                 'or use its result.xml, which has them'
             )
-        geometry = mi.load_dict(scanner).geometry
         poses = None
         if max(settings.adam.rate_pose) > 0:
             poses = Poses(len(geometry))
             poses.restore(arrays)
         state.values |= average.values_of(arrays)
-        model = CloudModel(settings, geometry, unit, effects)
-        return cls(model, state, initial, poses, seed, history, seconds, info)
-
-
-def _settings(stored: dict) -> Settings:
-    """Settings from JSON, where tuples are lists."""
-    return Settings().changed(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()})
+        model = CloudModel(settings, geometry, extra['unit'], effects)
+        history = [current_names(entry) for entry in extra['history']]
+        seed, seconds, info = (extra[name] for name in ('seed', 'seconds', 'info'))
+        return cls(model, state, arrays['initial'], poses, seed, history, seconds, info)

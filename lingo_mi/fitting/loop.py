@@ -61,7 +61,7 @@ def run(
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
     if isinstance(begin, Path):
         host, extra, arrays = checkpoint.load(begin)
-        require_same_fit(host, extra, settings, scanned, seed, begin)
+        require_same_fit(extra, settings, scanned, seed, begin)
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, info = (extra[k] for k in ('iteration', 'seconds', 'info'))

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.fitting.state import State
 
 
 def extensible(settings: Settings) -> bool:
@@ -19,14 +17,8 @@ def extensible(settings: Settings) -> bool:
     return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.adam.average == 0
 
 
-def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:
-    """Raise InputError if a checkpoint belongs to another fit, or is inconsistent."""
-    damaged = InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged; remove it and start again')
-    if (
-        not {'rng', 'seed', 'iteration', 'seconds', 'history', 'info', 'settings', 'views', 'scanner', 'signal'}
-        <= extra.keys()
-    ):
-        raise damaged
+def require_same_fit(extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:
+    """Raise InputError if a checkpoint, by its plain values, belongs to another fit."""
     now = settings.flat()
     before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
@@ -48,12 +40,3 @@ def require_same_fit(host: State, extra: dict, settings: Settings, scanned: dict
             f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
             'settings, or remove it and start again'
         )
-    shapes = {k: (len(host), size) for k, size in forward_model(settings).parameters.items()}
-    if not (
-        len(host.gradient) == len(host.visits) == len(host)
-        and all(
-            {k: x.shape for k, x in group.items()} == shapes and all(np.isfinite(x).all() for x in group.values())
-            for group in (host.values, host.first, host.second)
-        )
-    ):
-        raise damaged

@@ -6,16 +6,17 @@ Code uses the parts. Users, command lines and files use flat names, which are un
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.lingo.initialise import LingoSettings
-from lingo_mi.parsing import checked, nearest, parse
+from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
 
 INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by the setting `render`
+# Ranges end where float32 or the time of a fit does, far beyond what is of use.
+MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
 
 
 @dataclass(frozen=True)
@@ -32,16 +33,19 @@ class StartSettings(LingoSettings):
     the source, invalid pixels).
     """
 
+    RANGES: ClassVar = LingoSettings.RANGES | dict(
+        cuboid_step=(1, 1e6), fdk_threshold=(-1e6, 1e6), fdk_rescale=(0, 1e6)
+    )
+
     init: str = 'r2'
     cuboid_step: int = 8
     fdk_threshold: float = 0.05
     fdk_rescale: float = 0.15
 
     def __post_init__(self):
-        _require_finite(self)
         super().__post_init__()
-        _require_at_least(1, self, 'cuboid_step')
-        _require_at_least(0, self, 'fdk_rescale')
+        known = [name for names in INITS.values() for name in names]
+        _require(self.init in known, f'init is one of {", ".join(known)}, not {shown(self.init)}')
 
 
 @dataclass(frozen=True)
@@ -69,11 +73,8 @@ class ModelSettings:
     effects: str = 'model'
 
     def __post_init__(self):
-        _require_finite(self)
+        require_ranges(self, sh_degree=(0, 3), sh_every=(1, MOST_STEPS), extent=(1, 20))
         _require(self.render in INITS, f"render is 'integral' or 'alpha', not {self.render!r}")
-        _require(0 <= self.sh_degree <= 3, f'sh_degree is from 0 to 3, not {self.sh_degree}')
-        _require_at_least(1, self, 'sh_every')
-        _require(1 <= self.extent <= 20, f'extent is from 1 to 20 standard deviations, not {self.extent:g}')
         _require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
 
 
@@ -99,9 +100,7 @@ class LossSettings:
     loss_scale: str = 'none'
 
     def __post_init__(self):
-        _require_finite(self)
-        _require_at_least(0, self, 'lambda_ssim', 'lambda_tv')
-        _require(self.tv_size >= 1 and self.tv_stride >= 1, 'tv_size and tv_stride must be at least 1')
+        require_ranges(self, lambda_ssim=(0, 1e6), lambda_tv=(0, 1e6), tv_size=(1, 1e6), tv_stride=(1, 1e6))
         _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
         _require(
             self.loss_scale in ('none', 'dynamic', 'statistic'),
@@ -138,17 +137,11 @@ class AdamSettings:
     average: float = 0.0
 
     def __post_init__(self):
-        _require_finite(self)
-        _require(0 <= self.beta1 < 1 and 0 <= self.beta2 < 1, 'beta1 and beta2 must lie in [0, 1)')
-        _require_at_least(0, self, 'epsilon')
-        _require(0 <= self.average < 1, f'average must be at least 0 and below 1, not {self.average:g}')
-        for name in (f.name for f in fields(self) if f.name.startswith('rate_') and f.name != 'rate_pose'):
-            rate = getattr(self, name)
-            _require(
-                len(rate) == 2 and min(rate) > 0, f'{name} must be two positive numbers, first and last, not {rate}'
-            )
+        rates = {f.name: RATES for f in fields(self) if f.name.startswith('rate_')} | dict(rate_pose=(0, 1))
+        decay = (0, 1 - 1e-6)  # beyond, float32 counts it as 1
+        require_ranges(self, **rates, beta1=decay, beta2=decay, epsilon=(0, 1), average=decay)
         _require(
-            len(self.rate_pose) == 2 and (min(self.rate_pose) > 0 or self.rate_pose == (0, 0)),
+            min(self.rate_pose) > 0 or self.rate_pose == (0, 0),
             f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}',
         )
 
@@ -192,21 +185,21 @@ class DensificationSettings:
     values_per_gaussian: float = 0.0
 
     def __post_init__(self):
-        _require_finite(self)
-        _require(self.birth in ('clone', 'halve'), f"birth is 'clone' or 'halve', not {self.birth!r}")
-        _require_at_least(1, self, 'densify_every', 'max_gaussians')
-        _require_at_least(
-            0,
+        steps, sizes = (0, MOST_STEPS), (0, 1e6)
+        require_ranges(
             self,
-            'densify_from',
-            'densify_until',
-            'densify_threshold',
-            'split_size',
-            'prune_density',
-            'reset_every',
-            'prune_size',
-            'values_per_gaussian',
+            densify_from=steps,
+            densify_until=steps,
+            densify_every=(1, MOST_STEPS),
+            densify_threshold=sizes,
+            split_size=sizes,
+            prune_density=sizes,
+            reset_every=steps,
+            prune_size=sizes,
+            max_gaussians=(1, 1e9),
+            values_per_gaussian=(0, 1e9),
         )
+        _require(self.birth in ('clone', 'halve'), f"birth is 'clone' or 'halve', not {self.birth!r}")
 
 
 @dataclass(frozen=True)
@@ -217,8 +210,8 @@ class ScaleBounds:
     scale_max: float = 1.0
 
     def __post_init__(self):
-        _require_finite(self)
-        _require(0 < self.scale_min < self.scale_max, 'scale_min must be positive and below scale_max')
+        require_ranges(self, scale_min=SCALES, scale_max=SCALES)
+        _require(self.scale_min < self.scale_max, 'scale_min must be below scale_max')
 
 
 @dataclass(frozen=True)
@@ -249,10 +242,14 @@ class Settings:
     bounds: ScaleBounds = field(default_factory=ScaleBounds)
 
     def __post_init__(self):
-        _require_finite(self)
-        _require_at_least(1, self, 'iterations', 'batch')
-        _require_at_least(0, self, 'decay_steps', 'checkpoint_seconds')
-        _require(0 <= self.coarse_share <= 1, f'coarse_share must lie in [0, 1], not {self.coarse_share:g}')
+        require_ranges(
+            self,
+            iterations=(1, MOST_STEPS),
+            decay_steps=(0, MOST_STEPS),
+            batch=(1, 1e6),
+            coarse_share=(0, 1),
+            checkpoint_seconds=(0, 1e9),
+        )
         inits, init = INITS[self.model.render], self.start.init
         _require(init in inits, f'init is {inits[0]!r} or {inits[1]!r} with render={self.model.render}, not {init!r}')
         _require(
@@ -278,7 +275,7 @@ class Settings:
         """All values by their flat names, as in files and on command lines."""
         return {name: value for _, values in self._parts() for name, value in values.items()}
 
-    def changed(self, **values: Any) -> Settings:
+    def changed(self, /, **values: Any) -> Settings:
         """A copy with new values, by flat name. Values may be strings, as from a command line.
 
         Raises InputError for an unknown name or a value of the wrong kind.
@@ -314,19 +311,3 @@ class Settings:
 def _require(good: bool, message: str):
     if not good:
         raise InputError(message)
-
-
-def _require_finite(part):
-    """Raise InputError if a number of a part is not finite."""
-    for f in fields(part):
-        value = getattr(part, f.name)
-        numbers = [x for x in (value if isinstance(value, tuple) else [value]) if isinstance(x, int | float)]
-        _require(all(map(math.isfinite, numbers)), f'{f.name} must be finite, not {value}')
-
-
-def _require_at_least(least: int, part, *names: str):
-    """Raise InputError if one of the named numbers is below `least` (0 or 1)."""
-    for name in names:
-        value = getattr(part, name)
-        say = 'not be negative' if least == 0 else f'be at least {least}'
-        _require(value >= least, f'{name} must {say}, not {value:g}')

@@ -28,6 +28,7 @@ import numpy as np
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.functional.frameworks import call
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.memory import room
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
 from lingo_mi.projectors.cloud import line_integrals
@@ -81,9 +82,9 @@ def project(
         found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 
-    return call(
-        _checked(images, 'project'), (means, scales, quaternions, density), (len(index), height, width), 'project'
-    )
+    shape = len(index), height, width
+    _require_room(shape, 'project')
+    return call(_checked(images, 'project'), (means, scales, quaternions, density), shape, 'project')
 
 
 def voxelize(
@@ -99,6 +100,7 @@ def voxelize(
     shape = geometry.nVoxel
     corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
     extent = _extent(extent)
+    _require_room(shape, 'voxelize')
 
     def grid(*gaussians):
         cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
@@ -119,6 +121,16 @@ def _checked(function, name: str):
         return function(*gaussians)
 
     return wrapped
+
+
+def _require_room(shape: tuple[int, ...], name: str):
+    """Raises InputError for a result that does not fit into this process's memory, or into the 32 bits of Dr.Jit's indices."""
+    count, most = math.prod(shape), int(min(room() / 4, 2**32 - 1))
+    if count > most:
+        size = ' x '.join(map(str, shape))
+        raise InputError(
+            f'{name}: {size} numbers do not fit into this process, only {most:,}: take fewer views, pixels or voxels'
+        )
 
 
 def _extent(extent) -> float:

@@ -14,10 +14,13 @@ ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.cre
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry import limits
 from lingo_mi.geometry.rays import Rays
 
 CIRCLES = {'cone': 'cone', 'parallel3d': 'parallel'}  # ASTRA's types of scans on a circle, and their beams
@@ -31,10 +34,7 @@ def to_vectors(rays: Rays, nDetector: tuple[int, int]) -> np.ndarray:
 
 def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool) -> Rays:
     """The views of ASTRA's vectors [n, 12]; nDetector is (v, u) pixels. InputError where they are no poses."""
-    try:
-        vectors = np.asarray(vectors, float)
-    except (TypeError, ValueError):
-        raise InputError('poses must be 12 numbers for every view') from None
+    vectors = limits.lengths('poses', vectors)
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
         raise InputError(
             f'poses must be 12 numbers for every view (source, centre of the panel, u, v), not an array of '
@@ -52,16 +52,16 @@ def circle(proj_geom: dict) -> dict:
     """
     mode = CIRCLES[proj_geom['type']]
     DSO, to_panel = (
-        _given(proj_geom, 'DistanceOrigin' + of) if mode == 'cone' else 0.0 for of in ('Source', 'Detector')
+        _number(proj_geom, 'DistanceOrigin' + of) if mode == 'cone' else 0.0 for of in ('Source', 'Detector')
     )
     return dict(
         mode=mode,
         DSO=DSO,
         DSD=DSO + to_panel,
         nDetector=_panel(proj_geom),
-        dDetector=(_given(proj_geom, 'DetectorSpacingY'), _given(proj_geom, 'DetectorSpacingX')),
+        dDetector=(_number(proj_geom, 'DetectorSpacingY'), _number(proj_geom, 'DetectorSpacingX')),
         # ASTRA's source is at DSO (sin a, -cos a, 0).
-        angles=np.asarray(_given(proj_geom, 'ProjectionAngles'), float) - np.pi / 2,
+        angles=limits.angles('ProjectionAngles', _given(proj_geom, 'ProjectionAngles')) - np.pi / 2,
     )
 
 
@@ -72,9 +72,9 @@ def views(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
 
     Raises InputError where the type is another one, a number is missing, or the vectors are no poses.
     """
-    kind = proj_geom.get('type')
+    kind = kind_of(proj_geom)
     if kind not in VECTORS:
-        raise InputError(f'an ASTRA geometry must be of the type {", ".join(CIRCLES | VECTORS)}, not {kind!r}')
+        raise InputError(f'an ASTRA geometry must be of the type {", ".join(CIRCLES | VECTORS)}, not {shown(kind)}')
     nDetector = _panel(proj_geom)
     rays = from_vectors(_given(proj_geom, 'Vectors'), nDetector, VECTORS[kind] == 'parallel')
     source, v = rays.source, -rays.v
@@ -88,19 +88,36 @@ def grid(vol_geom: dict) -> dict:
 
     Raises InputError where it has two dimensions only, or a number is missing.
     """
-    if 'GridSliceCount' not in vol_geom:
+    if not isinstance(vol_geom, Mapping) or 'GridSliceCount' not in vol_geom:
         raise InputError('the ASTRA volume has no GridSliceCount: give one of three dimensions')
     window = _given(vol_geom, 'option')
-    nVoxel = [_given(vol_geom, f'Grid{name}Count') for name in ('Col', 'Row', 'Slice')]
-    low, high = (np.array([_given(window, f'Window{end}{axis}') for axis in 'XYZ'], float) for end in ('Min', 'Max'))
-    return dict(nVoxel=nVoxel, dVoxel=(high - low) / nVoxel, offOrigin=(low + high) / 2)
+    counts = np.array([_number(vol_geom, f'Grid{name}Count') for name in ('Col', 'Row', 'Slice')])
+    low, high = (np.array([_number(window, f'Window{end}{axis}') for axis in 'XYZ']) for end in ('Min', 'Max'))
+    if not np.all(counts >= 1):
+        raise InputError(f'the counts of an ASTRA volume must be positive, not {shown(counts.tolist())}')
+    return dict(nVoxel=counts, dVoxel=(high - low) / counts, offOrigin=(low + high) / 2)
+
+
+def kind_of(proj_geom: dict) -> str:
+    """The type of a dict of ASTRA, empty where it has none. Raises InputError where this is no dict, or no text."""
+    kind = proj_geom.get('type', '') if isinstance(proj_geom, Mapping) else None
+    if not isinstance(kind, str):
+        raise InputError(f'an ASTRA geometry must be a dict with a type, not {shown(proj_geom)}')
+    return kind
 
 
 def _panel(proj_geom) -> tuple[int, int]:
-    return int(_given(proj_geom, 'DetectorRowCount')), int(_given(proj_geom, 'DetectorColCount'))
+    return int(_number(proj_geom, 'DetectorRowCount')), int(_number(proj_geom, 'DetectorColCount'))
+
+
+def _number(values: dict, name: str) -> float:
+    value = limits.lengths(name, _given(values, name))
+    if value.ndim:
+        raise InputError(f'{name} of the ASTRA geometry must be one number, not {shown(value)}')
+    return float(value)
 
 
 def _given(values: dict, name: str):
-    if name not in values:
+    if not isinstance(values, Mapping) or name not in values:
         raise InputError(f'the ASTRA geometry has no {name}')
     return values[name]

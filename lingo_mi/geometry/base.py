@@ -30,10 +30,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError
-from lingo_mi.geometry import astra, rtk, tigre
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry import astra, limits, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
+from lingo_mi.geometry.limits import MOST_COUNT
 from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import Motion, helix, scanner_rays
 
@@ -78,7 +79,8 @@ class Geometry(ABC):
     DSO, DSD     distances from the source to the axis and to the panel, mm
 
     One number may stand for all of nDetector, dDetector, nVoxel, dVoxel, offOrigin and offDetector. Wrong shapes, numbers
-    that are not finite, and sizes and counts that are not positive raise InputError.
+    that are not finite or beyond the limits of `lingo_mi.geometry.limits`, and sizes and counts that are not positive raise
+    InputError.
 
         geometry = Geometry.cone(DSO=1000, DSD=1500, nDetector=512, dDetector=1, nVoxel=256, dVoxel=1, angles=circular(50))
         geometry.rays().source   # [50, 3], mm
@@ -158,8 +160,13 @@ class Geometry(ABC):
         circle = CircularGeometry(mode=mode, **scan)
         _warn_of_degrees(circle.angles)
         if pitch:
-            motion['height'] = helix(circle.angles, pitch) + motion.get('height', 0.0)
-        if not any(np.any(value) for value in motion.values()):
+            climb, height = helix(circle.angles, pitch), limits.lengths('height', motion.get('height', 0.0))
+            if height.shape not in ((), climb.shape):
+                raise InputError(
+                    f'height must be one number, or one for each of {len(climb)} views, not {shown(height)}'
+                )
+            motion['height'] = climb + height
+        if not any(np.any(limits.numbers(name, value)) for name, value in motion.items()):
             return circle
         if 'rotDetector' in motion:
             motion['rotDetector'] = _numbers('rotDetector', motion['rotDetector'], float, 3)
@@ -181,12 +188,12 @@ class Geometry(ABC):
 
             Geometry.per_view(DSO=[900, 905], DSD=1400, nDetector=64, dDetector=2, nVoxel=64, dVoxel=1, angles=[0, 1.5])
         """
-        if mode not in ('cone', 'parallel'):
-            raise InputError(f"mode must be 'cone' or 'parallel', not {mode!r}")
+        _require_mode(mode)
         sizes: dict[str, Any] = dict(nDetector=nDetector, dDetector=dDetector, nVoxel=nVoxel, dVoxel=dVoxel)
         panel = CircularGeometry(DSO=1.0, DSD=1.0, angles=np.zeros(1), **sizes)  # one number may stand for both
         motion: dict[str, Any] = dict(views)
-        origin = np.asarray(motion.pop('offOrigin', 0.0), float)
+        DSO, DSD = limits.lengths('DSO', DSO), limits.lengths('DSD', DSD)
+        origin = limits.lengths('offOrigin', motion.pop('offOrigin', 0.0))
         rays = scanner_rays(
             DSO=DSO,
             DSD=DSD,
@@ -195,7 +202,7 @@ class Geometry(ABC):
             parallel=mode == 'parallel',
             **motion,
         )
-        if mode == 'cone' and not (np.all(np.asarray(DSO) > 0) and np.all(np.asarray(DSD) >= np.asarray(DSO))):
+        if mode == 'cone' and not (np.all(DSO > 0) and np.all(DSD >= DSO)):
             raise InputError(
                 'a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)'
             )
@@ -272,7 +279,7 @@ class Geometry(ABC):
         if (vol_geom is None) == (nVoxel is None) or (nVoxel is None) != (dVoxel is None):
             raise InputError('an ASTRA geometry needs either vol_geom or both nVoxel and dVoxel')
         grid: dict = dict(nVoxel=nVoxel, dVoxel=dVoxel) if vol_geom is None else astra.grid(vol_geom)
-        if proj_geom.get('type') in astra.CIRCLES:
+        if astra.kind_of(proj_geom) in astra.CIRCLES:
             return CircularGeometry(**astra.circle(proj_geom), **grid)
         rays, nDetector = astra.views(proj_geom)
         return cls.from_poses(rays, nDetector, **grid)
@@ -309,6 +316,8 @@ class Geometry(ABC):
             value = _numbers(name, getattr(self, name), kind, length)
             if name != 'offOrigin' and min(value) <= 0:
                 raise InputError(f'{name} must be positive, not {value}')
+            if kind is int and max(value) > MOST_COUNT:
+                raise InputError(f'{name} must be at most {MOST_COUNT} along an axis, not {shown(value)}')
             object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
@@ -389,6 +398,12 @@ class Geometry(ABC):
         by_v, by_u = (factor if n >= 2 * factor else 1 for n in self.nDetector)
         return by_v, by_u
 
+    def _require_proportions(self, nearest: float, *distances: float):
+        """Raises InputError where the scan's lengths are too different. nearest: source to volume; distances: any others."""
+        long = *self.sDetector, *self.sVoxel, *self.offOrigin, *distances
+        short = *self.dDetector, *self.dVoxel, *([nearest] if self.mode == 'cone' else [])
+        limits.require_proportions(long, short)
+
     def _panel_and_grid(self) -> dict:
         return {name: getattr(self, name) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
 
@@ -409,29 +424,24 @@ class CircularGeometry(Geometry):
     offDetector: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
-        if self.mode not in ('cone', 'parallel'):
-            raise InputError(f"mode must be 'cone' or 'parallel', not {self.mode!r}")
+        _require_mode(self.mode)
         super().__post_init__()
         object.__setattr__(self, 'offDetector', _numbers('offDetector', self.offDetector, float, 2))
-        try:
-            angles = np.atleast_1d(np.asarray(self.angles, float))
-        except (TypeError, ValueError):
-            raise InputError(f'angles must be numbers, in radians, not {self.angles!r}') from None
+        angles = np.atleast_1d(limits.angles('angles', self.angles))
         if angles.ndim != 1 or len(angles) == 0:
             raise InputError('the scan has no views: give at least one angle')
-        if not np.all(np.isfinite(angles)):
-            raise InputError('an angle of the scan is not a finite number')
         object.__setattr__(self, 'angles', angles)
         for name in ('DSO', 'DSD'):
-            try:
-                object.__setattr__(self, name, float(getattr(self, name)))
-            except (TypeError, ValueError):
-                raise InputError(f'{name} must be one number, in mm, not {getattr(self, name)!r}') from None
-        if self.mode == 'cone' and not (np.isfinite(self.DSD) and self.DSD >= self.DSO > 0):
+            value = limits.lengths(name, getattr(self, name))
+            if value.ndim:
+                raise InputError(f'{name} must be one number, in mm, not {shown(getattr(self, name))}')
+            object.__setattr__(self, name, float(value))
+        if self.mode == 'cone' and not self.DSD >= self.DSO > 0:
             raise InputError(
                 f'a cone beam needs DSD >= DSO > 0, but DSO = {self.DSO:g} and DSD = {self.DSD:g} '
                 '(both are distances from the source, in mm)'
             )
+        self._require_proportions(self.DSO, self.DSO, self.DSD, *self.offDetector)
 
     def numbers(self) -> dict:
         """All numbers by name, as the class and `Geometry.per_view` take them."""
@@ -505,6 +515,8 @@ class PosedGeometry(Geometry):
         to_panel = rays.corner if rays.parallel else rays.corner - rays.source
         object.__setattr__(self, 'DSO', 0.0 if rays.parallel else float(np.mean(np.linalg.norm(toward, axis=1))))
         object.__setattr__(self, 'DSD', float(np.mean(np.abs(np.sum(to_panel * normal, 1)))))
+        nearest = float(np.linalg.norm(toward, axis=1).min())
+        self._require_proportions(nearest, self.DSO, self.DSD, np.abs(rays.corner).max())
 
     def rays(self) -> Rays:
         """The rays of all views in the world frame, mm."""
@@ -522,20 +534,23 @@ class PosedGeometry(Geometry):
         return replace(self, nDetector=(nv // by_v, nu // by_u), poses=poses)
 
 
+def _require_mode(mode: Any):
+    if not (isinstance(mode, str) and mode in ('cone', 'parallel')):
+        raise InputError(f"mode must be 'cone' or 'parallel', not {shown(mode)}")
+
+
 def _numbers(name: str, value: ArrayLike, kind: type, length: int) -> tuple:
-    """`length` finite numbers of a kind; one may stand for all."""
-    try:
-        array = np.atleast_1d(np.asarray(value, float)).ravel()
-    except (TypeError, ValueError):
-        array = np.empty(0)
+    """`length` finite numbers of a kind, no larger than lengths may be; one may stand for all."""
+    array = np.atleast_1d(limits.numbers(name, value)).ravel()
     if len(array) == 1:
         array = np.repeat(array, length)
     if len(array) != length or not np.all(np.isfinite(array)):
         raise InputError(
-            f'{name} must be {"one finite number" if length == 1 else f"{length} finite numbers"}, not {value!r}'
+            f'{name} must be {"one finite number" if length == 1 else f"{length} finite numbers"}, not {shown(value)}'
         )
     if kind is int and np.any(array % 1):
-        raise InputError(f'{name} must be whole numbers, not {value!r}')
+        raise InputError(f'{name} must be whole numbers, not {shown(value)}')
+    limits.lengths(name, array)
     return tuple(kind(x) for x in array)
 
 

@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.limits import numbers
 from lingo_mi.geometry.rays import Rays
 
 # From continuous pixel positions, centres at (i + 1/2), to indices.
 _TO_INDEX = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+
+MOST = 1e100  # of a matrix's entries, whose scale says nothing
 
 
 def to_matrices(rays: Rays) -> np.ndarray:
@@ -39,13 +42,14 @@ def from_matrices(
 
     Raises InputError where a matrix is no camera of that kind.
     """
-    matrices, towards = np.asarray(matrices, float), np.asarray(towards, float)
+    matrices, towards = numbers('projection matrices', matrices), numbers('towards', towards)
     if matrices.ndim != 3 or matrices.shape[1:] != (3, 4) or not len(matrices):
         raise InputError(f'projection matrices must be [view, 3, 4], not an array of shape {matrices.shape}')
-    if not np.isfinite(matrices).all():
-        raise InputError('a projection matrix holds NaN or infinity')
+    if not np.all(np.abs(matrices) < MOST):
+        raise InputError(f'a projection matrix holds NaN or infinity, or numbers beyond {MOST:.0e}')
     P = np.linalg.inv(_TO_INDEX) @ matrices
-    rows = _parallel(P, towards) if parallel else _cone(P, towards, dDetector[1])
+    with np.errstate(all='ignore'):  # of what is no pose, which `checked` refuses
+        rows = list(_parallel(P, towards) if parallel else _cone(P, towards, dDetector[1]))
     return Rays(*(np.array(column) for column in zip(*rows)), parallel=parallel).checked()
 
 

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry.limits import LEAST_LENGTH, MOST_LENGTH, numbers
 
 Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
 
@@ -23,12 +24,14 @@ def checked_views(index: Index, count: int) -> Index:
         return index
     try:
         views = np.asarray(index)
-    except (TypeError, ValueError):  # lists of several lengths
+    except (TypeError, ValueError, OverflowError):  # lists of several lengths
         views = np.empty((0, 0))
     whole = views.dtype.kind in 'iu' and (views.size == 0 or -count <= views.min() and views.max() < count)
     mask = views.dtype.kind == 'b' and len(views) == count
     if views.ndim != 1 or not (whole or mask or views.size == 0):
-        raise InputError(f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {index!r}')
+        raise InputError(
+            f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {shown(index)}'
+        )
     return views if views.size else views.astype(int)
 
 
@@ -84,7 +87,7 @@ class Rays:
         Raises InputError, naming the first bad view, where an array is not [n, 3] or not finite, where u and v span
         no panel, or where the rays run along it.
         """
-        source, corner, u, v = (np.asarray(a, float) for a in self._arrays())
+        source, corner, u, v = (numbers(name, a) for name, a in zip(('source', 'corner', 'u', 'v'), self._arrays()))
         if any(a.ndim != 2 or a.shape[1] != 3 or len(a) != len(corner) for a in (source, corner, u, v)) or not len(
             corner
         ):
@@ -130,10 +133,13 @@ class Rays:
 
 def _faults(source, corner, u, v, parallel) -> Iterator[tuple[str, Any]]:
     """What may be wrong with poses, each with the views [n] where it is; later ones count on the earlier."""
-    yield 'holds NaN or infinity', ~np.isfinite(np.concatenate([source, corner, u, v], 1)).all(1)
+    far = ~(np.abs(np.concatenate([source, corner, u, v], 1)) <= MOST_LENGTH).all(1)
+    yield f'holds NaN or infinity, or numbers beyond {MOST_LENGTH:.0e}', far
     normal = np.cross(u, v)
     area = np.linalg.norm(normal, axis=1)
-    steps = np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1)
+    along_u, along_v = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+    yield f'has steps u and v shorter than {LEAST_LENGTH:.0e}', ~(np.minimum(along_u, along_v) >= LEAST_LENGTH)
+    steps = along_u * along_v
     yield 'has steps u and v that span no panel', ~(area > 1e-9 * steps)
     beam = source if parallel else corner - source
     length = np.linalg.norm(beam, axis=1)

@@ -25,7 +25,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import one_line, reading, replacing
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays
@@ -140,10 +140,19 @@ def _views(path):
     """Numbers of every view by name, with those that all views share."""
     try:
         with reading(path):
-            root = ElementTree.fromstring(Path(path).read_text(encoding='utf-8'))
+            text = Path(path).read_text(encoding='utf-8')
+        if '<!ENTITY' in text:  # one may stand for many others
+            raise InputError(f'{path}: defines entities, which no geometry of RTK needs; remove them')
+        parser, depth = ElementTree.XMLPullParser(('start', 'end')), 0
+        parser.feed(text)
+        for event in parser.read_events():
+            depth += 1 if event[0] == 'start' else -1
+            if depth > 3:
+                raise InputError(f'{path}: is no {ROOT}: it is nested more than 3 deep')
+        root = ElementTree.fromstring(text)
     except InputError:
         raise
-    except (ElementTree.ParseError, UnicodeDecodeError, ValueError) as error:
+    except (ElementTree.ParseError, UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InputError(f'{path}: is no XML ({one_line(error)})') from None
     if root.tag != ROOT or root.get('version') not in ('2', '3'):
         raise InputError(f'{path}: is no {ROOT} of version 2 or 3')
@@ -167,7 +176,7 @@ def _number(node, path) -> dict:
         if not np.isfinite(value):
             raise ValueError
     except (TypeError, ValueError):
-        raise InputError(f'{path}: {node.tag} must be a finite number, not {node.text!r}') from None
+        raise InputError(f'{path}: {node.tag} must be a finite number, not {shown(node.text)}') from None
     if node.tag == 'RadiusCylindricalDetector' and value == 0:
         return {}
     if node.tag not in _NUMBERS:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry import limits
 
 
 def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
@@ -26,7 +27,7 @@ def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
     Raises InputError where a number is missing, or has neither one value nor one for every view.
     """
     given = geo.get if isinstance(geo, Mapping) else lambda name: getattr(geo, name, None)
-    angles = np.atleast_1d(np.asarray(angles, float))
+    angles = np.atleast_1d(limits.angles('angles', angles))
     if angles.ndim == 2 and angles.shape[1] == 3 and not angles[:, 1:].any():
         angles = angles[:, 0]  # what TIGRE makes of plain angles
 
@@ -35,7 +36,7 @@ def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
         value = default if given(name) is None else given(name)
         if value is None:
             raise InputError(f'the TIGRE geometry has no {name}')
-        value = np.asarray(value, float)
+        value = limits.lengths(name, value)
         if value.size not in (length, length * len(angles)):
             raise InputError(
                 f'{name} of the TIGRE geometry must be {length} number{"s" * (length > 1)}, or that for each of '
@@ -50,9 +51,16 @@ def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
         """The size of a pixel or voxel, which `s` says too."""
         if given('d' + kind) is not None:
             return each('d' + kind, length)
-        return each('s' + kind, length) / each('n' + kind, length)
+        count = each('n' + kind, length)
+        if not np.all(count >= 1):
+            raise InputError(f'n{kind} of the TIGRE geometry must be positive, not {shown(given("n" + kind))}')
+        return each('s' + kind, length) / count
 
-    mode = given('mode') or 'cone'
+    mode = given('mode')
+    if mode is None or isinstance(mode, str) and not mode:
+        mode = 'cone'
+    if not isinstance(mode, str):
+        raise InputError(f"mode of the TIGRE geometry must be 'cone' or 'parallel', not {shown(mode)}")
     far = 0.0 if mode == 'parallel' else None  # of a parallel beam they only place the panel
     scan = dict(
         mode=mode,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
+from lingo_mi.geometry import limits
 from lingo_mi.geometry.rays import Rays
 
 if TYPE_CHECKING:
@@ -17,11 +18,17 @@ if TYPE_CHECKING:
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
     """n angles, [n] radians, evenly spaced over [start, start + total) degrees: `circular(4)` is 0, pi / 2, pi, 3 pi / 2.
 
-    Raises InputError for n < 1.
+    Raises InputError unless n is from 1 to `limits.MOST_VIEWS`, and for angles of too many turns.
     """
-    if n < 1:
-        raise InputError(f'a scan needs at least one view, not {n}')
-    return np.radians(start + total * np.arange(n) / n)
+    count = limits.numbers('the number of views', n)
+    if count.ndim or not count >= 1 or np.isfinite(count) and count % 1:
+        raise InputError(f'a scan needs a whole number of views, at least one view, not {shown(n)}')
+    if count > limits.MOST_VIEWS:
+        raise InputError(f'a scan has at most {limits.MOST_VIEWS} views, not {shown(n)}')
+    for name, degrees in (('start', start), ('total', total)):
+        if limits.angles(name, np.radians(limits.lengths(name, degrees))).ndim:
+            raise InputError(f'{name} must be one number of degrees, not {shown(degrees)}')
+    return np.radians(float(start) + float(total) * np.arange(int(count)) / int(count))
 
 
 def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
@@ -31,7 +38,10 @@ def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
 
         helix(circular(8, total=720, start=-360), pitch=40)   # -40, -30, ..., 30
     """
-    return pitch * np.asarray(angles, float) / (2 * np.pi)
+    climb = limits.lengths('pitch', pitch)
+    if climb.ndim:
+        raise InputError(f'pitch must be one number, in mm a turn, not {shown(pitch)}')
+    return climb * limits.angles('angles', angles) / (2 * np.pi)
 
 
 def spread(total: int, n: int) -> np.ndarray:
@@ -100,11 +110,11 @@ def scanner_rays(
     for name in motion.keys() - moves.keys():
         raise TypeError(f'{name!r} is no number of a scanner; what moves one is {", ".join(moves)}')
     moves |= motion
-    angles = np.atleast_1d(_numbers('angles', angles))
+    angles = np.atleast_1d(limits.angles('angles', angles))
     n = len(angles)
 
     def each(name, value, *shape):
-        value = _numbers(name, value)
+        value = (limits.angles if name in ('angles', 'tilt', 'rotDetector') else limits.lengths)(name, value)
         if value.shape not in (shape, (n, *shape)):
             raise InputError(
                 f'{name} must be {" x ".join(map(str, shape)) or "one"} number{"s" * bool(shape)}, or that for '
@@ -131,10 +141,3 @@ def scanner_rays(
     corner = centre - nu / 2 * du * u - nv / 2 * dv * v
     source = -out if parallel else DSO[:, None] * out + shift
     return Rays(source, corner, du * u, dv * v, parallel)
-
-
-def _numbers(name: str, value: ArrayLike) -> np.ndarray:
-    try:
-        return np.asarray(value, float)
-    except (TypeError, ValueError):
-        raise InputError(f'{name} must be made of numbers, not {value!r}') from None

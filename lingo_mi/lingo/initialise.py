@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.parsing import require_ranges
 from lingo_mi.scan import Scan
 
 
@@ -61,6 +63,15 @@ class LingoSettings:
     Raises InputError for a value out of its range.
     """
 
+    RANGES: ClassVar = dict(
+        n_points=(1, 1e8),
+        high_fraction=(0, 1),
+        low_factor=(0, 1e6),
+        occupancy_voxels=(1, 1e6),
+        V_S=(0, 1e6),
+        misses=(0, 1e6),
+    )
+
     n_points: int = 50_000
     high_fraction: float = 0.25
     low_factor: float = 0.1
@@ -71,14 +82,7 @@ class LingoSettings:
     init_density: str = 'lsq'
 
     def __post_init__(self):
-        for name in ('n_points', 'occupancy_voxels'):
-            if getattr(self, name) < 1:
-                raise InputError(f'{name} must be at least 1, not {getattr(self, name)}')
-        if not 0 <= self.high_fraction <= 1:
-            raise InputError(f'high_fraction must lie in [0, 1], not {self.high_fraction}')
-        for name in ('low_factor', 'V_S', 'misses'):
-            if getattr(self, name) < 0:
-                raise InputError(f'{name} must not be negative, not {getattr(self, name):g}')
+        require_ranges(self, **self.RANGES)
         if self.outside not in ('invalid', 'ignore', 'auto'):
             raise InputError(f"outside is 'invalid', 'ignore' or 'auto', not {self.outside!r}")
         if self.init_density not in MODES:

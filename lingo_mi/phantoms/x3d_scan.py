@@ -13,8 +13,10 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.phantoms import Phantom
 from lingo_mi.scan import Dataset, Scan
 
+PIXELS = 512  # along the panel's sides
 
-def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = 512) -> Geometry:
+
+def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = PIXELS) -> Geometry:
     """X3D's scanner about a phantom.
 
     DSD 1500 and DSO 1000 mm. The panel of `pixels` x `pixels` is twice as wide as the phantom's longest side (512
@@ -55,7 +57,7 @@ def scan(
     views: int = 50,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
-    pixels: int = 512,
+    pixels: int = PIXELS,
 ) -> Dataset:
     """The default scan: `views` views to fit, evenly spaced over [0, 180) degrees, and as many held-out views at
     random angles in this range.

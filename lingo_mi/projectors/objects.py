@@ -64,6 +64,13 @@ class Ellipsoids:
             raise InputError(f'the ellipsoids {shape.id()!r} have no attribute "density": give it one value a Gaussian')
         data, self.density = params['data'], params['density']
         self.second = params.get('second')  # share of a second material
+        count, rest = divmod(dr.width(data), 10)
+        for name, column in (('density', self.density), ('second', self.second)):
+            if column is not None and (rest or count == 0 or dr.width(column) != count):
+                raise InputError(
+                    f'the ellipsoids {shape.id()!r} have {dr.width(data)} numbers as data, 10 for each of at least one '
+                    f'Gaussian, but {dr.width(column)} as {name}: give it one value a Gaussian'
+                )
         self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
         key, gaussians = (data.index, self.density.index), (self.centre, self.scale, self.rotation, self.density)
         if key not in _USABLE and require_usable(*gaussians, where=f'the ellipsoids {self.name!r}'):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.balance import SHARING, Sharing
 from lingo_mi.projectors.view import View
@@ -44,8 +45,8 @@ class RenderOptions:
         if accuracy not in cutoff.PRESETS:
             raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
         extent = cutoff.PRESETS[accuracy] if extent is None else extent
-        if not 1 <= extent <= 20:
-            raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {extent:g}')
+        if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
+            raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {shown(extent)}')
         if footprint not in FOOTPRINTS:
             raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')
         return RenderOptions(extent, footprint, 1 if pixel == 'area' else _subpixels(pixel), pixel == 'area')

@@ -16,7 +16,7 @@ def data_file(name: str, parameter: str) -> str:
 
     parameter   the scene's `<default>` that sets the file, for the message
 
-    Raises InputError, in one line, if there is no such file.
+    Raises InputError, in one line, if there is no such file, or if it is a device or a pipe, which may have no end.
     """
     resolver: Any = mi.file_resolver  # declared as an object
     found = Path(str(resolver().resolve(name)))
@@ -29,4 +29,6 @@ def data_file(name: str, parameter: str) -> str:
             f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
             f'that holds it, or name your file: -D {parameter}=FILE'
         )
+    if not found.is_file() and not found.is_dir():
+        raise InputError(f'{name}: is no regular file, but a device or a pipe; name another: -D {parameter}=FILE')
     return str(found)

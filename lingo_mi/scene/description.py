@@ -11,10 +11,10 @@ from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import to_posed
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.scene.data_files import data_file
 
-MOST_VIEWS = 100_000
 T = TypeVar('T', str, int, float)
 NAMES = (
     'mode',

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,6 +13,7 @@ import mitsuba as mi
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
 from lingo_mi.scene.checks import check_memory
+from lingo_mi.scene.outline import outline
 
 
 @dataclass(frozen=True)
@@ -37,16 +37,19 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
     Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong.
     """
     path = Path(path)
-    unknown = set(parameters or {}) - defaults(path)
+    known = outline(path, parameters)
+    unknown = set(parameters or {}) - known
     if unknown:
         raise InputError(
             f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
-            f'it has {", ".join(sorted(defaults(path))) or "none"}'
+            f'it has {", ".join(sorted(known)) or "none"}'
         )
     try:
         # With one thread: with several, Mitsuba rarely fails to create a plugin (bad_alloc in a gridvolume, 1 in thousands).
         scene = mi.load_file(str(path), parallel=False, **(parameters or {}))
     except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
+        if 'KeyboardInterrupt' in str(error).splitlines()[-1]:  # Ctrl-C within a plugin
+            raise KeyboardInterrupt from None
         raise InputError(f'{path}: {plain(error)}') from None
     if not isinstance(scene, mi.Scene):
         raise InputError(f'{path}: this is a {type(scene).__name__}, not a scene')
@@ -62,13 +65,8 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
 
 
 def defaults(path: PathLike | str) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or not XML."""
-    if not Path(path).is_file():
-        raise InputError(f'{path}: {"is a folder, not a scene" if Path(path).is_dir() else "there is no such scene"}')
-    try:
-        return {node.get('name', '') for node in ElementTree.parse(path).iter('default')}
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: this is not a scene in XML ({error})') from None
+    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no scene (see `outline`)."""
+    return outline(path)
 
 
 def plain(error: Exception) -> str:

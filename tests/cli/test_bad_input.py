@@ -60,6 +60,7 @@ def test_missing_scene(tmp_path):
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml')
     assert f'{tmp_path}: is a folder' in refused(tmp_path, tmp_path)
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml', '-D', 'size=16')
+    assert 'a device or a pipe' in refused(tmp_path, '/dev/zero')
 
 
 @pytest.mark.parametrize(
@@ -180,12 +181,25 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--mu-water', '0.02'], '--volume'),
         (['--resume'], 'no checkpoint'),
         (['--seed', '-1'], 'seed'),
+        (['--seed', '9' * 400], '--seed'),
+        (['--iterations', '9' * 400], 'iterations must lie in'),
+        (['--views', '9' * 400], 'views'),
+        (['-D', 'batch=1e9'], 'batch must lie in'),
+        (['-D', 'batch=9'], 'at most the 8 of the scan, not 9'),
+        (['-D', 'tv_stride=1e300'], 'tv_stride must lie in'),
+        (['-D', 'rate_pose=1e300'], 'rate_pose must lie in'),
+        (['-D', 'views=' + '9' * 400], '999'),
+        *(
+            (['--volume', 'a.raw', '--dtype', text], '--dtype must be')
+            for text in (',', 'O', 'U5', 'c8', 'i4,i4', 'magic')
+        ),
     ],
 )
 def test_bad_arguments(scene, tmp_path, args, says):
     code, _, err = fit(scene, *args, '--out', tmp_path / 'new' / 'folder')
     lines = [line for line in err.splitlines() if not line.startswith('Scan: ')]
     assert code == 2 and len(lines) == 1 and lines[0].startswith('error: ') and says in lines[0], (code, err)
+    assert len(lines[0]) < 310
     assert not (tmp_path / 'new').exists()
 
 

@@ -332,10 +332,23 @@ BAD = {
     'projections NaN': (plain(train={'projections': NAN, 'angles': np.arange(3.0)}), 'NaN'),
     'projections 2D': (plain(train={'projections': NAN[0], 'angles': np.arange(3.0)}), '3 dimensions'),
     'projections ragged': (plain(train={'projections': [[1], [1, 2]], 'angles': [1.0, 2.0]}), 'not an array'),
-    'projections text': (plain(train={'projections': ['a', 'b', 'c'], 'angles': np.arange(3.0)}), 'real numbers'),
+    'projections text': (plain(train={'projections': ['a', 'b', 'c'], 'angles': np.arange(3.0)}), 'not an array'),
     'no views': (plain(train={'projections': np.ones((0, 4, 5)), 'angles': np.ones(0)}, numTrain=0), 'no views'),
     'angles count': (plain(train={'projections': NAN * 0 + 1, 'angles': np.arange(2.0)}), 'agree|NaN'),
     'numTrain': (plain(numTrain=7), 'agree'),
+    'numTrain array': (plain(numTrain=np.ones(3)), 'must be one number'),
+    'mode array': (plain(mode=np.ones(3)), 'mode must be'),
+    'mode list': (plain(mode=['cone']), 'mode must be'),
+    'DSO huge': (plain(DSO=1e308, DSD=1e308), 'DSO must be finite lengths'),
+    'DSD whole': (plain(DSD=10**300), 'at most'),
+    'DSD of 400 digits': (plain(DSD=10**400), 'bits'),
+    'dDetector huge': (plain(dDetector=[1e308, 1e308]), 'dDetector must be finite lengths'),
+    'dVoxel tiny': (plain(dVoxel=1e-300), 'lengths of a scan must lie'),
+    'offDetector huge': (plain(offDetector=[1e300, 0]), 'offDetector must be finite lengths'),
+    'nDetector huge': (plain(nDetector=[1e300, 1e300]), 'does not match'),
+    'a text too long': (plain(DSO='x' * 20_000), 'text of 20000'),
+    'a key that is a tuple': (plain(**{}) | {(1, 2): 3}, 'key of type tuple'),
+    'a set': (plain(mode={1, 2}), 'a set'),
 }
 
 
@@ -358,3 +371,34 @@ def test_write_refuses(tmp_path):
     with pytest.raises(InputError, match='one scanner'):
         naf.write(tmp_path / 'a.pickle', Dataset(dataset.train, other))
     assert not list(tmp_path.iterdir())
+
+
+# ---- small files that would become large -------------------------------------------------------------------
+
+
+def nested(levels, code):
+    """Each level holds the one below it ten times."""
+    return b'\x80\x04K\x01' + b''.join(
+        b'\x94' + (b'(' if code == b't' else b'](') + b'h' + bytes([i]) + (b'h' + bytes([i])) * 9 + code
+        for i in range(levels)
+    )
+
+
+@pytest.mark.parametrize(
+    'raw, match',
+    [
+        (b'\x80\x04}r\xff\xff\xff\x7f.', 'memo'),
+        (b'\x80\x02}p2147483647\n.', 'memo'),
+        (nested(20, b't') + b'.', 'values'),
+        (nested(20, b'e') + b'.', 'values'),
+        (nested(20, b't').replace(b'\x80\x04', b'\x80\x04}', 1) + b'K\x01s.', 'key of type tuple'),
+        (b'\x80\x04\x8f.', 'a set'),
+        (b'\x80\x04' + b'(' * 10**6 + b'.', 'instructions|damaged'),
+        (b'\x80\x04' + b'K\x010' * 10**6 + b'N.', 'instructions'),
+        (b'\x80\x04\x8e' + b'\xff' * 7 + b'\x0f' + b'abc.', 'damaged'),
+        (b'\x80\x04\x95' + b'\xff' * 7 + b'\x0fN.', 'damaged'),
+        (b'', 'damaged'),
+    ],
+)
+def test_bombs(tmp_path, raw, match):
+    refused(dumped(tmp_path, raw), match)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.files.ply import read_ply, write_ply
+from lingo_mi.files.ply import read_ply, require_elements, write_ply
 
 
 def cloud(n=5):
@@ -154,3 +154,25 @@ def test_write_refuses_shapes(tmp_path):
             write_ply(path, *args)
     with pytest.raises(InputError, match='cannot be written'):
         write_ply(tmp_path / 'none' / 'a.ply', *cloud())
+
+
+PLY = b'ply\nformat %s 1.0\nelement vertex 2\nproperty float x\nproperty list uchar int i\nend_header\n'
+
+
+@pytest.mark.parametrize('kind, body', [(b'ascii', b'1 2\n3 4\n'), (b'binary_big_endian', bytes(10))])
+def test_elements_of_any_ply(tmp_path, kind, body):
+    path = tmp_path / 'a.ply'
+    path.write_bytes(PLY % kind + body)
+    require_elements(path)
+    for old, new, match in (
+        (b'element vertex 2', b'element vertex 999999999', 'more than its'),
+        (b'element vertex 2', b'element vertex ' + b'9' * 30, 'no count'),
+        (b'element vertex 2', b'element vertex', 'no count'),
+        (b'element vertex 2\n', b'', 'of no element'),
+        (b'element', b'end_header\nelement', 'no elements'),
+        (b'end_header', b'', 'no end'),
+        (b'ply', b'', 'does not begin'),
+    ):
+        path.write_bytes((PLY % kind + body).replace(old, new, 1))
+        with pytest.raises(InputError, match=match):
+            require_elements(path)

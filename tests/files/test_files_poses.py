@@ -424,7 +424,7 @@ def test_what_rtk_cannot_say(tmp_path):
         (dict(DSO=[900, 905], DSD=1400), 'DSO must be 1 number'),
         (dict(DSO=900, DSD=1400, pitch=3, z=[1, 2, 3]), 'pitch and z both'),
         (dict(DSO=900, DSD=1400, tilt='steep'), 'tilt must be'),
-        (dict(DSO=900, DSD=1400, rotDetector=[[1, 2, 3]] * 2), 'rotDetector must be 3 numbers'),
+        (dict(DSO=900, DSD=1400, rotDetector=[[1, 2, 3], [1, 2, 3]]), 'rotDetector must be 3 numbers'),
         (dict(DSO=900, DSD=[1400, 800, 1400], tilt=1), 'DSD >= DSO'),
     ],
 )

@@ -1,6 +1,7 @@
 """The R2-Gaussian folder."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -186,3 +187,27 @@ def test_write_refuses_a_folder_in_use(tmp_path):
         with pytest.raises(InputError, match='exists already|cannot be written'):
             r2.write(path, small_dataset())
     assert sorted(p.name for p in tmp_path.iterdir()) == ['file', 'scan']
+
+
+def test_numbers_nested_too_deep(tmp_path):
+    folder = tmp_path / 'a'
+    r2.write(folder, small_dataset())
+    meta = folder / 'meta_data.json'
+    content = meta.read_text()
+    for deep in (600, 100_000):
+        meta.write_text(re.sub(r'"DSO": [\d.]+', f'"DSO": {"[" * deep}1{"]" * deep}', content))
+        with pytest.raises(InputError, match='DSO must be numbers|not valid JSON') as caught:
+            r2.read(folder)
+        assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize('name', ['/etc/hostname', '../v.npy', 3, None, ''])
+def test_files_elsewhere(tmp_path, name):
+    folder = tmp_path / 'a'
+    r2.write(folder, small_dataset())
+    meta = folder / 'meta_data.json'
+    content = json.loads(meta.read_text())
+    content['proj_train'][0]['file_path'] = name
+    meta.write_text(json.dumps(content))
+    with pytest.raises(InputError, match='beside it'):
+        r2.read(folder)

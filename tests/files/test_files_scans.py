@@ -125,6 +125,9 @@ def test_intensity(tmp_path):
     intensity = 1e4 * np.exp(-PROJECTIONS)
     dataset = read_scan(npy(tmp_path, intensity, input='intensity', I0=1e4))
     np.testing.assert_allclose(dataset.train.projections, PROJECTIONS, rtol=1e-6)
+    intensity[1, 2, 3] = np.nan
+    np.save(tmp_path / 'mask.npy', np.ones(intensity.shape, bool))
+    assert '(1, 2, 3)' in refused(npy(tmp_path, intensity, input='intensity', I0=1e4, valid='mask.npy'), 'not positive')
     intensity[1, 2, 3] = 0
     assert '(1, 2, 3)' in refused(npy(tmp_path, intensity, input='intensity', I0=1e4), 'not positive')
 
@@ -134,6 +137,26 @@ def test_intensity(tmp_path):
     [
         ({'DSO': ...}, 'DSO is missing'),
         ({'DSO': 2000}, 'DSD >= DSO'),
+        ({'DSD': 1e308}, 'DSD must be finite lengths'),
+        ({'DSD': 10**400}, 'DSD must be'),
+        ({'angles': [10**400, 0, 0]}, 'angles must be'),
+        ({'totalAngle': 10**400}, 'totalAngle must be'),
+        ({'dDetector': 1e308}, 'dDetector must be finite lengths'),
+        ({'offDetector': [1e300, 0]}, 'offDetector must be finite lengths'),
+        ({'offOrigin': [1e300, 0, 0]}, 'offOrigin must be finite lengths'),
+        ({'dVoxel': 1e-300, 'sVoxel': ...}, 'lengths of a scan must lie'),
+        ({'nVoxel': [10**400, 1, 1]}, 'nVoxel must be'),
+        ({'nVoxel': ['x' * 9000, 1, 1]}, 'nVoxel must be'),
+        ({'pitch': 1e300}, 'pitch must be finite lengths'),
+        ({'pitch': 10**400}, 'pitch must be'),
+        ({'tilt': 10**400}, 'tilt must be'),
+        ({'mode': [1]}, 'mode must be'),
+        ({'nDetector': float('inf')}, 'nDetector must be whole'),
+        ({'nVoxel': float('nan')}, 'nVoxel must be whole'),
+        ({'offDetector': [[1], [1, 2]]}, 'offDetector must be'),
+        ({'DSO': [[1], [1, 2]]}, 'DSO must be'),
+        ({'valid': '/etc/hostname'}, 'beside it'),
+        ({'valid': '../mask.npy'}, 'beside it'),
         ({'DSO': 'far'}, 'DSO must be'),
         ({'DSO': [1, 2]}, 'DSO must be'),
         ({'nDetector': [5, 4]}, 'shape'),

@@ -1,6 +1,7 @@
 """The fit on tiny scans: it descends, resumes to the bit, compiles nothing late, and refuses what it must."""
 
 import errno
+import json
 import os
 from dataclasses import replace
 
@@ -8,9 +9,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
@@ -49,6 +51,19 @@ def test_a_small_scan_bounds_the_number_of_gaussians(scan, whole):
     few = SHORT.changed(values_per_gaussian=scan.projections.size / 65, n_points=500, init='lingo')
     assert len(run(scan, few, some_points(scan.geometry), seed=3).state) <= 65
     assert len(initial_cloud(scan, few)) == 65
+
+
+def test_more_than_the_scan_or_the_memory_has(scan, monkeypatch):
+    with pytest.raises(InputError, match='at most the 3 of the scan, not 4'):
+        initial_cloud(scan, SHORT.changed(batch=4))
+    with pytest.raises(InputError, match='at most the 3 of the scan, not 1000000'):
+        run(scan, SHORT.changed(batch=10**6), some_points(scan.geometry))
+    monkeypatch.setattr(limits, 'room', lambda: 2**20)
+    for settings in (SHORT.changed(init='lingo', n_points=10**8), METHODS['3dgs'].changed(n_points=3000)):
+        with pytest.raises(InputError, match='lower n_points'):
+            initial_cloud(scan, settings)
+    limits.bounded(SHORT.changed(n_points=2000), scan)
+    limits.bounded(METHODS['xgaussian'], scan)
 
 
 def test_progress_and_measure_are_called(scan):
@@ -316,19 +331,20 @@ def test_an_unfinished_fit_is_its_mean_so_far(scan, tmp_path):
 def test_files_that_are_no_fit(scan, stored):
     with pytest.raises(InputError, match='no such file'):
         Fitted.from_checkpoint(stored.with_name('none.npz'))
-    state, extra, arrays = checkpoint.load(stored)
+    content = contents(stored)
+    extra = json.loads(str(content['extra']))
     for damaged, message in (
         (extra | dict(effects=True), 'modelled effects'),
         ({k: v for k, v in extra.items() if k != 'unit'}, 'by this version'),
-        (extra | dict(settings=extra['settings'] | dict(renamed=1)), 'by this version'),
+        (extra | dict(settings=extra['settings'] | dict(renamed=1)), "unknown setting 'renamed'"),
     ):
-        checkpoint.save(stored, state, damaged, arrays)
+        write_as_before(stored, content, damaged)
         with pytest.raises(InputError, match=message) as caught:
             Fitted.from_checkpoint(stored)
         assert '\n' not in str(caught.value)
     del extra['effects']  # as earlier versions wrote it
-    checkpoint.save(stored, state, extra, arrays)
-    assert len(Fitted.from_checkpoint(stored).state) == len(state)
+    write_as_before(stored, content, extra)
+    assert len(Fitted.from_checkpoint(stored).state) == len(content['born'])
 
 
 def test_progress_shows_the_absolute_measures(tmp_path):

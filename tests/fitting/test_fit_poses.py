@@ -147,5 +147,5 @@ def test_poses_left_alone_compile_nothing_new(monkeypatch):
 
 @pytest.mark.parametrize('rate', [(1e-3, 0.0), (-1e-3, -1e-4), (1e-3,)])
 def test_bad_rates(rate):
-    with pytest.raises(InputError, match='rate_pose (must be two positive numbers|takes two numbers)'):
+    with pytest.raises(InputError, match='rate_pose (must be two positive numbers|must lie in|takes two numbers)'):
         SHORT.changed(rate_pose=rate)

@@ -1,5 +1,7 @@
 """Settings of a fit, from the text of a command line too."""
 
+from dataclasses import MISSING, fields, is_dataclass
+
 import numpy as np
 import pytest
 
@@ -31,19 +33,19 @@ def test_values(name, text, value):
         ('iterations', 'nan', 'a whole number'),
         ('iterations', '2.5', 'a whole number'),
         ('iterations', '', 'a whole number'),
-        ('iterations', '0', 'at least 1'),
-        ('lambda_tv', 'inf', 'finite'),
+        ('iterations', '0', 'in [1, 1e+09], not 0'),
+        ('lambda_tv', 'inf', 'in [0, 1e+06], not inf'),
         ('lambda_tv', 'much', 'a number'),
         ('normalise', '1', 'true or false'),
-        ('rate_centre', '1,2,3', 'two positive numbers'),
-        ('rate_centre', '0', 'two positive numbers'),
-        ('occupancy_voxels', '0', 'at least 1'),
+        ('rate_centre', '1,2,3', 'two numbers'),
+        ('rate_centre', '0', 'in [1e-12, 1000]'),
+        ('occupancy_voxels', '0', 'in [1, 1e+06]'),
         ('high_fraction', '2', 'in [0, 1]'),
         ('init_density', 'xyz', "'xyz' is unknown"),
         ('outside', 'left', "'invalid', 'ignore' or 'auto'"),
         ('lambda', '1', 'unknown'),
         *(
-            (name, '-1', 'must not be negative')
+            (name, '-1', f'{name} must lie in [0, ')
             for name in (
                 'lambda_ssim',
                 'lambda_tv',
@@ -93,6 +95,31 @@ def test_bad_values_of_python(method, name, value, message):
     with pytest.raises(InputError) as caught:
         METHODS[method].changed(**{name: value})
     assert message in str(caught.value) and '\n' not in str(caught.value)
+
+
+EXTREME = -1, float('nan'), float('inf'), 1e300, 1e308, 10**400, 10**5000, 'x', None, [], (1e300, 1e300), (10**400, 1)
+TEXTS = '', '-1', 'nan', 'inf', '1e300', '1e400', '1' * 400, '1' * 5000, ','
+
+
+@pytest.mark.parametrize('name', Settings().flat())
+def test_extreme_values(name):
+    """Every setting refuses them in one line, in whichever way it is given."""
+    for value in (*EXTREME, *TEXTS, True):
+        if value is True and name == 'normalise' or name == 'fdk_threshold' and value in (-1, '-1'):
+            continue
+        with pytest.raises(InputError) as caught:
+            Settings().changed(**{name: value})
+        message = str(caught.value)
+        assert name in message and '\n' not in message and len(message) < 300
+
+
+@pytest.mark.parametrize('part', [Settings, *(type(part) for part in vars(Settings()).values() if is_dataclass(part))])
+def test_extreme_values_of_the_parts(part):
+    for f in fields(part):
+        for value in EXTREME if f.default is not MISSING else ():
+            if (f.name, value) != ('fdk_threshold', -1):
+                with pytest.raises(InputError, match=f.name):
+                    part(**{f.name: value})
 
 
 @pytest.mark.parametrize(

@@ -339,6 +339,10 @@ BAD = {
         r'quaternions must be of the shape \[4, 4\], not \[3, 4\]',
     ),
     'a column of densities': ([*GOOD[:3], np.ones((4, 1))], r'density must be of the shape \[4\], not \[4, 1\]'),
+    'three densities': (
+        [*(x[:1] for x in GOOD[:3]), np.ones((1, 3))],
+        r'density must be of the shape \[1\], not \[1, 3\]',
+    ),
     'no axis': ([np.float32(1), *GOOD[1:]], r'means must be of the shape \[N, 3\], not \[\]'),
     'empty': ([x[:0] for x in GOOD], 'the cloud is empty'),
     'NaN': ([NAN, *GOOD[1:]], 'Gaussian 2 of the arrays given to'),
@@ -381,6 +385,15 @@ def test_bad_extent(extent):
     for function in (project, voxelize):
         with pytest.raises(InputError, match='extent is in standard deviations'):
             function(*GOOD, scan(), extent=extent)
+
+
+@pytest.mark.parametrize('count', [100_000, 1_000_000])
+def test_results_larger_than_memory(count):
+    huge = dict(nDetector=count, nVoxel=count, dDetector=1e-6, dVoxel=1e-6)
+    geometry = CircularGeometry(DSO=5, DSD=7, angles=[0.0, 1.0], **huge)
+    for function in (project, voxelize):
+        with pytest.raises(InputError, match='do not fit into this process'):
+            function(*GOOD, geometry)
 
 
 @pytest.mark.parametrize('values', [None, 'abc', [['a', 'b', 'c']] * 4, [[1, 2], [3]]])

@@ -267,7 +267,7 @@ def test_filtered_backprojection_refuses_other_poses():
         (dict(rotDetector=0.1), 'rotDetector must be 3 numbers'),
         (dict(DSO=[300, 300, 500, 300, 300]), 'DSD >= DSO'),
         (dict(offOrigin=np.ones((4, 3))), 'offOrigin must be'),
-        (dict(height=np.full(5, np.nan)), 'view 0 holds NaN'),
+        (dict(height=np.full(5, np.nan)), 'height must be finite'),
         (dict(angles=np.ones((5, 2))), 'angles must be'),
         (dict(rotDetector=(np.pi / 2, 0.0, 0.0)), 'source in the plane of its panel'),
         (dict(mode='fan'), 'mode must be'),

@@ -276,9 +276,16 @@ def test_script_lists(monkeypatch, capsys):
         ('foot', '--projections', 'x.npy'),
         ('foot', '--out', '/no/such/folder/x.nii.gz'),
         ('foot', '--kind', 'zip', '--projections', 'x'),
+        ('foot', '--views', '999999999', '--projections', 'x.pickle'),
+        ('foot', '--views', '9' * 400, '--projections', 'x.pickle'),
+        ('foot', '--views', '99999', '--projections', 'x.pickle'),
+        ('foot', '--seed', '-1', '--projections', 'x.pickle'),
+        ('foot', '--seed', '9' * 400, '--projections', 'x.pickle'),
+        ('foot', '--size', '9' * 400, '--out', 'x.nii.gz'),
     ],
 )
 def test_script_refuses(args, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr('lingo_mi.cli.phantom.room', lambda: 16 * 2**30)
     monkeypatch.chdir(tmp_path)
     assert _run_here(monkeypatch, *args) == 2
     said = capsys.readouterr().err

@@ -1,5 +1,6 @@
 """The integrator `lingo_xray` through Mitsuba's own interface: images, derivatives, sensors, updates, files, errors."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -497,6 +498,29 @@ def test_unusable_gaussians_are_named(name, row, value):
     refused("Gaussian 2 of the ellipsoids 'cloud'", dict(cloud=ellipsoids(cloud.changed(**{name: values}))))
 
 
+@pytest.mark.parametrize('name', ['density', 'second'])
+@pytest.mark.parametrize('count', [1, 2])
+def test_more_values_than_gaussians(name, count):
+    """Mitsuba takes an attribute of any number of components: three densities would be three times the Gaussian."""
+    values = mi.TensorXf(np.ones((count, 3), np.float32))
+    refused(f'but {3 * count} as {name}', dict(cloud=dict(ellipsoids(cloud_of()[:count]), **{name: values})))
+
+
+@pytest.mark.parametrize('name, count', [('data', 10), ('data', 20), ('density', 1), ('density', 3)])
+def test_updates_of_another_number(name, count):
+    scene = load(dict(cloud=ellipsoids(cloud_of()[: 1 if name == 'density' else 4])))
+    params = mi.traverse(scene)
+    params[f'cloud.{name}'] = mi.Float(np.ones(count))
+    with contextlib.suppress(RuntimeError):  # Mitsuba's own refusal, of what its attributes do not divide
+        params.update()
+    if name == 'density' and count == 1:
+        render(scene)
+    else:
+        with pytest.raises(RuntimeError) as caught:
+            render(scene)
+        assert 'one value a Gaussian' in str(caught.value.__cause__) or 'same number of entries' in str(caught.value)
+
+
 def test_missing_density():
     thing = ellipsoids(cloud_of())
     del thing['density']
@@ -524,7 +548,7 @@ def test_unknown_key_of_a_scanner():
         mi.load_dict(dict(SCANNER, DS0=3))
 
 
-@pytest.mark.parametrize('extent', [0.5, 21.0, float('nan')])
+@pytest.mark.parametrize('extent', [0.5, 21.0, float('nan'), 1e308, 'far', '5'])
 def test_extent_out_of_range(extent):
     with pytest.raises(Exception, match='extent is in standard deviations'):
         mi.load_dict(dict(type='lingo_xray', extent=extent))
@@ -548,7 +572,7 @@ def test_empty_scene():
         (dict(dDetector='a'), 'not a list of numbers'),
         (dict(DSD=2.0), 'DSD >= DSO'),
         (dict(mode='fan'), 'mode must be'),
-        (dict(angles='nan'), 'not a finite number'),
+        (dict(angles='nan'), 'angles must be finite numbers'),
         (dict(angles=''), 'no views'),
     ],
 )

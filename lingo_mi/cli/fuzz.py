@@ -1,0 +1,69 @@
+"""Give every reader mutated files, each in a child with a limit of time and memory: a value, or one line that refuses it.
+
+    lingo-mi fuzz --cases 200
+    lingo-mi fuzz --total 100000 --markdown docs/tables/fuzz.md
+    lingo-mi fuzz --readers nii tiff --cases 5000 --seed 7
+
+A case is its reader, the seed and its number. Those that fail are saved in --out, each in a folder with its files.
+The exit code is 1 where one fails.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+
+
+def arguments() -> argparse.Namespace:
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('--readers', nargs='+', metavar='NAME', help='which ones (default: all)')
+    p.add_argument('--cases', type=int, default=200, metavar='N', help='for every reader (default 200)')
+    p.add_argument('--total', type=int, metavar='N', help='for all readers together, instead')
+    p.add_argument('--seed', type=int, default=0)
+    p.add_argument('--processes', type=int, default=2, metavar='N', help='children at a time (default 2)')
+    p.add_argument('--seconds', type=float, default=10.0, metavar='S', help='that a case may take (default 10)')
+    p.add_argument('--memory', type=float, default=1.0, metavar='GIB', help='that a child may take (default 1)')
+    p.add_argument('--out', type=Path, default=Path('out/fuzz'), metavar='DIR', help='where cases that fail are saved')
+    p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
+    return p.parse_args()
+
+
+def main() -> int:
+    args = arguments()
+    from lingo_mi.progress import Progress
+    from lingo_mi.studies.fuzz.page import page
+    from lingo_mi.studies.fuzz.pool import run, save_case
+    from lingo_mi.studies.fuzz.readers import NAMES
+    from lingo_mi.studies.provenance import write_provenance
+
+    names = args.readers or list(NAMES)
+    unknown = [name for name in names if name not in NAMES]
+    if unknown:
+        raise InputError(f'--readers {unknown[0]}: is none of {", ".join(NAMES)}')
+    cases = args.cases if args.total is None else -(-args.total // len(names))
+    if min(cases, args.processes, args.seconds, args.memory) <= 0:
+        raise InputError('--cases, --total, --processes, --seconds and --memory must be positive')
+    memory, start = int(args.memory * 2**30), time.monotonic()
+    with Progress('Read', cases * len(names)) as bar:
+        tallies = run(
+            names,
+            cases,
+            args.seed,
+            processes=args.processes,
+            seconds=args.seconds,
+            memory=memory,
+            report=lambda done: bar.update(done),
+        )
+    text = page(tallies, args.seed, time.monotonic() - start, args.seconds, memory)
+    print(text)
+    failures = [(name, number, what) for name, t in tallies.items() for number, what in t.failures.items()]
+    for name, number, what in failures:
+        where = save_case(name, args.seed, number, what, args.out)
+        print(f'failed: {name}, case {number}: {what} ({where})', file=sys.stderr)
+    if args.markdown:
+        args.markdown.write_text(text, encoding='utf-8')
+        write_provenance(args.markdown)
+    return int(bool(failures))

@@ -1,0 +1,200 @@
+"""What a checkpoint holds, checked as a whole: names, types, shapes that agree with each other, ranges.
+
+values.*, first.*, second.*   float32 [N, size], the parameters of the forward model and Adam's moments
+gradient, seen                float32 [N]
+born                          bool [N]
+array.initial                 float32 [M, 3]
+array.order                   whole numbers [K], views that come next
+array.average.*               like values.*, where the fit averages
+array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], where the fit corrects poses
+array.share                   float32 [N], where the fit models two materials
+array.scattered               float64 [2, views, rows, columns], where it models scatter
+extra                         text: plain values as JSON, named in `_PLAIN`
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError, shown
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.scene.description import NAMES, read_scanner
+
+VERSION = 1  # of the checkpoints written now; those of earlier programs have neither a version nor a checksum
+_OF_EFFECTS = 'array.share', 'array.scattered'  # not every effect has both
+
+
+def settings_of(extra: dict) -> Settings:
+    """The settings of a checkpoint, from its plain values. Raises InputError if this program does not know them."""
+    return Settings().changed(**{k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()})
+
+
+def geometry_of(extra: dict) -> Geometry:
+    """The geometry of the scan that was fitted, as given. Raises InputError if it is none."""
+    return read_scanner(extra['scanner'])[0]
+
+
+def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
+    """Raises InputError, which says what is wrong, unless the arrays of a checkpoint, by name, and its plain values belong to a
+    fit that can go on."""
+    settings = _require_plain(extra)
+    expected = _expected(settings, extra['views'], arrays['born'].size if 'born' in arrays else 0)
+    allowed = dict(expected)
+    if not extra.get('effects', True):
+        allowed = {name: v for name, v in expected.items() if name not in _OF_EFFECTS}
+    for name in expected.keys() - set(_OF_EFFECTS) - arrays.keys():
+        raise InputError(f'{name} is missing')
+    for name in arrays.keys() - allowed.keys():
+        raise InputError(f'{shown(name)} does not belong there')
+    for name, array in arrays.items():
+        _require_array(name, array, *allowed[name])
+    _require(len(arrays['born']) > 0 and len(arrays['array.initial']) > 0, 'it holds no Gaussian')
+    order, steps = arrays['array.order'], arrays.get('array.poses.steps')
+    _require(
+        not len(order) or order.min() >= 0 and order.max() < extra['views'] and len(np.unique(order)) == len(order),
+        'array.order holds views twice, or some that the scan has not',
+    )
+    made = extra['iteration'] * settings.batch
+    _require(
+        steps is None or steps.max() <= made == steps.sum(),
+        f'array.poses.steps does not add up to the {made} that were made',
+    )
+
+
+def _expected(settings: Settings, views: int, count: int) -> dict[str, tuple[str, tuple]]:
+    """Type, as NumPy spells it, and shape of every array by name; None is any length."""
+    sizes = forward_model(settings).parameters
+    found: dict[str, tuple[str, tuple]] = {'born': ('bool', (count,)), 'array.order': ('int', (None,))}
+    found |= {f'{g}.{k}': ('float32', (count, n)) for g in ('values', 'first', 'second') for k, n in sizes.items()}
+    found |= dict.fromkeys(('gradient', 'seen', 'array.share'), ('float32', (count,)))
+    found |= {'array.initial': ('float32', (None, 3)), 'array.scattered': ('float64', (2, views, None, None))}
+    if settings.adam.average > 0:
+        found |= {f'array.average.{k}': ('float32', (count, n)) for k, n in sizes.items()}
+    if max(settings.adam.rate_pose) > 0:
+        found |= {f'array.poses.{k}': ('float64', (views, 3)) for k in ('turn', 'shift')}
+        found |= {f'array.poses.{k}': ('float64', (views, 6)) for k in ('first', 'second')}
+        found |= {'array.poses.steps': ('int', (views,))}
+    return found
+
+
+def _require_array(name: str, array: np.ndarray, kind: str, shape: tuple):
+    of_kind = array.dtype.kind == 'i' if kind == 'int' else array.dtype == kind
+    if not of_kind or array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape)):
+        wanted = ', '.join('n' if n is None else str(n) for n in shape)
+        raise InputError(f'{name} must be {kind} [{wanted}], not {shown(array.dtype)} {list(array.shape)}')
+    _require(array.dtype.kind != 'f' or np.isfinite(array).all(), f'{name} holds NaN or infinity')
+    never_negative = name in ('gradient', 'seen', 'array.poses.steps') or '.second' in f'.{name}'
+    _require(not never_negative or not array.size or array.min() >= 0, f'{name} holds negative numbers')
+
+
+def _require_plain(extra: Any) -> Settings:
+    """The settings, once all plain values are in their ranges."""
+    _require(isinstance(extra, dict), 'extra must be a dictionary')
+    version = extra.get('version', VERSION)
+    if version != VERSION or isinstance(version, bool):
+        raise InputError(f'its version is {shown(version)}, but this program reads {VERSION}')
+    for name, (wanted, good) in _PLAIN.items():
+        if name not in extra:
+            if 'version' not in extra and name in ('unit', 'effects'):
+                continue
+            raise InputError(f'{name} is missing')
+        if not good(extra[name]):
+            raise InputError(f'{name} must be {wanted}, not {shown(extra[name])}')
+    if strange := extra.keys() - _PLAIN.keys() - {'version'}:
+        raise InputError(f'{shown(min(strange))} does not belong there')
+    try:
+        settings = settings_of(extra)
+        seen = len(geometry_of(extra))
+    except InputError as error:
+        raise InputError(f'in its settings or its scanner, {error}') from None
+    _require(seen == extra['views'], f'views is {shown(extra["views"])}, but the scanner has {seen}')
+    steps = [entry['iteration'] for entry in extra['history']]
+    _require(extra['iteration'] <= settings.iterations, "iteration is beyond the settings' iterations")
+    _require(steps == sorted(set(steps)) and max(steps, default=0) <= extra['iteration'], 'history is out of order')
+    return settings
+
+
+def _count(value: Any, least: int = 0, most: float = math.inf) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+
+
+def _number(value: Any, least: float = -math.inf) -> bool:
+    """Whether a value is a finite number from `least` on. Those that float64 cannot hold are not."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or abs(value) > 1e300:
+        return False
+    return math.isfinite(value) and value >= least
+
+
+def _is_rng(value: Any) -> bool:
+    """Whether this is the state of NumPy's PCG64."""
+    if not isinstance(value, dict) or value.keys() != {'bit_generator', 'state', 'has_uint32', 'uinteger'}:
+        return False
+    state = value['state']
+    return (
+        value['bit_generator'] == 'PCG64'
+        and isinstance(state, dict)
+        and state.keys() == {'state', 'inc'}
+        and all(_count(x, 0, 2**128 - 1) for x in state.values())
+        and _count(value['has_uint32'], 0, 1)
+        and _count(value['uinteger'], 0, 2**32 - 1)
+    )
+
+
+def _is_history(value: Any) -> bool:
+    """Whether these are measurements over time. Those of quality may be missing (None), NaN or infinite."""
+    return isinstance(value, list) and all(
+        isinstance(entry, dict)
+        and _count(entry.get('iteration'), 1)
+        and _number(entry.get('seconds'), 0)
+        and _number(entry.get('loss'))
+        and _count(entry.get('gaussians'), 1)
+        and all(x is None or isinstance(x, float) or _number(x) for x in entry.values())
+        for entry in value
+    )
+
+
+def _is_scanner(value: Any) -> bool:
+    """Whether this may be what `scene.description.describe` gives: no file is named."""
+    return (
+        isinstance(value, dict)
+        and value.get('type') == 'ct_scanner'
+        and value.keys() <= {*NAMES, 'type', 'view'}
+        and all(isinstance(x, str) or _number(x) for x in value.values())
+        and _are_numbers(str(value.get('poses', '')))
+    )
+
+
+def _are_numbers(text: str) -> bool:
+    try:
+        return all(math.isfinite(float(x)) for x in text.replace(',', ' ').split())
+    except ValueError:
+        return False
+
+
+_PLAIN = {
+    'seed': ('a whole number from 0 to 2^64 - 1', lambda value: _count(value, 0, 2**64 - 1)),
+    'rng': ('the state of a PCG64', _is_rng),
+    'iteration': ('a whole number from 0 on', _count),
+    'seconds': ('a number from 0 on', lambda value: _number(value, 0)),
+    'history': ('a list of measurements', _is_history),
+    'info': (
+        'a dictionary with its seconds',
+        lambda value: isinstance(value, dict) and _number(value.get('seconds', 0), 0),
+    ),
+    'settings': ('a dictionary', lambda value: isinstance(value, dict)),
+    'unit': ('a positive number', lambda value: _number(value, 0) and value > 0),
+    'effects': ('true or false', lambda value: isinstance(value, bool)),
+    'views': ('a whole number from 1 on', lambda value: _count(value, 1)),
+    'scanner': ('the numbers of a ct_scanner', _is_scanner),
+    'signal': ('a number', _number),
+}
+
+
+def _require(good: Any, message: str):
+    if not good:
+        raise InputError(message)

@@ -1,0 +1,55 @@
+"""How far the numbers of a scan may go, so that everything made of them stays finite.
+
+Lengths, in mm or whatever unit a scan has, are zero or from 1e-12 to 1e12, and no two of a scan's are further apart than
+that: products of three, which projectors form, then fit into float32 in any frame. These are the limits of Gaussians too
+(`lingo_mi.projectors.usable`). Products of three counts fit into 64 bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lingo_mi.errors import InputError, shown
+
+MOST_LENGTH = 1e12
+LEAST_LENGTH = 1 / MOST_LENGTH
+MOST_ANGLE = 1e6  # radians, which float64 knows to 1e-10
+MOST_COUNT = 1_000_000  # pixels or voxels along an axis
+MOST_VIEWS = 100_000
+
+
+def numbers(name: str, value: ArrayLike) -> np.ndarray:
+    """`value` as float64, of any shape. Raises InputError where it is not made of numbers, or one is beyond float64."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f'{name} must be made of numbers, not {shown(value)}') from None
+
+
+def lengths(name: str, value: ArrayLike) -> np.ndarray:
+    """`value` as float64, of any shape and sign. Raises InputError where one is not finite, or too long."""
+    array = numbers(name, value)
+    if not np.all(np.abs(array) <= MOST_LENGTH):
+        raise InputError(f'{name} must be finite lengths, at most {MOST_LENGTH:.0e}, not {shown(value)}')
+    return array
+
+
+def angles(name: str, value: ArrayLike) -> np.ndarray:
+    """`value` in radians as float64, of any shape. Raises InputError where one is not finite, or of too many turns."""
+    array = numbers(name, value)
+    if not np.all(np.abs(array) <= MOST_ANGLE):
+        raise InputError(f'{name} must be finite numbers of radians, at most {MOST_ANGLE:.0e}, not {shown(value)}')
+    return array
+
+
+def require_proportions(long: Iterable[float], short: Iterable[float]) -> None:
+    """Raises InputError where the longest length of a scan is too many times the shortest. Zeros do not count."""
+    longest, shortest = (max(map(abs, long)), min(map(abs, short)))
+    if not (LEAST_LENGTH <= shortest and longest <= MOST_LENGTH and longest <= MOST_LENGTH * shortest):
+        raise InputError(
+            f'the lengths of a scan must lie between {LEAST_LENGTH:.0e} and {MOST_LENGTH:.0e}, and within a factor of '
+            f'{MOST_LENGTH:.0e}: these are from {shortest:g} to {longest:g}'
+        )

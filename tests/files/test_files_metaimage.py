@@ -1,0 +1,118 @@
+"""MetaImage without a library: as SimpleITK reads it, and headers that lie."""
+
+import numpy as np
+import pytest
+
+from lingo_mi.errors import InputError
+from lingo_mi.files import metaimage
+
+SHAPE = (4, 5, 6)
+VALUES = np.random.default_rng(0).integers(0, 100, SHAPE)
+BODY = VALUES.astype('u1').tobytes('F')
+HEADER = dict(
+    ObjectType='Image', NDims='3', BinaryData='True', DimSize='4 5 6', ElementType='MET_UCHAR', ElementDataFile='LOCAL'
+)
+
+
+def written(path, body=BODY, **changes):
+    fields = {**HEADER, **changes}
+    fields['ElementDataFile'] = fields.pop('ElementDataFile')  # the last
+    text = '\n'.join(f'{name} = {value}' for name, value in fields.items() if value is not None)
+    path.write_bytes(text.encode('latin1') + b'\n' + body)
+    return path
+
+
+def refused(path, match):
+    with pytest.raises(InputError, match=match) as caught:
+        metaimage.read(path)
+    assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize('suffix', ['mha', 'mhd'])
+@pytest.mark.parametrize('compressed', [False, True])
+@pytest.mark.parametrize('dtype', ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'i8', 'u8', 'f4', 'f8'])
+def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
+    sitk = pytest.importorskip('SimpleITK')
+    image = sitk.GetImageFromArray(VALUES.astype(dtype).transpose(2, 1, 0))
+    image.SetSpacing((0.5, 1, 2.5))
+    image.SetOrigin((7, 8, 9))
+    image.SetDirection((0, -1, 0, 0.6, 0, 0.8, -0.8, 0, 0.6))
+    path = tmp_path / f'v.{suffix}'
+    sitk.WriteImage(image, str(path), compressed)
+    data, affine = metaimage.read(path)
+    assert data.dtype == dtype
+    np.testing.assert_array_equal(data, VALUES)
+    np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
+    np.testing.assert_allclose(affine[:, 3], [7, 8, 9, 1])
+
+
+def test_as_simpleitk_reads_it(tmp_path):
+    """Fields that it does not write itself."""
+    sitk = pytest.importorskip('SimpleITK')
+    path = written(
+        tmp_path / 'v.mha',
+        VALUES.astype('>i2').tobytes('F'),
+        ElementType='MET_SHORT',
+        ElementByteOrderMSB='True',
+        Rotation='1 0 0 0 0 1 0 -1 0',
+        ElementSpacing='1 2 3',
+        Position='-1 0 4e1',
+        Comment='a = b',
+    )
+    image = sitk.ReadImage(str(path))
+    data, affine = metaimage.read(path)
+    np.testing.assert_array_equal(data, sitk.GetArrayFromImage(image).transpose(2, 1, 0))
+    np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
+    np.testing.assert_allclose(affine[:3, 3], image.GetOrigin())
+
+
+def test_voxels_at_the_end_and_below(tmp_path):
+    (tmp_path / 'below').mkdir()
+    (tmp_path / 'below' / 'v.raw').write_bytes(b'skipped' + VALUES.astype('u1').tobytes('F'))
+    path = written(tmp_path / 'v.mhd', b'', HeaderSize=-1, ElementDataFile='below/v.raw')
+    np.testing.assert_array_equal(metaimage.read(path)[0], VALUES)
+    written(tmp_path / 'v.mhd', b'', HeaderSize=7, ElementDataFile='below/v.raw')
+    np.testing.assert_array_equal(metaimage.read(path)[0], VALUES)
+
+
+@pytest.mark.parametrize('n', ['4294967296', '999999999999', '-1', '100', '1e400', 'nan', '', '3 3', 'x' * 5000])
+def test_wrong_numbers_of_dimensions(tmp_path, n):
+    """They have crashed a library that trusted them."""
+    refused(written(tmp_path / 'v.mha', NDims=n), 'NDims|dimensions')
+
+
+@pytest.mark.parametrize(
+    'changes, match',
+    [
+        (dict(ElementDataFile='%n%n%s%s.raw 1 2 1'), 'several files'),
+        (dict(ElementDataFile='LIST'), 'several files'),
+        (dict(ElementDataFile='/etc/hostname'), 'beside it'),
+        (dict(ElementDataFile='../../v.raw'), 'beside it'),
+        (dict(ElementDataFile='below/../../v.raw'), 'beside it'),
+        (dict(ElementDataFile=''), 'beside it'),
+        (dict(ElementDataFile='v\0.raw'), 'no name of a file'),
+        (dict(ElementDataFile='.'), 'a folder'),
+        (dict(DimSize='4 5 7'), 'cannot hold'),
+        (dict(DimSize='99999999 99999999 99999999'), 'cannot hold'),
+        (dict(DimSize='4 5 1e300'), 'cannot hold'),
+        (dict(DimSize='4 5 0'), 'DimSize'),
+        (dict(DimSize='4 5'), 'DimSize'),
+        (dict(DimSize=None), 'DimSize'),
+        (dict(ElementType='MET_STRING'), 'ElementType'),
+        (dict(ElementNumberOfChannels='3'), '3 values a voxel'),
+        (dict(BinaryData='False'), 'BinaryData'),
+        (dict(HeaderSize='-2'), 'HeaderSize'),
+        (dict(HeaderSize='9' * 300), 'cannot hold'),
+        (dict(HeaderSize='inf'), 'HeaderSize'),
+        (dict(CompressedData='True'), 'unpacked'),
+        (dict(ElementSpacing='1 nan 1'), 'ElementSpacing'),
+        (dict(TransformMatrix='1 0 0'), 'TransformMatrix'),
+    ],
+)
+def test_headers_that_lie(tmp_path, changes, match):
+    refused(written(tmp_path / 'v.mha', **changes), match)
+
+
+def test_no_end_of_the_header(tmp_path):
+    (tmp_path / 'v.mha').write_bytes(b'NDims = 3\n' * 20000)
+    refused(tmp_path / 'v.mha', 'no end')

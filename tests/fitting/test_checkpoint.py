@@ -1,0 +1,301 @@
+"""Checkpoints: what was altered is refused in one line, whichever entry it is in, and what is sound is read."""
+
+import json
+import os
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+
+from helpers.checkpoints import contents, write_as_before
+from helpers.fits import SHORT, assert_equal_states, geometry, some_points, tiny_scan
+from lingo_mi.errors import InputError
+from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.loop import run
+
+SETTINGS = SHORT.changed(iterations=3, n_points=60, average=0.5, rate_pose=(1e-3, 1e-3), densify_from=100)
+ARRAYS = (
+    *(f'{group}.{k}' for group in ('values', 'first', 'second') for k in ('centre', 'scale', 'rotation', 'density')),
+    *(f'array.average.{k}' for k in ('centre', 'scale', 'rotation', 'density')),
+    *(f'array.poses.{k}' for k in ('turn', 'shift', 'first', 'second', 'steps')),
+    *('gradient', 'seen', 'born', 'array.initial', 'array.order'),
+)
+WAYS = {
+    'missing': None,
+    'empty': lambda a: a[:0],
+    'shorter': lambda a: a[:-1],
+    'another axis': lambda a: a[..., None],
+    'one number': lambda a: np.zeros((), a.dtype),
+    'text': lambda a: np.full(a.shape, 'x'),
+    'complex': lambda a: a.astype(complex),
+    'another type': lambda a: a.astype(np.float16 if a.dtype == np.float32 else np.float32),
+    'another order of bytes': lambda a: a.astype('>f4'),
+    'NaN': lambda a: np.full(a.shape, np.nan, a.dtype),
+    'infinity': lambda a: np.full(a.shape, -np.inf, a.dtype),
+    'huge': lambda a: np.full(a.shape, np.iinfo(a.dtype).max),
+    'changed': lambda a: a + a.dtype.type(1),
+}
+PLAIN = (
+    'seed',
+    'rng',
+    'iteration',
+    'seconds',
+    'history',
+    'info',
+    'settings',
+    'unit',
+    'effects',
+    'views',
+    'scanner',
+    'signal',
+)
+VALUES = None, 'text', '', -1, 0, 1.5, float('nan'), float('inf'), 10**400, True, [], [1], {}, {'a': 1}, [{}]
+LEGAL = {  # a fit could have left these
+    'seed': [0],
+    'seconds': [0, 1.5],
+    'history': [[]],
+    'info': [{}, {'a': 1}],
+    'unit': [1.5],
+    'effects': [True],
+    'signal': [-1, 0, 1.5],
+}
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+    """The path of a checkpoint with averages and poses, and its entries."""
+    scan, path = tiny_scan(geometry()), tmp_path_factory.mktemp('whole') / 'fit.npz'
+    run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path)
+    return path, contents(path)
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """A function of altered entries: writes them and returns the line by which they are refused."""
+
+    def refused(content=None, raw=None):
+        path = tmp_path / 'altered.npz'
+        if raw is None:
+            np.savez(path, **content)
+        else:
+            path.write_bytes(raw)
+        return line(path)
+
+    return refused
+
+
+def line(path):
+    with pytest.raises(InputError) as caught:
+        checkpoint.load(path)
+    message = str(caught.value)
+    assert message.startswith(f'{path}: ') and '\n' not in message and len(message) < 300 + len(str(path))
+    return message.removeprefix(f'{path}: ')
+
+
+def altered(content, name, way):
+    """The entries with one of them altered; None where this cannot be."""
+    rest = {k: v for k, v in content.items() if k != name}
+    if way == 'missing':
+        return rest
+    old = content[name]
+    if way in ('NaN', 'infinity') and old.dtype.kind != 'f' or way == 'huge' and old.dtype.kind != 'i':
+        return None
+    new = WAYS[way](old)
+    return (
+        None if new.shape == old.shape and new.dtype == old.dtype and np.array_equal(new, old) else rest | {name: new}
+    )
+
+
+def test_the_test_knows_every_entry(whole):
+    _, content = whole
+    assert content.keys() == {*ARRAYS, 'extra', 'checksum'}
+    assert json.loads(str(content['extra'])).keys() == {*PLAIN, 'version'}
+
+
+@pytest.mark.parametrize('name', ARRAYS)
+def test_altered_arrays(whole, refused, tmp_path, name):
+    """With the checksum that was; and without, as in a checkpoint of an earlier program, where the alteration shows."""
+    path, content = whole
+    for way in WAYS:
+        bad = altered(content, name, way)
+        if bad is None:
+            continue
+        assert refused(bad)
+        sound = name == 'array.order' and way in ('empty', 'shorter') or name == 'array.initial' and way == 'shorter'
+        sound |= way == 'changed' and name not in ('array.order', 'array.poses.steps')
+        write_as_before(tmp_path / 'old.npz', bad)
+        if sound:
+            checkpoint.load(tmp_path / 'old.npz')
+        else:
+            assert 'checksum' not in line(tmp_path / 'old.npz'), way
+
+
+@pytest.mark.parametrize('name', PLAIN)
+def test_altered_plain_values(whole, refused, tmp_path, name):
+    _, content = whole
+    extra = json.loads(str(content['extra']))
+    path = tmp_path / 'old.npz'
+    for value in VALUES:
+        bad = extra | {name: value}
+        if bad == extra:
+            continue
+        assert refused(content | {'extra': np.array(json.dumps(bad))})
+        write_as_before(path, content, bad)
+        if any(value == legal and type(value) is type(legal) for legal in LEGAL.get(name, ())):
+            checkpoint.load(path)
+        else:
+            assert line(path), value
+    write_as_before(path, content, {k: v for k, v in extra.items() if k != name})
+    if name in ('unit', 'effects'):  # not in the first checkpoints
+        checkpoint.load(path)
+    else:
+        assert f'{name} is missing' in line(path)
+
+
+@pytest.mark.parametrize(
+    'name, key, values',
+    [
+        ('rng', 'state', [None, 3, {}, {'state': 1}, {'state': -1, 'inc': 1}, {'state': 2**128, 'inc': 1}]),
+        ('rng', 'bit_generator', [None, 'MT19937', 3]),
+        ('rng', 'has_uint32', [None, 2, 0.5]),
+        ('rng', 'uinteger', [None, 2**32, -1]),
+        ('rng', 'more', [1]),
+        ('info', 'seconds', [None, 'long', -1, float('nan')]),
+        ('settings', 'renamed', [1]),
+        ('settings', 'self', [1]),
+        ('settings', 'lambda_tv', [None, 'x', float('nan'), -1, 10**400, [1, 2]]),
+        ('settings', 'iterations', [None, 2, 0, 1.5, 10**400]),
+        ('settings', 'rate_pose', [[0, 0], [1], 'x']),
+        ('settings', 'render', ['alpha', 'x', 3]),
+        ('scanner', 'type', [None, 'bitmap']),
+        ('scanner', 'filename', ['/etc/passwd']),
+        ('scanner', 'poses', ['/etc/passwd', '1', 'nan', '../1']),
+        ('scanner', 'DSO', [None, 'x', -1, float('inf'), 1e308, 10**400, []]),
+        ('scanner', 'nDetector', ['0, 0', 'x', '1e308', '1,2,3']),
+        ('scanner', 'angles', ['', 'x', '1, 2', 'nan, nan, nan']),
+    ],
+)
+def test_altered_parts_of_plain_values(whole, tmp_path, name, key, values):
+    _, content = whole
+    for value in values:
+        extra = json.loads(str(content['extra']))
+        extra[name][key] = value
+        write_as_before(tmp_path / 'old.npz', content, extra)
+        assert line(tmp_path / 'old.npz'), value
+
+
+@pytest.mark.parametrize(
+    'entry, value',
+    [
+        ('iteration', 0),
+        ('iteration', 10**6),
+        ('iteration', 'x'),
+        ('iteration', None),
+        ('seconds', -1),
+        ('seconds', float('nan')),
+        ('loss', None),
+        ('loss', float('inf')),
+        ('gaussians', 0),
+        ('gaussians', 1.5),
+        ('psnr_2d', 'good'),
+        ('psnr_2d', 10**400),
+    ],
+)
+def test_altered_history(whole, tmp_path, entry, value):
+    _, content = whole
+    extra = json.loads(str(content['extra']))
+    extra['history'][0][entry] = value
+    write_as_before(tmp_path / 'old.npz', content, extra)
+    assert 'history' in line(tmp_path / 'old.npz')
+
+
+def test_what_does_not_belong_there(whole, refused, tmp_path):
+    _, content = whole
+    for more in ('values.hue', 'array.share', 'strange', 'array.poses.more'):
+        assert 'checksum' in refused({**content, more: np.zeros(3)})
+        write_as_before(tmp_path / 'old.npz', {**content, more: np.zeros(3)})
+        assert more in line(tmp_path / 'old.npz')
+    write_as_before(tmp_path / 'old.npz', content, json.loads(str(content['extra'])) | {'more': 1})
+    assert 'more' in line(tmp_path / 'old.npz')
+
+
+def test_extra_that_is_no_json(whole, refused, tmp_path):
+    _, content = whole
+    texts = '', 'x', '[' * 100_000, '{}', '[]', '3', 'null', '{"iteration": ' + '9' * 5000 + '}'
+    for extra in (*(np.array(text) for text in texts), np.zeros(3), np.array(b'{}')):
+        assert refused({**content, 'extra': extra})
+        np.savez(tmp_path / 'old.npz', **{**{k: v for k, v in content.items() if k != 'checksum'}, 'extra': extra})
+        assert line(tmp_path / 'old.npz')
+
+
+def test_checksums(whole, refused):
+    _, content = whole
+    assert 'checksum is missing' in refused({k: v for k, v in content.items() if k != 'checksum'})
+    for wrong in ('', 'f' * 32, str(content['checksum'])[::-1], 3, np.zeros(5)):
+        assert 'checksum' in refused({**content, 'checksum': np.array(wrong)})
+    later = json.loads(str(content['extra'])) | {'version': 2}
+    bare = {k: v for k, v in content.items() if k != 'checksum'}
+    assert 'version is 2' in refused({**bare, 'extra': np.array(json.dumps(later))})
+
+
+def test_sizes_are_checked_before_memory_is_taken(whole, refused, tmp_path):
+    path, content = whole
+    np.savez_compressed(tmp_path / 'bomb.npz', **{**content, 'strange': np.zeros(10**7)})
+    assert 'compressed' in line(tmp_path / 'bomb.npz')
+    for claim in (b'(99999999999999, 3)', b'(-60, 3)', b'(0,)', b'(2, 2)'):
+        raw = path.read_bytes()
+        with zipfile.ZipFile(path) as archive:
+            entry = archive.getinfo('values.centre.npy')
+            old = archive.read(entry)
+        begin = old.index(b'(60, 3)')
+        header = old[: old.index(b'\n') + 1]
+        new = (header.replace(b'(60, 3)', claim).rstrip(b'\n ')).ljust(len(header) - 1)[: len(header) - 1] + b'\n'
+        assert begin and len(new) == len(header)
+        changed = new + old[len(header) :]
+        at = raw.index(old)
+        raw = raw[:at] + changed + raw[at + len(old) :]
+        raw = raw.replace(zlib.crc32(old).to_bytes(4, 'little'), zlib.crc32(changed).to_bytes(4, 'little'))
+        assert 'another size' in refused(raw=raw)
+
+
+def test_bytes_that_were_altered(whole, refused):
+    """Whatever byte of a checkpoint's content is flipped, wherever it is cut."""
+    raw = whole[0].read_bytes()
+    rng = np.random.default_rng(0)
+    for at in rng.integers(0, len(raw), 40):
+        assert refused(raw=raw[:at])
+    with zipfile.ZipFile(whole[0]) as archive:
+        for entry in archive.infolist():
+            begin = raw.index(archive.read(entry))
+            for at in begin + rng.integers(0, entry.file_size, 4):
+                assert refused(raw=raw[:at] + bytes([raw[at] ^ 1 << rng.integers(8)]) + raw[at + 1 :])
+
+
+def test_entries_twice(whole, tmp_path):
+    path = tmp_path / 'twice.npz'
+    path.write_bytes(whole[0].read_bytes())
+    with zipfile.ZipFile(path, 'a') as archive, pytest.warns(UserWarning, match='Duplicate'):
+        archive.writestr('seen.npy', archive.read('seen.npy'))
+    assert 'twice' in line(path)
+
+
+def test_files_that_are_no_files(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):
+        assert 'no regular file' in line(path)
+
+
+def test_earlier_checkpoints_are_read(whole, tmp_path):
+    path, content = whole
+    write_as_before(tmp_path / 'old.npz', content)
+    (new, extra, arrays), (old, extra_of_old, arrays_of_old) = map(checkpoint.load, (path, tmp_path / 'old.npz'))
+    assert_equal_states(new, old)
+    assert extra == extra_of_old and 'version' not in extra and arrays.keys() == arrays_of_old.keys()
+    scan = tiny_scan(geometry())
+    assert_equal_states(
+        run(scan, SETTINGS, None, seed=3, path=tmp_path / 'old.npz').state, Fitted.from_checkpoint(path).state
+    )
+    assert_equal_states(Fitted.from_checkpoint(tmp_path / 'old.npz').state, Fitted.from_checkpoint(path).state)
+    assert 'checksum' in contents(tmp_path / 'old.npz')  # written anew
