@@ -133,7 +133,7 @@ def _array(file: BinaryIO, entry: zipfile.ZipInfo) -> np.ndarray:
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, columns_first, kind = read[np.lib.format.read_magic(header)](header)
-    except (KeyError, MemoryError, SyntaxError, TypeError, tokenize.TokenError):  # it is an expression
+    except (KeyError, MemoryError, SyntaxError, TypeError, ValueError, tokenize.TokenError):  # an expression
         raise InputError('an entry is no array') from None
     count, begin = math.prod(shape), header.tell()
     if kind.hasobject or any(n < 0 for n in shape) or count * kind.itemsize != len(content) - begin:
