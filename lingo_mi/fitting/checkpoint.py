@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def _text(array: np.ndarray) -> str:
     return array.item()
 
 
-def _array(file: BinaryIO, entry: zipfile.ZipInfo) -> np.ndarray:
+def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
     """The array in an entry, writable, from the file straight into its memory. Raises InputError where the entry's check sum is
     wrong, or its header claims another size than it has, or objects."""
     file.seek(entry.header_offset + 26)  # where the lengths stand of what goes before the content
@@ -133,7 +133,7 @@ def _array(file: BinaryIO, entry: zipfile.ZipInfo) -> np.ndarray:
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, columns_first, kind = read[np.lib.format.read_magic(header)](header)
-    except (KeyError, MemoryError, SyntaxError, TypeError, tokenize.TokenError):  # it is an expression
+    except (KeyError, MemoryError, SyntaxError, TypeError, ValueError, tokenize.TokenError):  # an expression
         raise InputError('an entry is no array') from None
     count, begin = math.prod(shape), header.tell()
     if kind.hasobject or any(n < 0 for n in shape) or count * kind.itemsize != len(content) - begin:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from numbers import Real
 from typing import Any
 
 import drjit as dr
@@ -45,7 +44,7 @@ class RenderOptions:
         if accuracy not in cutoff.PRESETS:
             raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
         extent = cutoff.PRESETS[accuracy] if extent is None else extent
-        if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
+        if not (isinstance(extent, int | float) and 1 <= float(extent) <= 20):
             raise InputError(f'lingo_xray: extent is in standard deviations, from 1 to 20, not {shown(extent)}')
         if footprint not in FOOTPRINTS:
             raise InputError(f'lingo_xray: footprint is one of {", ".join(FOOTPRINTS)}, not {footprint!r}')

@@ -13,6 +13,7 @@ from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import bounded as limits
+from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
@@ -64,6 +65,61 @@ def test_more_than_the_scan_or_the_memory_has(scan, monkeypatch):
             initial_cloud(scan, settings)
     limits.bounded(SHORT.changed(n_points=2000), scan)
     limits.bounded(METHODS['xgaussian'], scan)
+
+
+RATES = {f'rate_{name}': ((1e-12,) * 2, (1e3,) * 2) for name in ('centre', 'density', 'scale', 'rotation')}
+ENDS = RATES | dict(
+    rate_pose=((1e-12, 1e-12), (1.0, 1.0)),
+    tv_stride=(1, 1e6),
+    tv_size=(1, 1e6),
+    V_S=(0, 1e6),
+    occupancy_voxels=(1, 1e6),
+    misses=(0, 1e6),
+    decay_steps=(0, 1e9),
+    batch=(1, 3),
+    coarse_share=(0, 1),
+    high_fraction=(0, 1),
+    low_factor=(0, 1e6),
+    extent=(1, 20),
+    lambda_ssim=(0, 1e6),
+    lambda_tv=(0, 1e6),
+    beta1=(0, 1 - 1e-6),
+    beta2=(0, 1 - 1e-6),
+    epsilon=(0, 1),
+    average=(0, 1 - 1e-6),
+    densify_threshold=(0, 1e6),
+    split_size=(0, 1e6),
+    prune_density=(0, 1e6),
+    values_per_gaussian=(0, 1e9),
+    scale_min=(1e-9, 0.99),
+    scale_max=(2e-3, 1e3),
+    fdk_threshold=(-1e6, 1e6),
+    fdk_rescale=(0, 1e6),
+)
+SOON = 'rate_pose', 'rate_centre', 'tv_stride', 'epsilon'
+
+
+@pytest.mark.parametrize('name', [pytest.param(k, marks=[] if k in SOON else pytest.mark.slow) for k in ENDS])
+def test_the_ends_of_every_range(scan, name, tmp_path):
+    """A fit with settings as far as they may go is a fit, or one line."""
+    usual = SHORT.changed(
+        iterations=3,
+        n_points=60,
+        init='r2' if name.startswith('fdk') else 'lingo',
+        densify_from=0,
+        densify_every=1,
+        rate_pose=(1e-3, 1e-3),
+        average=0.5,
+        max_gaussians=200,
+    )
+    for value in ENDS[name]:
+        settings = usual.changed(**{name: value})
+        try:
+            fitted = run(scan, settings, initial_cloud(scan, settings), path=tmp_path / 'fit.npz')
+        except InputError as error:
+            assert '\n' not in str(error) and len(str(error)) < 300
+        else:
+            assert np.isfinite(fitted.volume()).all() and len(checkpoint.load(tmp_path / 'fit.npz')[0]) > 0
 
 
 def test_progress_and_measure_are_called(scan):
