@@ -132,29 +132,29 @@ def _image(path):
 
 
 def _image_stack(path):
-    if path.suffix.lower() == '.edf':
-        fabio = optional('fabio')
+    frame, count = (_edf_frame, _edf_count) if path.suffix.lower() == '.edf' else (_tiff_frame, _tiff_count)
+    n = _checked(path, lambda: count(path))
+    first = _checked(path, lambda: frame(path, 0))
+    return Frames(str(path), n, first.shape, first.dtype, lambda i: frame(path, i))
 
-        def frame(i):
-            with fabio.open(str(path)) as image:
-                return np.asarray(image.get_frame(i).data)
 
-        def count():
-            with fabio.open(str(path)) as image:
-                return image.nframes
-    else:
-        tifffile = optional('tifffile')
+def _edf_frame(path, i):
+    with optional('fabio').open(str(path)) as file:
+        return np.asarray(file.get_frame(i).data)
 
-        def frame(i):
-            return tifffile.imread(path, key=i)
 
-        def count():
-            with tifffile.TiffFile(path) as file:
-                return len(file.pages)
+def _edf_count(path):
+    with optional('fabio').open(str(path)) as file:
+        return file.nframes
 
-    n = _checked(path, count)
-    first = _checked(path, lambda: frame(0))
-    return Frames(str(path), n, first.shape, first.dtype, frame)
+
+def _tiff_frame(path, i):
+    return optional('tifffile').imread(path, key=i)
+
+
+def _tiff_count(path):
+    with optional('tifffile').TiffFile(path) as file:
+        return len(file.pages)
 
 
 def _array(path):

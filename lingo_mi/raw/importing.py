@@ -114,7 +114,7 @@ def import_raw(
             level = 1.0
             if air is not None or options.percentile is not None:  # of the whole frame: air may lie outside the crop
                 level = _air_level(frame, panel, air, options.percentile, float(exposure[i]), limit)
-            p[k], valid[k] = line_integrals(_cut(frame, crop), part, bins, exposure[i] * level, limit)
+            p[k], valid[k] = line_integrals(_cut(frame, crop), part, bins, float(exposure[i] * level), limit)
             levels[k] = level
             seen = p[k][valid[k]]
             if not seen.size:

@@ -45,7 +45,10 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None) -
     for name, frames in (('flats', flats), ('darks', darks)):
         if frames is not None and frames.shape != shape:
             raise InputError(f'{frames.where}: the {name} have {frames.shape} pixels, but the views have {shape}')
-    dark = np.zeros(shape) if darks is None else sum(darks[i] for i in range(len(darks))) / len(darks)
+    dark = np.zeros(shape)
+    if darks is not None:
+        for i in range(len(darks)):
+            dark += darks[i] / len(darks)
     good = np.isfinite(dark)
     if flats is None:
         return Fields(dark, None, good & _near(dark, np.ptp(np.percentile(dark, [5, 95]))), None)

@@ -30,7 +30,7 @@ def foot():
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('name', ['foot', 'chest', 'shepp_logan', 'gaussians'])
+@pytest.mark.parametrize('name', ['foot', 'chest', 'shepp_logan', pytest.param('gaussians', marks=pytest.mark.slow)])
 @pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
 def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
     assert look(scanned(name, mode, views, total)).advice == []

@@ -73,6 +73,14 @@ def test_tiff_stack(tmp_path, raw, scan_yml):
     check(load(tmp_path / 'views.tif', scan_yml, flats=tmp_path / 'flats.tif', darks=tmp_path / 'darks.tif'), raw)
 
 
+def test_edf_of_several_frames(tmp_path, raw, scan_yml):
+    image = pytest.importorskip('fabio').edfimage.EdfImage(data=raw.views[0])
+    for view in raw.views[1:]:
+        image.append_frame(data=view)
+    image.write(str(tmp_path / 'views.edf'))
+    check(load(tmp_path / 'views.edf', scan_yml, **save(tmp_path, raw)), raw)
+
+
 def test_edf(tmp_path, raw, scan_yml):
     edf = pytest.importorskip('fabio').edfimage.EdfImage
     (tmp_path / 'views').mkdir()
