@@ -32,6 +32,7 @@ __version__ = '0.1.0'
 __all__ = [  # noqa: RUF022 - in the order of their use
     'simulate',
     'load',
+    'load_raw',
     'phantom',
     'Geometry',
     'circular',
@@ -58,7 +59,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
 ]
 
 if TYPE_CHECKING:
-    from lingo_mi.api.data import load, phantom, simulate
+    from lingo_mi.api.data import load, load_raw, phantom, simulate
     from lingo_mi.api.fitting import fit
     from lingo_mi.api.result import Gaussians, Result, load_result
     from lingo_mi.api.volumes import reconstruct
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
 _PUBLIC = {
     'simulate': 'lingo_mi.api.data',
     'load': 'lingo_mi.api.data',
+    'load_raw': 'lingo_mi.api.data',
     'phantom': 'lingo_mi.api.data',
     'Geometry': 'lingo_mi.geometry',
     'circular': 'lingo_mi.geometry',

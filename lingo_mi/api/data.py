@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from os import PathLike
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +13,13 @@ from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
-from lingo_mi.parsing import whole
+from lingo_mi.parsing import nearest, whole
 from lingo_mi.phantoms import Phantom, make
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
 from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
 from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
+from lingo_mi.raw.importing import Options, import_raw
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory, require_densities, warn_if_truncated
@@ -125,6 +128,31 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
     check_memory(dataset.train.geometry)
     warn_if_truncated(dataset.train.geometry)
     return dataset
+
+
+def load_raw(
+    frames: str | PathLike, geometry: str | PathLike | Geometry, *, progress: bool = True, **options: Any
+) -> Scan:
+    """Read a scanner's raw frames and turn them into line integrals, one frame at a time.
+
+    frames     a folder of TIFF or EDF images, a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as NXtomo or DXchange
+    geometry   of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml
+    progress   whether to show a progress bar on standard error
+    options    flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
+               saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file;
+               pixel, mm. `lingo_mi.raw.importing.Options` describes them, and `lingo-mi import` writes a file
+
+    Returns a `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts. Raises InputError where
+    something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.
+
+        scan = lm.load_raw('frames/', 'scan.yml', flats='flats/', darks='darks/', binning=2)
+    """
+    require_type('frames', frames, (str, PathLike))
+    require_type('geometry', geometry, (str, PathLike, Geometry))
+    known = {field.name for field in dataclasses.fields(Options)}
+    for name in options.keys() - known:
+        raise InputError(f'load_raw has no option {name!r}{nearest(name, known)}; it has {", ".join(sorted(known))}')
+    return import_raw(frames, geometry, Options(**options), progress)[0]
 
 
 def phantom(name: str, size: int = 256, seed: int = 0) -> Phantom:

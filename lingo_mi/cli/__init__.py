@@ -12,6 +12,8 @@ from lingo_mi.cli.common import guard
 COMMANDS = {
     'fit': 'fit a cloud of 3D Gaussians to a scan; makes a volume and new views',
     'reconstruct': 'reconstruct a volume on voxels: FDK, SART, ASD-POCS and others',
+    'import': "turn a scanner's raw frames into a scan",
+    'inspect': 'look at a scan before work: air, noise, truncation, order of the views, axis',
     'phantom': 'make a test object and a scan of it',
     'gradcheck': "check the derivatives of a scene's image against differences",
     'recipes': 'compare recipes: quality against time',
@@ -25,10 +27,12 @@ COMMANDS = {
     'cuda-check': 'check the CUDA backend where there is no GPU',
 }
 
+MODULES = {'import': 'import_frames', 'inspect': 'inspect_scan'}  # names that Python has a use for
+
 
 def run(command: str) -> None:
     """Run one command with the arguments in `sys.argv`, and exit."""
-    module = importlib.import_module(f'lingo_mi.cli.{command.replace("-", "_")}')
+    module = importlib.import_module(f'lingo_mi.cli.{MODULES.get(command, command.replace("-", "_"))}')
     guard(module.main)
 
 

@@ -23,6 +23,7 @@ degrees:
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
     valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
+    history                how the projections were made, for people: `lingo-mi import` writes it
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
 
 DSO, DSD, offDetector, offOrigin (TIGRE's: it moves the object), rotDetector, COR and tilt may be lists of one
@@ -63,7 +64,7 @@ from lingo_mi.files.scanner_dict import (
 )
 from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.parsing import nearest
 from lingo_mi.scan import Dataset, Scan
@@ -91,6 +92,7 @@ _KEYS = {
     'poses',
     'test_poses',
     'valid',
+    'history',
     *MOTION,
 }
 
@@ -98,7 +100,8 @@ _KEYS = {
 # ---- geometry files ----------------------------------------------------------------------------------------
 
 
-def _load_yaml(path) -> dict:
+def load_yaml(path: PathLike | str) -> dict:
+    """The names of a geometry file. Raises InputError if it is missing, damaged, or has others."""
     values = plain_yaml.load(path)
     if not isinstance(values, dict):
         raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
@@ -122,8 +125,8 @@ def _number(values, key, default, where):
     return number
 
 
-def _geometry(values, n, where, test=False):
-    """The geometry of the n views to fit, or of those held out."""
+def posed_geometry(values: dict, n: int, where: PathLike | str, test: bool = False) -> Geometry:
+    """The geometry of the n views to fit, or of those held out, from the names of a geometry file."""
     prefix = 'test_' if test else ''
     poses = values.get(prefix + 'poses')
     if poses is None:
@@ -214,18 +217,18 @@ def _read_npy(path, geometry):
         geometry = next((p for p in beside if p.exists()), None)
         if geometry is None:
             raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
-    values = _load_yaml(geometry)
+    values = load_yaml(geometry)
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
     if valid is not None:
         projections = np.where(valid, projections, 1)  # a value with a logarithm
-    g = _geometry(values, len(projections), geometry)
+    g = posed_geometry(values, len(projections), geometry)
     if str(values.get('poses')).lower().endswith('.xml'):
         projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
     return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path, valid))
 
 
-def _write_npy(path, dataset):
+def _write_npy(path, dataset, history=None):
     path = Path(path)
     if path.suffix != '.npy':
         raise InputError(
@@ -236,7 +239,9 @@ def _write_npy(path, dataset):
             f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
             'instead, or drop the test views and the volume'
         )
-    more = {'input': 'line_integral'}
+    more: dict = {'input': 'line_integral'}
+    if history is not None:
+        more['history'] = history
     if dataset.train.valid is not None:
         more['valid'] = path.stem + '.valid.npy'
         arrays.save(path.with_name(more['valid']), dataset.train.valid)
@@ -265,7 +270,7 @@ def _read_stack(folder):
 
 def _read_exr_folder(folder):
     where = folder / 'geometry.yml'
-    values = _load_yaml(where)
+    values = load_yaml(where)
     if values.get('valid') is not None:
         raise InputError(f'{where}: valid goes with .npy projections only')
     scans = {}
@@ -278,7 +283,7 @@ def _read_exr_folder(folder):
                 f'{where}: test_angles is missing, but there is a folder of test views; add it, in degrees'
             )
         projections = _read_stack(folder / split)
-        geometry = _geometry(values, len(projections), where, split == 'test')
+        geometry = posed_geometry(values, len(projections), where, split == 'test')
         scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
     volume = folder / 'volume.nii.gz'
     return make_dataset(
@@ -383,11 +388,12 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
 _WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _write_npy}
 
 
-def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str) -> None:
+def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:
     """Writes a scan that `read_scan` reads back, whole or not at all.
 
     kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`
            and its .yml, for training views alone, and the mask of valid pixels if there is one
+    history   how it was made, plain values by name; for 'npy'
 
     Raises InputError if the kind is unknown, a folder exists already, the file cannot be written, or the
     format cannot hold the data.
@@ -398,4 +404,9 @@ def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str) -> None
     masked = any(scan is not None and scan.valid is not None for scan in (dataset.train, dataset.test))
     if masked and kind != 'npy':
         raise InputError(f"{path}: this format holds no mask of valid pixels; write 'npy'")
+    if history is not None:
+        if kind != 'npy':
+            raise InputError(f"{path}: this format holds no history; write 'npy'")
+        _write_npy(path, dataset, history)
+        return
     _WRITERS[kind](path, dataset)

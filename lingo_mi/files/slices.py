@@ -40,7 +40,7 @@ def _natural(path):
     return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
 
 
-def _require_chain(path):
+def require_chain(path: Path) -> None:
     """Raises InputError where a TIFF file's list of images goes round in circles: all of it cannot be longer than the file."""
     left = os.path.getsize(path)
     with open(path, 'rb') as stream:
@@ -62,10 +62,12 @@ def _require_chain(path):
             (at,) = struct.unpack(order + link, following)
 
 
-def _tiff_file(tifffile, path):
+def read_tiff_file(path: Path) -> np.ndarray:
+    """The first series of images of a TIFF file, as it is stored. Raises InputError where it is damaged, or claims too much."""
+    tifffile = optional('tifffile')
     try:
         with reading(path):
-            _require_chain(path)
+            require_chain(path)
         # What some microscopes' own descriptions say is not followed: to other files, or to more images than there are.
         others = {f'is_{kind}': False for kind in tifffile.TIFF.FILE_FLAGS - _KINDS}
         with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False, **others) as file:
@@ -82,10 +84,9 @@ def _tiff_file(tifffile, path):
 
 def read_tiff(files: list[Path]) -> np.ndarray:
     """The values [x, y, z] of one file of [z, y, x], or of several of [y, x]. Raises InputError where there are none."""
-    tifffile = optional('tifffile')
-    slices = [_tiff_file(tifffile, files[0])]
+    slices = [read_tiff_file(files[0])]
     require_room(len(files) * slices[0].size * 8, files[0])
-    slices += [_tiff_file(tifffile, file) for file in files[1:]]
+    slices += [read_tiff_file(file) for file in files[1:]]
     if len(slices) == 1:
         return (slices[0][None] if slices[0].ndim == 2 else slices[0]).transpose()
     for file, image in zip(files, slices):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lingo_mi import phantoms
-from lingo_mi.cli import COMMANDS, main
+from lingo_mi.cli import COMMANDS, MODULES, main
 
 SCRIPTS = Path(__file__).parents[2] / 'scripts'
 
@@ -62,7 +62,7 @@ def test_every_command_describes_itself(command, name):
 
 @pytest.mark.parametrize('name', COMMANDS)
 def test_every_command_is_a_script(monkeypatch, capsys, name):
-    path = SCRIPTS / f'{name.replace("-", "_")}.py'
+    path = SCRIPTS / f'{MODULES.get(name, name.replace("-", "_"))}.py'
     monkeypatch.setattr(sys, 'argv', [str(path), '--help'])
     with pytest.raises(SystemExit) as stop:
         runpy.run_path(str(path), run_name='__main__')
@@ -70,7 +70,7 @@ def test_every_command_is_a_script(monkeypatch, capsys, name):
 
 
 def test_there_are_no_other_scripts():
-    assert {path.stem.replace('_', '-') for path in SCRIPTS.glob('*.py')} == set(COMMANDS)
+    assert {path.stem for path in SCRIPTS.glob('*.py')} == {MODULES.get(c, c.replace('-', '_')) for c in COMMANDS}
 
 
 @pytest.mark.parametrize('name', COMMANDS)

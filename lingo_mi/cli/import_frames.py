@@ -1,0 +1,103 @@
+"""Turn raw frames into a scan that every command reads: line integrals, their geometry, and a mask of valid pixels."""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+
+EPILOG = """\
+examples:
+  lingo-mi import frames/ --flats flats/ --darks darks/ --geometry scan.yml --out scan.npy
+      folders of TIFF or EDF images; scan.yml needs DSO, DSD, dDetector and angles or totalAngle
+  lingo-mi import tomo.h5 --geometry scan.yml --binning 2 --out scan.npy
+      NXtomo or DXchange, with its own flats, darks and angles
+  lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
+      Nikon, with the air level of every view from a region without object
+  lingo-mi fit x3d_foot --projections scan.npy"""
+
+
+def arguments() -> argparse.Namespace:
+    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add('frames', help='a folder of .tif or .edf images, a multi-page .tif, a .edf, .npy [n, v, u], or .h5 / .nxs')
+    add('--geometry', required=True, metavar='F', help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml")
+    add(
+        '--out', required=True, type=Path, metavar='F.npy', help='the scan; F.yml and F.valid.npy are written beside it'
+    )
+    add('--flats', metavar='F', help='frames without object')
+    add('--darks', metavar='F', help='frames without beam')
+    add('--air', type=int, nargs=4, metavar=('V0', 'V1', 'U0', 'U1'), help='pixels without object in every view')
+    add('--air-percentile', type=float, metavar='P', help='instead: a percentile of each view is its air level')
+    add('--i0', type=float, metavar='COUNTS', help='instead: the counts of the unattenuated beam above the dark ones')
+    add(
+        '--exposure',
+        metavar='X',
+        help='exposure of the views over that of the flats: a number, or a file with one a line',
+    )
+    add(
+        '--saturation',
+        type=float,
+        metavar='COUNTS',
+        help='counts from here on are not valid (default: the largest integer)',
+    )
+    add('--crop', type=int, nargs=4, metavar=('V0', 'V1', 'U0', 'U1'), help='pixels to keep')
+    add('--binning', type=int, default=1, metavar='N', help='N x N pixels become one (default 1)')
+    add('--views', metavar='A:B:STEP', help='the views to keep, such as ::4')
+    add('--angles', metavar='F', help='a file of angles in degrees, one a line (.txt, .ang)')
+    add('--pixel', type=float, metavar='MM', help="size of a raw pixel, for RTK's geometry")
+    add('--force', action='store_true', help='overwrite existing files')
+    return parser.parse_args()
+
+
+def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
+    """'A:B:STEP' as numbers."""
+    if text is None:
+        return None
+    try:
+        parts = [int(part) if part else None for part in text.split(':')]
+        first, end, step = (*parts, None, None, None)[:3]
+        if not 2 <= len(parts) <= 3 or (step is not None and step < 1):
+            raise ValueError
+    except ValueError:
+        raise InputError(f'--views must be FIRST:END:STEP, such as 0:100:2 or ::4, not {text!r}') from None
+    return first or 0, end, step or 1
+
+
+def main() -> None:
+    args = arguments()
+    from lingo_mi.files.scans import write_scan
+    from lingo_mi.raw.importing import Options, import_raw
+    from lingo_mi.raw.nikon import read_numbers
+
+    if args.out.suffix != '.npy':
+        raise InputError(f'{args.out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy')
+    if args.binning < 1:
+        raise InputError(f'--binning must be at least 1, not {args.binning}')
+    written = [args.out, args.out.with_suffix('.yml'), args.out.with_name(args.out.stem + '.valid.npy')]
+    if Path(args.geometry).resolve() in [file.resolve() for file in written]:
+        raise InputError(
+            f'{args.geometry}: would be overwritten by the geometry of {args.out}; give --out another name'
+        )
+    for file in written:
+        if file.exists() and not args.force:
+            raise InputError(f'{file}: exists already; give --force to overwrite it')
+    exposure = 1.0
+    if args.exposure is not None:
+        try:
+            exposure = float(args.exposure)
+        except ValueError:
+            exposure = read_numbers(args.exposure)
+    options = Options(
+        flats=args.flats, darks=args.darks, air=args.air, percentile=args.air_percentile, i0=args.i0, exposure=exposure,
+        saturation=args.saturation, crop=args.crop, binning=args.binning, views=chosen_views(args.views), angles=args.angles,
+        pixel=args.pixel,
+    )  # fmt: skip
+    scan, history = import_raw(args.frames, args.geometry, options)
+    write_scan(args.out, scan, 'npy', history)
+    left_out = 0.0 if scan.valid is None else 1 - scan.valid.mean()
+    photons = history.get('photons_from_flats', history['photons_from_views'])
+    print(f'{args.out}: {len(scan)} views of {scan.geometry.nDetector[0]} x {scan.geometry.nDetector[1]} pixels')
+    print(f'  {history["bad_pixels"]} bad pixels of the panel, {left_out:.2%} of all pixels left out')
+    source = 'flats' if 'photons_from_flats' in history else 'views'
+    print(f'  about {photons:.3g} photons a pixel, from the scatter of the {source}')

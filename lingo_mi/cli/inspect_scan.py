@@ -1,0 +1,32 @@
+"""Look at a scan before work: geometry, air, noise, truncation, order of the views, angles and axis; and what to correct."""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+
+EPILOG = """\
+examples:
+  lingo-mi inspect scan.npy
+      prints what was measured and what to correct; draws scan.png in the current folder
+  lingo-mi inspect foot_50.pickle --out look.png"""
+
+
+def main() -> None:
+    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('scan', help='a scan in any format that --projections of fit reads')
+    parser.add_argument('--out', type=Path, metavar='F.png', help='where to draw (default: the name of the scan, .png)')
+    args = parser.parse_args()
+    from lingo_mi.files.scans import read_scan
+    from lingo_mi.inspection.measure import look
+    from lingo_mi.inspection.sheet import draw
+
+    scan = read_scan(args.scan).train
+    found = look(scan)
+    print('\n'.join(found.facts))
+    print('\nto correct:' if found.advice else '\nnothing to correct was found')
+    for line in found.advice:
+        print(f'- {line}')
+    out = args.out or Path(Path(args.scan).stem + '.png')
+    draw(out, scan, found)
+    print(f'\n{out}')

@@ -1,0 +1,208 @@
+"""What a scan says of itself: numbers with their units, and what to correct."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
+from lingo_mi.raw.line_integrals import photons_of_images
+from lingo_mi.scan import Scan
+
+COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
+VIEWS = 40  # of the plane: the time goes with its square
+CLEAR = 0.01  # a disagreement that is more than discretisation
+
+
+@dataclass
+class Findings:
+    """What `look` has measured.
+
+    facts      sentences with numbers
+    advice     sentences: what to correct, and how; empty for a sound scan
+    air        level beside the object, nan where none is seen
+    mass       [n] mean line integral of every view, air subtracted
+    suspects   views that are black, doubled or out of order
+    """
+
+    facts: list[str] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list)
+    air: float = np.nan
+    mass: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    suspects: list[int] = field(default_factory=list)
+
+
+def look(scan: Scan) -> Findings:
+    """Measures a scan; nothing is changed."""
+    found = Findings()
+    geometry, p = scan.geometry, scan.projections
+    n, (nv, nu) = len(scan), geometry.nDetector
+    valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
+    found.facts.append(
+        f'{n} views of {nv} x {nu} pixels of {geometry.dDetector[0]:.4g} x {geometry.dDetector[1]:.4g} mm, {geometry.mode} beam'
+        + (f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else '')
+        + f'; {1 - valid.mean():.2%} of the pixels are left out'
+    )
+    top = float(np.percentile(p[valid], 99.5))
+    _air_and_truncation(found, p, valid, top)
+    photons = photons_of_images(p, scan.valid)
+    if np.isfinite(photons) and photons < 1e8:
+        found.facts.append(
+            f'noise: {photons**-0.5:.2g} rms in air from column to column, as of {photons:.2g} photons a pixel'
+        )
+    else:
+        found.facts.append('noise: none that could be measured')
+    highest = float(p[valid].max())
+    clipped = float((p[valid] == highest).mean())
+    if clipped > 1e-3 and highest > 0:
+        found.facts.append(f'saturation: {clipped:.2%} of the pixels have exactly the highest value, {highest:.3g}')
+        found.advice.append(
+            'pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)'
+        )
+    air = 0.0 if np.isnan(found.air) else found.air
+    found.mass = np.array([(p[i][valid[i]].mean() - air) if valid[i].any() else 0.0 for i in range(n)])
+    _views(found, p - air, valid)
+    _angles(found, scan, air)
+    return found
+
+
+def _air_and_truncation(found, p, valid, top):
+    nu = p.shape[2]
+    edge = max(1, nu // 64)
+    sides = np.concatenate([p[:, :, :edge][valid[:, :, :edge]], p[:, :, -edge:][valid[:, :, -edge:]]])
+    if not sides.size:
+        return
+    low = np.percentile(sides, 5)
+    near = sides[sides < low + 0.1 * (top - low)]
+    if low > 0.2 * top:
+        found.facts.append('air: none beside the object, which fills the panel')
+    else:
+        found.air = float(np.median(near))
+        found.facts.append(f'air: {found.air:.4g} beside the object (line integral; 0 without error)')
+        if abs(found.air) > 0.01 * top:
+            found.advice.append(
+                f'air is {found.air:.3g} instead of 0: import again with --air, or subtract it from the projections'
+            )
+    limit = (0.0 if np.isnan(found.air) else found.air) + 0.1 * top
+    cut = {}
+    for name, part in (('left or right', np.s_[:, :, [0, -1]]), ('upper or lower', np.s_[:, [0, -1], :])):
+        inside = (p[part] > limit) & valid[part]
+        cut[name] = int(inside.any((1, 2)).sum())
+    if p.shape[1] < 3:
+        cut.pop('upper or lower')
+    for name, views in cut.items():
+        if views:
+            found.facts.append(f'truncation: the object reaches over the {name} edge of the panel in {views} views')
+            found.advice.append(
+                f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object'
+            )
+
+
+def _views(found, p, valid):
+    """Black and doubled views."""
+    typical = np.median(found.mass)
+    n = len(p)
+    black = [
+        i for i in range(n) if not valid[i].any() or np.ptp(p[i][valid[i]]) == 0 or abs(found.mass[i]) < 0.1 * typical
+    ]
+    if black:
+        found.suspects += black
+        found.advice.append(f'{_named(black)} black or empty: drop with --views of import, or lm.Scan.subset')
+    if n >= 4:
+        doubled = [i for i in range(1, n) if i not in black and i - 1 not in black and np.array_equal(p[i], p[i - 1])]
+        if doubled:
+            found.suspects += doubled
+            found.advice.append(
+                f'{_named(doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
+            )
+
+
+def _plane(scan, air):
+    """The plane of the source, or a sentence why there is none."""
+    geometry = scan.geometry
+    if not isinstance(geometry, CircularGeometry):
+        return 'the scanner leaves the circle'
+    (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
+    p = scan.projections.astype(float) - air
+    if geometry.mode == 'parallel':
+        valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
+        row = (p * valid).sum(1) / np.maximum(valid.sum(1), 1)
+    else:
+        middle = nv / 2 - 0.5 + geometry.offDetector[0] / dv
+        if not -0.5 <= middle <= nv - 0.5:
+            return 'the panel does not see the plane of the source'
+        first = min(max(int(np.floor(middle)), 0), nv - 1)
+        last = min(first + 1, nv - 1)
+        part = min(max(middle - first, 0.0), 1.0)
+        row = (1 - part) * p[:, first] + part * p[:, last]
+    by = max(1, nu // COLUMNS)
+    columns = nu // by
+    row = row[:, : columns * by].reshape(len(p), columns, by).mean(2)
+    u = (np.arange(columns) + 0.5) * by * du - nu * du / 2 + geometry.offDetector[1]
+    peak = np.percentile(row, 99.5)
+    if row[:, [0, -1]].max() > 0.15 * peak:
+        return 'the object reaches over the edge of the panel'
+    return Plane(row, geometry.angles, u, geometry.DSD if geometry.mode == 'cone' else 0.0)
+
+
+def _angles(found, scan, air):
+    """Unit and sense of the angles, the axis, and views out of order."""
+    geometry, n = scan.geometry, len(scan)
+    if n >= 4 and isinstance(geometry, CircularGeometry):
+        turn = np.ptp(geometry.angles) * n / (n - 1)
+        found.facts.append(f'angles: {np.degrees(turn):.4g} degrees in all')
+        for whole in (np.pi, 2 * np.pi):
+            if abs(np.degrees(turn) / whole - 1) < 0.02:
+                found.advice.append(
+                    f'the angles span {np.degrees(turn):.3g} degrees: they look like radians; a .yml takes degrees'
+                )
+                return
+            if abs(turn / np.degrees(whole) - 1) < 0.02:
+                found.advice.append(
+                    f'the angles span {turn:.4g} radians: they look like degrees; give numpy.radians(angles)'
+                )
+                return
+    plane = _plane(scan, air)
+    if isinstance(plane, str):
+        found.facts.append(f'consistency of the views: not measured, as {plane}')
+        return
+    index = np.array([i for i in range(n) if i not in found.suspects])
+    index = index[:: max(1, -(-len(index) // VIEWS))]
+    plane = plane.subset(index)
+    shift, best = best_shift(plane, plane.angles, 0.08 * np.ptp(plane.u))
+    given = disagreement(plane, plane.angles)[0]
+    if not np.isfinite(given) or not np.isfinite(best):
+        found.facts.append('consistency of the views: not measured, as too few of them see the object from beside')
+        return
+    what = 'of the half-width of the panel' if not plane.DSD else 'of their mass'
+    found.facts.append(f'consistency of the views: they disagree by {given:.2%} rms {what}')
+    _, other = best_shift(plane, -plane.angles, 0.08 * np.ptp(plane.u)) if plane.DSD else (0.0, np.inf)
+    if best > CLEAR and other < 0.4 * best:
+        found.advice.append(
+            f'with reversed angles the views disagree by {other:.2%} instead of {best:.2%}: change the sign of the angles, or '
+            'mirror the columns'
+        )
+        return
+    pair = swapped(plane, plane.angles, shift) if best > 0.2 * CLEAR else None
+    if pair is not None:
+        views = [int(index[i]) for i in pair]
+        found.suspects += views
+        found.advice.append(
+            f"views {views[0]} and {views[1]} fit better in each other's place: check the order of the frames"
+        )
+        return
+    pixel = geometry.dDetector[1]
+    if abs(shift) > 0.5 * pixel and best < 0.7 * given:
+        found.facts.append(
+            f'axis: {shift:+.3g} mm on the panel ({shift / pixel:+.2g} pixels) lets them agree to {best:.2%}'
+        )
+        found.advice.append(
+            f'the axis is off: add {shift:+.3g} mm to the second number of offDetector, or fit with -D rate_pose=2e-3,2e-4'
+        )
+
+
+def _named(views):
+    text = ', '.join(map(str, views[:6])) + (', ...' if len(views) > 6 else '')
+    return f'view {text} is' if len(views) == 1 else f'views {text} are'

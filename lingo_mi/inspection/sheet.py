@@ -1,0 +1,55 @@
+"""One picture of a scan: its geometry, three views, and the mass of every view. No pyplot, no global state."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from lingo_mi.file_access import replacing
+from lingo_mi.inspection.measure import Findings
+from lingo_mi.scan import Scan
+
+
+def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
+    """Writes a PNG. Raises InputError if the file cannot be written."""
+    figure = Figure(figsize=(13, 6.4), layout='constrained')
+    FigureCanvasAgg(figure)
+    _geometry(figure.add_subplot(2, 4, (1, 6), projection='3d'), scan)
+    high = np.percentile(scan.projections, 99.8)
+    for place, i in zip((3, 4, 7), np.linspace(0, len(scan) - 1, 3).astype(int)):
+        axes = figure.add_subplot(2, 4, place)
+        axes.imshow(scan.projections[i], cmap='gray', vmin=0, vmax=high, aspect='auto')
+        axes.set_title(f'view {i}', fontsize=10)
+        axes.set(xticks=[], yticks=[])
+    axes = figure.add_subplot(2, 4, 8)
+    axes.plot(found.mass, '.-', color='#1f77b4', markersize=4, linewidth=0.8)
+    axes.plot(found.suspects, found.mass[found.suspects], 'o', color='#d1495b', fillstyle='none')
+    axes.set_title('mean line integral of a view', fontsize=10)
+    axes.set(xlabel='view', ylim=(0, None))
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=100, format='png')
+
+
+def _geometry(axes, scan):
+    """Sources (or directions), panels of the first and the middle view, and the volume; mm."""
+    geometry, rays = scan.geometry, scan.geometry.rays()
+    nv, nu = geometry.nDetector
+    size = np.array(geometry.sVoxel) / 2
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size + geometry.offOrigin
+    for a in range(8):
+        for bit in (1, 2, 4):
+            if not a & bit:
+                axes.plot(*corners[[a, a | bit]].T, color='#444444', linewidth=1)
+    source = -rays.source * size.max() * 3 if rays.parallel else rays.source
+    axes.plot(*source.T, '.', color='#d1495b', markersize=3)
+    axes.plot(*source[:1].T, 'o', color='#d1495b')
+    for k, colour in ((0, '#1f77b4'), (len(scan) // 3, '#9ec5e5')):
+        a = rays.corner[k]
+        panel = np.array([a, a + nu * rays.u[k], a + nu * rays.u[k] + nv * rays.v[k], a + nv * rays.v[k], a])
+        axes.plot(*panel.T, color=colour)
+    axes.set(xlabel='x', ylabel='y', zlabel='z')
+    axes.set_aspect('equal')
+    axes.set_title('sources (first: large), panels of two views, volume; mm', fontsize=10)

@@ -1,0 +1,239 @@
+"""Raw frames, read one at a time: a TIFF stack, a folder of TIFF or EDF images, a .npy, or HDF5 (NXtomo, DXchange)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import one_line, optional, reading
+from lingo_mi.files import arrays
+from lingo_mi.files.slices import read_tiff_file, require_chain
+
+IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'}
+HDF5 = ('.h5', '.hdf5', '.hdf', '.nxs', '.nx')
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Images of one panel.
+
+    where   file or folder, for messages
+    count   how many
+    shape   pixels (v, u)
+    dtype   of the counts as they are stored
+    read    read(i) -> [v, u], frame i, as it is stored
+    """
+
+    where: str
+    count: int
+    shape: tuple[int, int]
+    dtype: np.dtype
+    read: Callable[[int], np.ndarray]
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        """Frame i, float64 [v, u]. Raises InputError if it cannot be read, is of another size or holds no real numbers."""
+        try:
+            with reading(self.where, Path(self.where).is_dir()):
+                frame = np.asarray(self.read(i))
+        except InputError:
+            raise
+        except Exception as error:  # damaged files fail inside the readers in many ways
+            raise InputError(
+                f'{self.where}: frame {i} cannot be read ({one_line(error)[:120]}); copy it again'
+            ) from None
+        if frame.shape != self.shape:
+            raise InputError(
+                f'{self.where}: frame {i} has the shape {frame.shape}, but the first one has {self.shape}; all frames need '
+                'one panel'
+            )
+        if frame.dtype.kind not in 'uif':
+            raise InputError(f'{self.where}: frame {i} holds {frame.dtype} values; counts are needed')
+        return frame.astype(np.float64)
+
+    def subset(self, index: Sequence[int] | np.ndarray) -> Frames:
+        """The frames `index` only."""
+        index = [int(i) for i in index]
+        return Frames(self.where, len(index), self.shape, self.dtype, lambda i: self.read(index[i]))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What one file or folder holds: the views, and what else it may say. `angles` [n] in degrees."""
+
+    views: Frames
+    flats: Frames | None = None
+    darks: Frames | None = None
+    angles: np.ndarray | None = None
+
+
+def open_recording(path: PathLike | str) -> Recording:
+    """Opens raw frames; nothing but the first frame is read.
+
+    path   a folder of .tif, .tiff or .edf images, in the order of the numbers in their names; a multi-page .tif; a
+           multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data)
+
+    Raises InputError where the path is missing or unknown, or a package is needed that is not installed.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return Recording(_folder(path))
+    with reading(path):
+        open(path, 'rb').close()
+    if suffix == '.npy':
+        return Recording(_array(path))
+    if suffix in HDF5:
+        return _hdf5(path)
+    if suffix in IMAGES:
+        return Recording(_image_stack(path))
+    raise InputError(
+        f'{path}: is no known file of frames; give a folder of TIFF or EDF, .tif, .edf, .npy or HDF5 (.h5, .nxs)'
+    )
+
+
+def _natural(path):
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name.lower())]
+
+
+def _folder(path):
+    files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGES), key=_natural)
+    if not files:
+        raise InputError(f'{path}: holds no .tif, .tiff or .edf images; give the folder of the frames')
+    first = _checked(path, lambda: _image(files[0]))
+
+    def read(i):
+        image = _image(files[i])
+        if image.shape != first.shape:
+            raise InputError(
+                f'{files[i]}: has the shape {image.shape}, but {files[0].name} has {first.shape}; all frames need one panel'
+            )
+        return image
+
+    return Frames(str(path), len(files), first.shape, first.dtype, read)
+
+
+def _image(path):
+    if IMAGES[path.suffix.lower()] == 'fabio':
+        with optional('fabio').open(str(path)) as file:
+            image = np.asarray(file.data)
+    else:
+        image = read_tiff_file(path)
+    if image.ndim != 2 or image.size == 0:
+        raise InputError(f'{path}: is damaged, or no image of one channel (its shape is {image.shape}); copy it again')
+    return image
+
+
+def _image_stack(path):
+    frame, count = (_edf_frame, _edf_count) if path.suffix.lower() == '.edf' else (_tiff_frame, _tiff_count)
+    n = _checked(path, lambda: count(path))
+    first = _checked(path, lambda: frame(path, 0))
+    return Frames(str(path), n, first.shape, first.dtype, lambda i: frame(path, i))
+
+
+def _edf_frame(path, i):
+    with optional('fabio').open(str(path)) as file:
+        return np.asarray(file.get_frame(i).data)
+
+
+def _edf_count(path):
+    with optional('fabio').open(str(path)) as file:
+        return file.nframes
+
+
+def _tiff_frame(path, i):
+    return optional('tifffile').imread(path, key=i)
+
+
+def _tiff_count(path):
+    require_chain(path)
+    with optional('tifffile').TiffFile(path) as file:
+        return len(file.pages)
+
+
+def _array(path):
+    try:
+        with reading(path):
+            stack = np.load(path, mmap_mode='r', allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise InputError(f'{path}: is damaged or not a NumPy file ({one_line(error)[:120]}); write it again') from None
+    arrays.numeric(stack[:1], path, 3, finite=False)
+    return Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i])
+
+
+def _checked(path, read):
+    """What `read` gives, with an InputError for whatever a damaged file does."""
+    try:
+        with reading(path, Path(path).is_dir()):
+            return read()
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f'{path}: is damaged or of another kind ({one_line(error)[:120]}); copy it again') from None
+
+
+# ---- HDF5 --------------------------------------------------------------------------------------------------
+
+
+def _hdf5(path):
+    h5py = optional('h5py')
+    file = _checked(path, lambda: h5py.File(path, 'r'))
+
+    def stack(data):
+        if data.ndim == 2:
+            return Frames(str(path), 1, data.shape, data.dtype, lambda i: data[()])
+        if data.ndim != 3:
+            raise InputError(f'{path}: {data.name} has the shape {data.shape}; frames are [n, v, u]')
+        return Frames(str(path), len(data), data.shape[1:], data.dtype, lambda i: data[i])
+
+    if 'exchange/data' in file:  # DXchange
+        group = file['exchange']
+        flats, darks = (stack(group[name]) if name in group else None for name in ('data_white', 'data_dark'))
+        angles = np.asarray(group['theta'], float).ravel() if 'theta' in group else None
+        if angles is not None and _unit(group['theta']).startswith('rad'):
+            angles = np.degrees(angles)
+        return Recording(stack(group['data']), flats, darks, angles)
+    entry = _nxtomo(file)
+    if entry is None:
+        raise InputError(f'{path}: is neither DXchange (/exchange/data) nor NXtomo (instrument/detector/data)')
+    detector = entry['instrument/detector']
+    every = stack(detector['data'])
+    key = np.asarray(detector['image_key'], int) if 'image_key' in detector else np.zeros(len(every), int)
+    if key.shape != (len(every),):
+        raise InputError(f'{path}: image_key has {key.size} entries for {len(every)} frames; these must agree')
+
+    def of(kind):
+        return every.subset(np.flatnonzero(key == kind)) if (key == kind).any() else None
+
+    views = of(0)
+    if views is None:
+        raise InputError(f'{path}: image_key marks no projection (0); nothing can be imported')
+    angles = None
+    if 'sample/rotation_angle' in entry:
+        data = entry['sample/rotation_angle']
+        angles = np.asarray(data, float).ravel()
+        angles = np.degrees(angles) if _unit(data).startswith('rad') else angles
+        angles = angles[key == 0] if len(angles) == len(key) else angles
+    return Recording(views, of(1), of(2), angles)
+
+
+def _nxtomo(file):
+    """The first group with instrument/detector/data, among the root, its entries and their subentries."""
+    groups = [file, *file.values()]
+    for group in list(groups):
+        if hasattr(group, 'values') and group is not file:
+            groups += list(group.values())
+    return next((g for g in groups if hasattr(g, 'values') and 'instrument/detector/data' in g), None)
+
+
+def _unit(data):
+    unit = data.attrs.get('units', 'degree')
+    return (unit.decode() if isinstance(unit, bytes) else str(unit)).lower()

@@ -1,0 +1,128 @@
+"""From counts to line integrals: ln of the flat field over the view, both without the dark one.
+
+    p = ln( (flat - dark) exposure / (view - dark) )
+
+Without flats, the air level of each view stands for the flat field: its mean in a region of air, or a high percentile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from lingo_mi.errors import InputError
+from lingo_mi.raw.frames import Frames
+
+DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
+DIFFERENCE = (1, -4, 6, -4, 1)
+HOT = 0.05  # and one whose dark count is that part of the flat's counts off its neighbours'
+
+
+@dataclass(frozen=True)
+class Fields:
+    """What the panel shows without an object.
+
+    dark      [v, u], counts
+    flat      [v, u], counts above the dark ones; None without flats
+    good      bool [v, u]: neither dead nor hot
+    photons   a pixel of a flat, from the scatter of the flats; None with fewer than two
+    """
+
+    dark: np.ndarray
+    flat: np.ndarray | None
+    good: np.ndarray
+    photons: float | None
+
+
+def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None) -> Fields:
+    """The mean dark and flat field, the pixels that are good, and the photons of a pixel.
+
+    Photons are those of a Poisson signal of the same scatter: mean^2 / variance of a pixel over the flats, each divided by its
+    brightness first. Raises InputError where a panel has another size than `shape`, or the flats are no brighter than dark.
+    """
+    for name, frames in (('flats', flats), ('darks', darks)):
+        if frames is not None and frames.shape != shape:
+            raise InputError(f'{frames.where}: the {name} have {frames.shape} pixels, but the views have {shape}')
+    dark = np.zeros(shape)
+    if darks is not None:
+        for i in range(len(darks)):
+            dark += darks[i] / len(darks)
+    good = np.isfinite(dark)
+    if flats is None:
+        return Fields(dark, None, good & _near(dark, np.ptp(np.percentile(dark, [5, 95]))), None)
+    total, square = np.zeros(shape), np.zeros(shape)
+    bright = np.zeros(len(flats))
+    for i in range(len(flats)):
+        frame = flats[i] - dark
+        bright[i] = np.median(frame)
+        if not bright[i] > 0:
+            raise InputError(
+                f'{flats.where}: flat {i} is not brighter than the dark frames; are flats and darks swapped?'
+            )
+        total += frame / bright[i]
+        square += (frame / bright[i]) ** 2
+    n = len(flats)
+    mean = total / n
+    flat = mean * bright.mean()
+    local = median_filter(mean, 5)
+    good &= np.isfinite(flat) & (flat > 0) & (np.abs(mean - local) < DEAD * local) & _near(dark, flat)
+    photons = None
+    if n > 1 and good.any():
+        spread = np.maximum(square - n * mean**2, 0)[good] / (n - 1) / mean[good] ** 2
+        photons = float(1 / spread.mean()) if spread.mean() > 0 else None
+    return Fields(dark, flat, good, photons)
+
+
+def _near(dark, signal):
+    """Where dark counts are like their neighbours'."""
+    off = np.abs(dark - median_filter(dark, 5))
+    return off <= np.maximum(HOT * np.median(signal), 12 * 1.4826 * np.median(off) + 1)
+
+
+def line_integrals(
+    view: np.ndarray, known: Fields, bins: tuple[int, int], exposure: float = 1.0, saturation: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Line integrals of one view [v, u], and the mask of its valid pixels [v, u].
+
+    view         counts [v, u]
+    bins         (v, u) pixels that become one: their counts are added, bad ones left out, before the logarithm
+    exposure     of this view over that of the flats; without flats its air level in counts
+    saturation   counts from here on are not valid
+
+    A binned pixel with fewer than half of its pixels good is not valid, nor one without counts.
+    """
+    counts = view - known.dark
+    good = known.good & np.isfinite(counts) & (view < saturation)
+    full = np.full(view.shape, exposure) if known.flat is None else known.flat * exposure
+    bv, bu = bins
+    rows, columns = view.shape[0] // bv, view.shape[1] // bu
+
+    def summed(values):
+        return values[: rows * bv, : columns * bu].reshape(rows, bv, columns, bu).sum((1, 3))
+
+    signal, air = (summed(np.where(good, x, 0)) for x in (counts, full))
+    valid = (2 * summed(good.astype(float)) >= bv * bu) & (signal > 0) & (air > 0)
+    return np.log(np.where(valid, air, 1) / np.where(valid, signal, 1)), valid
+
+
+def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) -> float:
+    """Photons a pixel before the object, from how line integrals [view, v, u] scatter from column to column.
+
+    The variance of a line integral p is exp(p) / photons. Fourth differences along rows remove what is smooth, their median
+    what has edges. Pixels that a detector's blur correlates look less noisy, so this is then too many. inf without noise.
+    """
+    p = np.asarray(projections, np.float64)
+    n = p.shape[-1] - len(DIFFERENCE) + 1
+    if n < 1:
+        return np.inf
+    parts = [(w, slice(k, k + n)) for k, w in enumerate(DIFFERENCE)]
+    difference = sum(w * p[..., part] for w, part in parts)
+    power = sum(w**2 * np.exp(p[..., part]) for w, part in parts)
+    scaled = np.abs(difference) / np.sqrt(power)
+    if valid is not None:
+        scaled = scaled[np.logical_and.reduce([valid[..., part] for _, part in parts])]
+    scaled = scaled[scaled > 0]  # where all are exactly alike there was nothing to count
+    sigma = 1.4826 * np.median(scaled) if scaled.size else 0.0
+    return float(1 / sigma**2) if sigma > 0 else np.inf

@@ -1,0 +1,87 @@
+"""Nikon's .xtekct: the circle of an XT H scanner, and the level of its unattenuated beam."""
+
+from __future__ import annotations
+
+import configparser
+import warnings
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import one_line, reading
+
+
+def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
+    """A circular scan in the names of `lingo_mi.files.scanner_dict` (mm, angles in degrees), and the white level in counts.
+
+    Seen from the source, Nikon's columns run to the left: `frame[:, ::-1]` goes with these numbers. CentreOfRotationTop and
+    -Bottom, mm on the panel, become COR. Raises InputError where the file is missing or damaged, or lacks a number.
+    """
+    path = Path(path)
+    parser = configparser.ConfigParser(strict=False, interpolation=None)
+    with reading(path):
+        try:
+            parser.read_string(path.read_text(encoding='utf-8', errors='replace'))
+        except configparser.Error as error:
+            raise InputError(f'{path}: is no .xtekct file ({one_line(error)[:120]})') from None
+    if not parser.has_section('XTekCT'):
+        raise InputError(f'{path}: has no section [XTekCT]; give the .xtekct of the scan')
+    section = parser['XTekCT']
+
+    def number(name, default=None):
+        try:
+            value = float(section[name]) if default is None or name in section else float(default)
+        except KeyError:
+            raise InputError(f'{path}: {name} is missing; give the .xtekct of the scan') from None
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise InputError(f'{path}: {name} must be a number, not {section[name]!r}')
+        return value
+
+    n = int(number('Projections'))
+    DSO, DSD = number('SrcToObject'), number('SrcToDetector')
+    if n < 1 or not DSD >= DSO > 0:
+        raise InputError(f'{path}: needs Projections >= 1 and SrcToDetector >= SrcToObject > 0')
+    top, bottom = number('CentreOfRotationTop', 0), number('CentreOfRotationBottom', 0)
+    unread = [name for name in ('DetectorOffsetX', 'DetectorOffsetY', 'ObjectTilt', 'ObjectRoll') if number(name, 0)]
+    if top != bottom:
+        unread.append('the slope between CentreOfRotationTop and CentreOfRotationBottom')
+    if unread:
+        warnings.warn(
+            f'{path}: {", ".join(unread)} is not read; `lingo-mi inspect` measures an axis offset', stacklevel=2
+        )
+    values = dict(
+        DSO=DSO,
+        DSD=DSD,
+        nDetector=[int(number('DetectorPixelsY')), int(number('DetectorPixelsX'))],
+        dDetector=[number('DetectorPixelSizeY'), number('DetectorPixelSizeX')],
+        angles=(number('InitialAngle', 0) + number('AngularStep') * np.arange(n)).tolist(),
+    )
+    if top + bottom:
+        values['COR'] = (top + bottom) / 2 * DSO / DSD
+    return values, number('WhiteLevel', 0)
+
+
+def read_numbers(path: PathLike | str) -> np.ndarray:
+    """Numbers [n] of a text file: one a line, or the second column, after the number of the view, as angles in Nikon's .ang.
+
+    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left.
+    """
+    found = []
+    with reading(path):
+        lines = Path(path).read_text(encoding='utf-8', errors='replace').splitlines()
+    for line in lines:
+        cells = line.replace(':', ' ').replace(',', ' ').replace(';', ' ').split()
+        try:
+            numbers = [float(cell) for cell in cells]
+        except ValueError:
+            continue
+        if numbers:  # number and angle; further columns, such as times, follow
+            found.append(numbers[min(1, len(numbers) - 1)])
+    if not found or not np.isfinite(found).all():
+        raise InputError(f'{path}: holds no numbers; write one a line')
+    return np.array(found)

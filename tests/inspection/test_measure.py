@@ -1,0 +1,92 @@
+"""A sound scan raises no alarm; what is wrong is noticed, and a small error is measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from lingo_mi.geometry import circular
+from lingo_mi.inspection.measure import look
+
+PIXELS, SIZE = 96, 40
+
+
+def scanned(name, mode='cone', views=25, total=360.0):
+    """A view of 12 degrees half a fan; the panel is higher than the object."""
+    phantom = lm.phantom(name, SIZE)
+    side = max(phantom.spacing) * SIZE
+    sizes = dict(nDetector=(110, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views, total))
+    if mode == 'cone':
+        geometry = lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.4 / PIXELS, **sizes)
+    else:
+        geometry = lm.Geometry.parallel(dDetector=side * 1.45 / PIXELS, **sizes)
+    return lm.simulate(phantom, geometry, progress=False).train
+
+
+@pytest.fixture(scope='module')
+def foot():
+    return scanned('foot')
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('name', ['foot', 'chest', 'shepp_logan', pytest.param('gaussians', marks=pytest.mark.slow)])
+@pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
+def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
+    assert look(scanned(name, mode, views, total)).advice == []
+
+
+def only(scan, words):
+    (advice,) = look(scan).advice
+    assert words in advice
+    return look(scan)
+
+
+def test_axis_offset_is_measured(foot):
+    """Three columns, to a tenth."""
+    moved = lm.Scan(foot.geometry, np.roll(foot.projections, 3, 2))
+    found = only(moved, 'the axis is off: add')
+    shift = float(next(fact for fact in found.facts if fact.startswith('axis')).split()[1])
+    assert shift == pytest.approx(-3 * foot.geometry.dDetector[1], abs=0.1 * foot.geometry.dDetector[1])
+    mended = lm.Scan(replace(foot.geometry, offDetector=(0, shift)), moved.projections)
+    assert look(mended).advice == []
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_views_in_each_others_place(mode):
+    scan = scanned('foot', mode)
+    p = scan.projections.copy()
+    p[[3, 5]] = p[[5, 3]]
+    assert sorted(only(lm.Scan(scan.geometry, p), "views 3 and 5 fit better in each other's place").suspects) == [3, 5]
+
+
+def test_doubled_and_black_views(foot):
+    p = foot.projections.copy()
+    p[4] = p[3]
+    assert only(lm.Scan(foot.geometry, p), 'view 4 is the same as the one before').suspects == [4]
+    p = foot.projections.copy()
+    p[7] = 0
+    assert only(lm.Scan(foot.geometry, p), 'view 7 is black or empty').suspects == [7]
+
+
+def test_sense_and_unit_of_angles(foot):
+    angles = foot.geometry.angles
+    only(lm.Scan(replace(foot.geometry, angles=-angles), foot.projections), 'change the sign of the angles')
+    only(lm.Scan(replace(foot.geometry, angles=np.degrees(angles)), foot.projections), 'they look like degrees')
+    only(lm.Scan(replace(foot.geometry, angles=np.radians(angles)), foot.projections), 'they look like radians')
+
+
+def test_air_and_truncation(foot):
+    found = only(lm.Scan(foot.geometry, foot.projections + 3), 'instead of 0: import again with --air')
+    assert found.air == pytest.approx(3, abs=0.1)
+    cut = lm.Scan(replace(foot.geometry, nDetector=(110, 40)), foot.projections[:, :, 28:68])
+    assert any('left or right edge' in line and '-D outside=ignore' in line for line in look(cut).advice)
+
+
+def test_noise(foot):
+    """Photons to 20 %."""
+    rng = np.random.default_rng(0)
+    p = foot.projections / foot.projections.max() * 2
+    noisy = -np.log(rng.poisson(2e4 * np.exp(-p)) / 2e4)
+    fact = next(fact for fact in look(lm.Scan(foot.geometry, noisy)).facts if fact.startswith('noise'))
+    assert float(fact.split(' of ')[1].split()[0]) == pytest.approx(2e4, rel=0.2)

@@ -1,0 +1,243 @@
+"""Raw frames to line integrals: the truth comes back, from every layout, and what is wrong is said in one line."""
+
+import warnings
+
+import numpy as np
+import pytest
+import yaml
+
+import lingo_mi as lm
+from helpers.raw_frames import raw_frames
+from lingo_mi.raw.importing import Options, import_raw
+from lingo_mi.raw.line_integrals import photons_of_images
+
+tifffile = pytest.importorskip('tifffile')
+
+
+@pytest.fixture(scope='module')
+def raw():
+    return raw_frames()
+
+
+@pytest.fixture
+def scan_yml(tmp_path):
+    values = dict(DSO=100, DSD=150, dDetector=[1, 1], nVoxel=[16, 16, 16], dVoxel=1, angles=list(range(0, 360, 60)))
+    path = tmp_path / 'scan.yml'
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def load(frames, geometry, **options):
+    return lm.load_raw(frames, geometry, progress=False, **options)
+
+
+def save(tmp_path, raw):
+    for name in ('views', 'flats', 'darks'):
+        np.save(tmp_path / f'{name}.npy', getattr(raw, name))
+    return dict(flats=tmp_path / 'flats.npy', darks=tmp_path / 'darks.npy')
+
+
+def check(scan, raw):
+    """Line integrals within five of their own standard deviations, the mask exactly the bad pixels."""
+    valid = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
+    np.testing.assert_array_equal(valid, np.broadcast_to(~raw.bad, valid.shape))
+    sigma = np.sqrt(np.exp(raw.truth) / raw.photons * (1 + 1 / 20) * 1.3)
+    assert (np.abs(scan.projections - raw.truth)[valid] < 5 * sigma[valid]).all()
+    assert abs((scan.projections - raw.truth)[valid].mean()) < 1e-3
+
+
+def write_tiff_folder(folder, stack):
+    folder.mkdir()
+    for i, image in enumerate(stack):
+        tifffile.imwrite(folder / f'a_{i}.tif', image)  # a_10 sorts after a_9
+
+
+def test_truth_comes_back(tmp_path, raw, scan_yml):
+    check(load(save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, **save(tmp_path, raw)), raw)
+
+
+def test_tiff_folders(tmp_path, scan_yml):
+    raw = raw_frames(n=12)
+    scan_yml.write_text(scan_yml.read_text().replace('angles: [0, 60, 120, 180, 240, 300]', ''))
+    values = yaml.safe_load(scan_yml.read_text())
+    values['angles'] = list(range(0, 360, 30))
+    scan_yml.write_text(yaml.safe_dump(values))
+    for name in ('views', 'flats', 'darks'):
+        write_tiff_folder(tmp_path / name, getattr(raw, name))
+    check(load(tmp_path / 'views', scan_yml, flats=tmp_path / 'flats', darks=tmp_path / 'darks'), raw)
+
+
+def test_tiff_stack(tmp_path, raw, scan_yml):
+    for name in ('views', 'flats', 'darks'):
+        tifffile.imwrite(tmp_path / f'{name}.tif', getattr(raw, name), photometric='minisblack')
+    check(load(tmp_path / 'views.tif', scan_yml, flats=tmp_path / 'flats.tif', darks=tmp_path / 'darks.tif'), raw)
+
+
+def test_edf_of_several_frames(tmp_path, raw, scan_yml):
+    image = pytest.importorskip('fabio').edfimage.EdfImage(data=raw.views[0])
+    for view in raw.views[1:]:
+        image.append_frame(data=view)
+    image.write(str(tmp_path / 'views.edf'))
+    check(load(tmp_path / 'views.edf', scan_yml, **save(tmp_path, raw)), raw)
+
+
+def test_edf(tmp_path, raw, scan_yml):
+    edf = pytest.importorskip('fabio').edfimage.EdfImage
+    (tmp_path / 'views').mkdir()
+    for i, image in enumerate(raw.views):
+        edf(data=image).write(str(tmp_path / 'views' / f'{i}.edf'))
+    check(load(tmp_path / 'views', scan_yml, **save(tmp_path, raw)), raw)
+
+
+@pytest.mark.parametrize('layout', ['dxchange', 'nxtomo'])
+@pytest.mark.parametrize('unit', ['degree', 'rad'])
+def test_hdf5(tmp_path, raw, scan_yml, layout, unit):
+    h5py = pytest.importorskip('h5py')
+    values = yaml.safe_load(scan_yml.read_text())
+    del values['angles']
+    scan_yml.write_text(yaml.safe_dump(values))
+    angles = np.arange(0, 360, 60.0) + 7
+    stored = np.radians(angles) if unit == 'rad' else angles
+    path = tmp_path / 'tomo.h5'
+    with h5py.File(path, 'w') as file:
+        if layout == 'dxchange':
+            for name, stack in (('data', raw.views), ('data_white', raw.flats), ('data_dark', raw.darks)):
+                file[f'exchange/{name}'] = stack
+            theta = file.create_dataset('exchange/theta', data=stored)
+        else:
+            file['entry/instrument/detector/data'] = np.concatenate([raw.darks, raw.flats, raw.views])
+            file['entry/instrument/detector/image_key'] = (
+                [2] * len(raw.darks) + [1] * len(raw.flats) + [0] * len(raw.views)
+            )
+            every = np.concatenate([np.zeros(len(raw.darks) + len(raw.flats)), stored])
+            theta = file.create_dataset('entry/sample/rotation_angle', data=every)
+        theta.attrs['units'] = unit
+    scan = load(path, scan_yml)
+    check(scan, raw)
+    np.testing.assert_allclose(np.degrees(scan.geometry.angles), angles)
+
+
+def test_photons(tmp_path, scan_yml):
+    """Twenty flats tell the photons to 5 %, the images to 15 %."""
+    raw = raw_frames(shape=(96, 160))
+    scan, history = import_raw(
+        save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, Options(**save(tmp_path, raw)), False
+    )
+    assert history['photons_from_flats'] == pytest.approx(raw.photons, rel=0.05)
+    assert photons_of_images(scan.projections, scan.valid) == pytest.approx(raw.photons, rel=0.15)
+
+
+def test_without_noise_exact(tmp_path, scan_yml):
+    """Rounding to counts is all that is left: half a count of 20 000 exp(-2)."""
+    raw = raw_frames(noise=False)
+    scan = load(save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, **save(tmp_path, raw))
+    assert np.abs(scan.projections - raw.truth)[scan.valid].max() < 1e-3
+
+
+def test_exposure_of_every_view(tmp_path, scan_yml):
+    exposure = np.linspace(0.5, 1.5, 6)
+    raw = raw_frames(exposure=exposure, noise=False)
+    scan = load(save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, exposure=exposure, **save(tmp_path, raw))
+    assert np.abs(scan.projections - raw.truth)[scan.valid].max() < 2e-3
+    by_air = load(tmp_path / 'views.npy', scan_yml, air=(0, 3, 0, 40), **save(tmp_path, raw))
+    assert np.abs(by_air.projections - raw.truth)[by_air.valid].max() < 2e-3
+
+
+def test_crop_binning_and_views_keep_the_rays(tmp_path, raw, scan_yml):
+    given = save(tmp_path, raw)
+    whole = load(tmp_path / 'views.npy', scan_yml, **given)
+    part = load(tmp_path / 'views.npy', scan_yml, crop=(4, 20, 6, 36), binning=2, views=(1, None, 2), **given)
+    assert part.projections.shape == (3, 8, 15)
+    rays, inner = whole.geometry.rays(), part.geometry.rays()
+    np.testing.assert_allclose(inner.corner, (rays.corner + 4 * rays.v + 6 * rays.u)[1::2], atol=1e-9)
+    np.testing.assert_allclose(inner.u, 2 * rays.u[1::2], atol=1e-12)
+    truth = -np.log(np.exp(-raw.truth)[1::2, 4:20, 6:36].reshape(3, 8, 2, 15, 2).mean((2, 4)))
+    assert np.abs(part.projections - truth).max() < 0.15  # three bad pixels of four would be refused
+    assert np.abs(part.projections - truth).mean() < 0.02
+
+
+def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
+    np.save(tmp_path / 'views.npy', raw.views)
+    with pytest.raises(lm.InputError, match='no flat frames; give --flats, or the air level'):
+        load(tmp_path / 'views.npy', scan_yml)
+    np.save(tmp_path / 'darks.npy', raw.darks)
+    with pytest.warns(UserWarning, match='brighter than the air level'):
+        scan = load(tmp_path / 'views.npy', scan_yml, darks=tmp_path / 'darks.npy', air=(0, 3, 0, 40))
+    # What is left of the gain, 20 %, is in the line integrals.
+    assert np.abs(scan.projections - raw.truth)[:, ~raw.bad].mean() < 0.12
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (dict(flats='small.npy'), 'the flats have .* pixels, but the views have'),
+        (dict(darks='small.npy'), 'the darks have .* pixels, but the views have'),
+        (dict(flats='darks.npy'), 'not brighter than the dark frames'),
+        (dict(crop=(0, 99, 0, 40)), r'crop = .* does not lie in a frame of \(24, 40\)'),
+        (dict(air=(0, 3, 0, 40), percentile=99.0), 'give one of them'),
+        (dict(views=(9, None, 1)), 'no view is left of 6'),
+        (dict(exposure=[1, 2]), 'one for each of 6 views'),
+        (dict(angles=[1.0, 2.0]), 'there are 2 angles for 6 views'),
+        (dict(bining=2), "no option 'bining', did you mean binning"),
+    ],
+)
+def test_refused_in_one_line(tmp_path, raw, scan_yml, change, message):
+    given = save(tmp_path, raw)
+    np.save(tmp_path / 'small.npy', raw.flats[:, :5])
+    change = {name: tmp_path / value if isinstance(value, str) else value for name, value in change.items()}
+    with pytest.raises(lm.InputError, match=message) as caught:
+        load(tmp_path / 'views.npy', scan_yml, **{**given, **change})
+    assert '\n' not in str(caught.value) and len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+def test_frames_of_different_sizes(tmp_path, raw, scan_yml):
+    write_tiff_folder(tmp_path / 'v', raw.views)
+    tifffile.imwrite(tmp_path / 'v' / 'a_3.tif', raw.views[3, :-1])
+    with pytest.raises(lm.InputError, match=r'a_3.tif: has the shape \(23, 40\), but a_0.tif has \(24, 40\)'):
+        load(tmp_path / 'v', scan_yml, **save(tmp_path, raw))
+
+
+def test_damaged_frame(tmp_path, raw, scan_yml):
+    write_tiff_folder(tmp_path / 'v', raw.views)
+    (tmp_path / 'v' / 'a_2.tif').write_bytes(b'II*\0broken')
+    with pytest.raises(lm.InputError, match='a_2.tif: is damaged'):
+        load(tmp_path / 'v', scan_yml, **save(tmp_path, raw))
+
+
+def test_black_view_and_counts_above_the_flat_are_warned_of(tmp_path, scan_yml):
+    raw = raw_frames()
+    raw.views[2] = 0
+    given = save(tmp_path, raw)
+    with pytest.warns(UserWarning, match='view 2 is without counts'):
+        scan = load(tmp_path / 'views.npy', scan_yml, **given)
+    assert not scan.valid[2].any() and scan.valid[3].any()
+    raw = raw_frames(exposure=1.5)
+    given = save(tmp_path, raw)
+    with pytest.warns(UserWarning, match='6 views .* more than 10 % brighter than the air level'):
+        load(tmp_path / 'views.npy', scan_yml, **given)
+
+
+def test_import_writes_a_scan_with_its_history(tmp_path, raw, scan_yml, monkeypatch, capsys):
+    from lingo_mi.cli import main
+
+    given = save(tmp_path, raw)
+    out = tmp_path / 'out.npy'
+    args = ['lingo-mi', 'import', tmp_path / 'views.npy', '--geometry', scan_yml, '--out', out]
+    args += ['--flats', given['flats'], '--darks', given['darks'], '--views', '::2']
+
+    def run():
+        monkeypatch.setattr('sys.argv', [str(a) for a in args])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code
+
+    assert run() == 0
+    assert '3 views of 24 x 40 pixels' in capsys.readouterr().out
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        scan = lm.load(out).train
+    np.testing.assert_array_equal(scan.valid[0], ~raw.bad)
+    history = yaml.safe_load(out.with_suffix('.yml').read_text())['history']
+    assert history['views'] == [0, 5, 2] and history['bad_pixels'] == 8 and history['flats'].endswith('flats.npy (20)')
+    before = out.read_bytes()
+    assert run() == 2 and 'exists already; give --force' in capsys.readouterr().err and out.read_bytes() == before
