@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import re
+import secrets
 import shutil
 import stat
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -48,21 +52,32 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
         ) from None
 
 
+# What a kill may leave behind. The suffix stays at the end because several libraries choose the format by it.
+_TEMPORARY = '.lingo_mi-{}-{}'
+LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
+
+
 @contextmanager
-def _temporary(path, remove):
+def _temporary(path, make, remove):
     path = Path(path)
-    # The suffix stays at the end because several libraries choose the format by it.
-    temporary = path.with_name(f'.{os.getpid()}.{path.name}')
+    temporary = path.with_name(_TEMPORARY.format(secrets.token_hex(8), path.name[-40:]))
     try:
+        make(temporary)
         yield temporary
+        _flush(temporary)
         os.replace(temporary, path)
+        flush_folder(path.parent)
     except OSError as error:
         raise InputError(
             f'{path}: cannot be written ({error.strerror or one_line(error)}); '
-            'check that the folder exists and may be written to'
+            'check that the folder exists, may be written to, and has room'
         ) from None
     finally:
         remove(temporary)
+
+
+def _new_file(path):
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
 
 
 def _remove_file(path):
@@ -72,14 +87,52 @@ def _remove_file(path):
         pass
 
 
+def _flush(path):
+    """Wait until a file, or all files in a folder, are on the disk: a name must never come before its content."""
+    if path.is_dir():
+        for part in path.iterdir():
+            _flush(part)
+        flush_folder(path)
+        return
+    file = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def flush_folder(path: PathLike | str) -> None:
+    """Wait until the names in a folder are on the disk, where the system can."""
+    if not hasattr(os, 'O_DIRECTORY'):
+        return
+    folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):  # some file systems cannot
+            raise
+    finally:
+        os.close(folder)
+
+
 @contextmanager
 def replacing(path: PathLike | str) -> Iterator[Path]:
-    """Yields a temporary path beside `path`, which takes its place when the block ends without an error.
+    """Yields a new, empty file beside `path`, which takes its place when the block ends without an error.
 
-    Raises InputError if the file cannot be written.
+    Its content is on the disk before it has its name, so that `path` is the old file or the new one also after a crash. Where
+    `path` is a link, the link is replaced, not what it points to. Raises InputError if the file cannot be written.
     """
-    with _temporary(path, _remove_file) as temporary:
+    with _temporary(path, _new_file, _remove_file) as temporary:
         yield temporary
+
+
+def write_text(path: PathLike | str, text: str) -> None:
+    """Write a text file as UTF-8, whole or not at all; characters that have no UTF-8 are escaped.
+
+    Raises InputError if it cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(text.encode('utf-8', 'backslashreplace'))
 
 
 @contextmanager
@@ -91,8 +144,7 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
         raise InputError(f'{path}: exists already; remove it or give another name')
-    with _temporary(path, lambda folder: shutil.rmtree(folder, ignore_errors=True)) as temporary:
-        temporary.mkdir()
+    with _temporary(path, Path.mkdir, lambda folder: shutil.rmtree(folder, ignore_errors=True)) as temporary:
         yield temporary
 
 
@@ -118,9 +170,8 @@ def require_writable(folder: Path, path: Path, mend: str = 'choose another place
             if not part.exists():
                 part.mkdir()
                 made.append(part)
-        probe = folder / '.writable'
-        probe.touch()
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=folder):  # of a name that no file has
+            pass
     except OSError as error:
         raise InputError(f'{path}: cannot write there ({error.strerror}); {mend}') from None
     finally:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import beside, reading
+from lingo_mi.file_access import beside, reading, replacing, require_writable, write_text
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
@@ -56,3 +56,43 @@ def test_no_reader_waits_for_a_pipe_or_reads_a_device(tmp_path, name, kind):
 def test_names_that_are_none(path):
     with pytest.raises(InputError), reading(path):
         pass
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    path = tmp_path / 'a.txt'
+    path.write_text('old')
+    with pytest.raises(RuntimeError), replacing(path) as temporary:
+        assert temporary.parent == tmp_path and temporary.name.endswith('a.txt') and temporary.stat().st_size == 0
+        temporary.write_text('new')
+        raise RuntimeError
+    assert path.read_text() == 'old' and os.listdir(tmp_path) == ['a.txt']
+    write_text(path, 'new \udcff')
+    assert path.read_text() == 'new \\udcff' and os.listdir(tmp_path) == ['a.txt']
+
+
+def test_the_content_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
+    done = []
+    for name in ('fsync', 'replace'):
+        own = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, own=own, name=name: done.append(name) or own(*a))
+    write_text(tmp_path / 'a', 'x')
+    assert done == ['fsync', 'replace', 'fsync']
+
+
+def test_links_are_not_followed_for_writing(tmp_path):
+    (tmp_path / 'other').write_text('mine')
+    (tmp_path / 'a').symlink_to(tmp_path / 'other')
+    write_text(tmp_path / 'a', 'new')
+    assert (tmp_path / 'other').read_text() == 'mine' and (tmp_path / 'a').read_text() == 'new'
+
+
+def test_names_of_any_length_and_bytes(tmp_path):
+    for name in ('a' * 251 + '.txt', 'ä' * 127, os.fsdecode(b'\xff' * 200)):
+        write_text(tmp_path / name, 'x')
+        assert (tmp_path / name).read_text() == 'x'
+
+
+def test_the_probe_has_a_name_of_its_own(tmp_path):
+    (tmp_path / '.writable').write_text('mine')
+    require_writable(tmp_path, tmp_path)
+    assert (tmp_path / '.writable').read_text() == 'mine' and os.listdir(tmp_path) == ['.writable']

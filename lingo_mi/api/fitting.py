@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import nullcontext
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,13 @@ from typing import Any
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, require_writable, writing
-from lingo_mi.fitting.checkpoint import CHECKPOINT
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import between_steps
+from lingo_mi.output_folder import CHECKPOINT
 from lingo_mi.parsing import whole
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure
@@ -67,11 +69,13 @@ def fit(
         with writing(path):
             if path.is_dir():
                 raise InputError(f'{path}: is a folder; name a file in it, such as {path / CHECKPOINT}')
+            if path.is_symlink():
+                raise InputError(f'{path}: is a link, which is not written to; name the file itself')
             if path.exists() and not resume:
                 raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
         require_writable(path.parent, path)
-    cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
-    with tempfile.TemporaryDirectory() as folder, between_steps() as check:
+    with _lock(path), tempfile.TemporaryDirectory() as folder, between_steps() as check:
+        cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
         # Kept even where nobody names a file: `Result.save` writes it.
         file = Path(folder) / CHECKPOINT if path is None else path
         with Progress('Fit', chosen.iterations, shown=progress) as bar:
@@ -82,3 +86,10 @@ def fit(
 
             fitted = run(dataset.train, chosen, cloud, seed, quick_measure(dataset), report, file)
         return Result(fitted, name, file.read_bytes(), dataset)
+
+
+def _lock(path: Path | None):
+    """Keeps other processes from writing a checkpoint; its folder may hold those of several fits."""
+    if path is None:
+        return nullcontext()
+    return locked(path.parent, LOCK if path.name == CHECKPOINT else f'{LOCK}-{path.name}')

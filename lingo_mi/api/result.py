@@ -14,15 +14,26 @@ import numpy as np
 
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, replacing, writing
-from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.folder_lock import locked
 from lingo_mi.geometry import Geometry
 from lingo_mi.metrics import current_names
+from lingo_mi.output_folder import (
+    CHECKPOINT,
+    CLOUD,
+    METRICS,
+    SCENE,
+    begin,
+    clear_leftovers,
+    occupants,
+    require_ours,
+    require_together,
+)
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import Measured, measure
-from lingo_mi.results.save import report_data, save
+from lingo_mi.results.save import report_data, result_names, save
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
 
@@ -140,18 +151,23 @@ class Result:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz; returns the folder.
 
         title   of the report (default: the folder's name)
-        force   replace an earlier result
+        force   replace an earlier result; other files in the folder are left alone
 
-        Raises InputError where the folder holds files already, or cannot be written.
+        Raises InputError where the folder holds files already, cannot be written, or another process writes to it.
         """
         folder = as_path('folder', folder)
         with writing(folder):
-            if folder.is_dir() and any(folder.iterdir()) and not force:
+            if folder.is_dir() and occupants(folder) and not force:
                 raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
-            folder.mkdir(parents=True, exist_ok=True)
+        measured = self._measured  # takes a while, and may fail: before anything is touched
+        views = 0 if measured.views is None else len(measured.views)
+        with locked(folder), writing(folder):
+            clear_leftovers(folder)
+            require_ours(folder, result_names(measured.volume is not None, views) | {CHECKPOINT})
             with replacing(folder / CHECKPOINT) as temporary:
                 temporary.write_bytes(self._checkpoint)
-            save(folder, self.fitted, self._measured, title=title or folder.name, method=self.recipe)
+                begin(folder, [CHECKPOINT])
+            save(folder, self.fitted, measured, title=title or folder.name, method=self.recipe)
         return folder
 
     def __repr__(self) -> str:
@@ -169,7 +185,7 @@ class Result:
 def load_result(path: str | PathLike) -> Result:
     """A result from the folder that `Result.save` or the command line wrote, or from a checkpoint (.npz) alone.
 
-    Raises InputError where there is no result, or it is damaged.
+    Raises InputError where there is no result, or it is damaged, or of files that do not belong together.
 
         result = lm.load_result('out/foot')
     """
@@ -180,6 +196,8 @@ def load_result(path: str | PathLike) -> Result:
         raise InputError(
             f'{path}: there is no result here; give a folder that Result.save or lingo-mi fit wrote, or its {CHECKPOINT}'
         )
+    if path.is_dir():
+        require_together(path, [SCENE, CLOUD, CHECKPOINT])
     fitted, numbers = Fitted.from_checkpoint(file), file.with_name(METRICS)
     stored = None
     if path.is_dir() and numbers.exists():

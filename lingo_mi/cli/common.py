@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import shlex
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError, brief, shown
 from lingo_mi.file_access import require_writable
+from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
 MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 
@@ -31,6 +33,8 @@ def guard(main: Callable[[], int | None]) -> None:
 
     Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be text
+        sys.stdout.reconfigure(errors='backslashreplace')
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', RuntimeWarning)
@@ -186,21 +190,31 @@ def definitions(pairs: Iterable[str]) -> dict[str, str]:
     return out
 
 
-def writable_folder(path: Path, force: bool, resume: bool, owns: str) -> Path:
-    """The output folder, which can be made and written to, or an error that refuses to spoil one.
+def writable_folder(path: Path, force: bool, resume: bool) -> Path:
+    """The folder of a result, which can be made and written to, or an error that refuses to spoil one.
 
     Leaves nothing behind.
 
-    owns   name of a file that tells an earlier result
     force, resume   whether a folder with files in it will do
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f'{path}: is a file, not a folder; choose another --out')
-    if path.is_dir() and any(path.iterdir()) and not (force or resume):
-        what = 'holds a result already' if (path / owns).exists() else 'is not empty'
-        raise InputError(f'{path}: {what}; add --resume to go on, --force to replace it, or choose another --out')
+    there = occupants(path) if path.is_dir() else []
+    if resume and CHECKPOINT not in there:
+        mend = 'run without --resume' + (', with --force' if there else '')
+        raise InputError(f'{path / CHECKPOINT}: there is no checkpoint to go on from; {mend}')
+    if there and not (force or resume):
+        what, mend = 'is not empty', '--force to write beside what is there'
+        if METRICS in there:
+            what, mend = 'holds a result already', '--force to replace it'
+        if CHECKPOINT in there:
+            what = what if METRICS in there else 'holds a fit that was not completed'
+            mend = '--resume to go on, --force to replace it'
+        raise InputError(f'{path}: {what}; add {mend}, or choose another --out')
     require_writable(path, path, 'choose another --out')
+    if path.is_dir():
+        require_ours(path, FILES)
     return path
 
 

@@ -26,7 +26,10 @@ from lingo_mi.cli.common import (
 )
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.folder_lock import locked
 from lingo_mi.interrupts import between_steps
+from lingo_mi.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers, require_ours
 from lingo_mi.parsing import nearest
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
@@ -69,13 +72,7 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.fitting.checkpoint import CHECKPOINT, METRICS
-    from lingo_mi.fitting.initial import initial_cloud
-    from lingo_mi.fitting.loop import run
-    from lingo_mi.progress import Progress
-    from lingo_mi.results.measure import measure, quick_measure, summary
-    from lingo_mi.results.save import save
-    from lingo_mi.scene.load import defaults, load_scene
+    from lingo_mi.scene.load import defaults
 
     check_input(args)
     check_seed(args.seed)
@@ -95,12 +92,27 @@ def main() -> None:
             + (nearest(unknown[0], [*own, *known]) or '; the documentation of Settings lists those')
         )
     settings = METHODS[args.method].changed(**given)
-    folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume, METRICS)
+    folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume)
+    with locked(folder):
+        clear_leftovers(folder)
+        fit_into(folder, args, settings, {k: v for k, v in defined.items() if k in own})
 
-    if args.resume and not (folder / CHECKPOINT).exists():
-        raise InputError(f'{folder / CHECKPOINT}: there is no checkpoint to resume from; run without --resume')
-    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
+
+def fit_into(folder: Path, args: argparse.Namespace, settings: Settings, parameters: dict[str, str]) -> None:
+    """Fit, and write the result into a folder that no other process writes to.
+
+    parameters   of the scene file
+    """
+    from lingo_mi.fitting.initial import initial_cloud
+    from lingo_mi.fitting.loop import run
+    from lingo_mi.progress import Progress
+    from lingo_mi.results.measure import measure, quick_measure, summary
+    from lingo_mi.results.save import result_names, save
+    from lingo_mi.scene.load import load_scene
+
+    scene = load_scene(args.scene, parameters)
     scan = read_input(args, scene, args.views, args.seed)
+    require_ours(folder, result_names(settings.volumetric, 0 if scan.test is None else len(scan.test)))
     cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
     with Progress('Fit', settings.iterations) as bar, between_steps() as check:
 
@@ -122,5 +134,5 @@ def main() -> None:
         command=command_line(),
     )
     print(summary(result))
-    written = ('report.html', 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'metrics.json')
-    print(f'{folder}/: {", ".join(name for name in written if (folder / name).exists())}')
+    written = [name for name in (PAGE, VOLUME, CLOUD, SCENE, METRICS) if (folder / name).exists()]
+    print(f'{folder}/: {", ".join(written)}')

@@ -20,10 +20,13 @@ it, which says how.
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lingo_mi.cli.common import Parser, writable_folder
+from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
 from lingo_mi.fitting.recipes import METHODS, settings_of
+from lingo_mi.folder_lock import locked
 from lingo_mi.runtime import use_variant
 
 ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer'
@@ -78,7 +81,7 @@ def main() -> None:
     use_variant(args.variant)
     from lingo_mi.studies.tables.cells import SCALES, SCANNED, Cells
     from lingo_mi.studies.tables.objects import available
-    from lingo_mi.studies.tables.report import groups, plan, write
+    from lingo_mi.studies.tables.report import groups, plan
 
     scale = replace(SCALES[args.scale], finer=args.finer)
     views = sorted(set(args.views or ((25,) if args.table == 'ablation' else (5, 10, 25))))
@@ -94,7 +97,10 @@ def main() -> None:
     for method in args.methods:
         settings_of(method)
     objects = available(dict.fromkeys(args.objects or scale.objects), print)
-    folder = writable_folder(args.out or Path('out/tables') / args.scale, True, True, '')
+    folder = args.out or Path('out/tables') / args.scale
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f'{folder}: is a file, not a folder; choose another --out')
+    require_writable(folder, folder, 'choose another --out')
     cells = Cells(folder, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     planned = plan(rows, objects)
@@ -103,6 +109,15 @@ def main() -> None:
             f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
             'are no densities; add other --algorithms or --methods'
         )
+    with locked(folder):
+        compute(args, cells, rows, objects)
+
+
+def compute(args: argparse.Namespace, cells: Any, rows: list, objects: list[str]) -> None:
+    """Compute what is missing of a table's cells, and write the table, in a folder that no other process writes to."""
+    from lingo_mi.studies.tables.report import plan, write
+
+    planned = plan(rows, objects)
     failed = cells.compute_missing(planned, lambda: write(args.table, rows, objects, cells, args.scale))
     print(write(args.table, rows, objects, cells, args.scale))
     print(f'{cells.folder}/: {args.table}.md, {args.table}.json, {args.table}.provenance.json')

@@ -10,10 +10,10 @@ import numpy as np
 
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.checkpoint import METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.poses import Poses
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.output_folder import CLOUD, METRICS, require_together
 from lingo_mi.projectors.objects import Ellipsoids, find_objects
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import render_objects
@@ -57,8 +57,10 @@ class FittedCloud:
 def load_cloud(path: Path | str) -> FittedCloud | Fitted:
     """The cloud of a scene such as a fit's result.xml, or a fit by alpha compositing from its checkpoint (.npz).
 
-    Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError for any other file.
+    Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError for any other file, and for one of a
+    result whose files do not belong together.
     """
+    require_together(Path(path).parent, [Path(path).name, CLOUD])
     if Path(path).suffix == '.npz':
         return _composited(path)
     loaded = load_scene(Path(path))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,8 +30,21 @@ def write_exr(path: PathLike | str, image: np.ndarray) -> None:
     image = np.ascontiguousarray(numeric(np.asarray(image), path, 2), np.float32)
     header = {'compression': OpenEXR.ZIP_COMPRESSION, 'type': OpenEXR.scanlineimage}
     with replacing(path) as temporary:
-        open(temporary, 'wb').close()  # the file system's errors are clearer than the library's
-        OpenEXR.File(header, {'Y': OpenEXR.Channel(image)}).write(str(temporary))
+        _write(OpenEXR.File(header, {'Y': OpenEXR.Channel(image)}), temporary)
+
+
+def _write(file: OpenEXR.File, path: Path) -> None:
+    """Write an image to a path of any name: the library takes none but those in UTF-8."""
+    try:
+        str(path).encode('utf-8')
+        file.write(str(path))
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            other = Path(folder) / 'image.exr'
+            file.write(str(other))
+            path.write_bytes(other.read_bytes())
+    except RuntimeError as error:  # the library's, for a disk that is full and the like
+        raise OSError(one_line(error)) from None
 
 
 def read_exr(path: PathLike | str) -> np.ndarray:

@@ -24,10 +24,11 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import replacing
 from lingo_mi.fitting.checkpoint_schema import VERSION, require_sound
 from lingo_mi.fitting.state import State
+from lingo_mi.output_folder import CHECKPOINT, begin
 
-METRICS, CHECKPOINT = 'metrics.json', 'checkpoint.npz'  # files of a result
 LONGEST_HEADER = 2**16  # bytes of a .npy's
 
 
@@ -36,6 +37,7 @@ def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = 
 
     arrays   further NumPy arrays to store, by name
 
+    One of the name checkpoint.npz is part of the result in its folder (see `output_folder.begin`).
     Raises InputError if it cannot be written.
     """
     path = Path(path)
@@ -49,18 +51,11 @@ def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = 
         **{f'array.{k}': v for k, v in (arrays or {}).items()},
     )
     content['checksum'] = np.array(_checksum((name, _Crc.of(array)) for name, array in content.items()))
-    temporary = path.with_name(path.name + '.partial')  # left behind only by a kill, then replaced by the next
-    try:
+    with replacing(path) as temporary:
         with open(temporary, 'wb') as file:
             np.savez(file, **content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(
-            f'{path}: cannot be written ({error.strerror or error}); make room, or name another folder'
-        ) from None
+        if path.name == CHECKPOINT:  # as late as can be: until then an old result in the folder is whole
+            begin(path.parent, [CHECKPOINT])
 
 
 def load(path: PathLike | str) -> tuple[State, dict, dict]:

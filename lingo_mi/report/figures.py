@@ -387,8 +387,9 @@ def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> b
 
     def draw(fig):
         parts = fig.subfigures(len(rows) + 1, 1, height_ratios=[1, *tallest], hspace=0)
-        parts[0].text(0.5, 0.66, data.title, ha='center', va='center', fontsize=20, weight='bold')
-        parts[0].text(0.5, 0.2, headline, ha='center', va='center', fontsize=13, color='#333333')
+        shown = dict(ha='center', va='center', parse_math=False)  # a name may have dollars
+        parts[0].text(0.5, 0.66, data.title, fontsize=20, weight='bold', **shown)
+        parts[0].text(0.5, 0.2, headline, fontsize=13, color='#333333', **shown)
         for part, row, own, height in zip(parts[1:], rows, heights, tallest):
             for sub, section, h in zip(np.ravel(part.subfigures(1, len(row), wspace=0.03)), row, own):
                 if h < 0.9 * height:  # align a lower section with the top of its neighbour

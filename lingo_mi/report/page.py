@@ -11,7 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, brief
+from lingo_mi.file_access import replacing, write_text
+from lingo_mi.output_folder import PAGE, PICTURE
 from lingo_mi.report import figures
 
 # Key of `ReportData.metrics`: label, unit, format.
@@ -58,7 +60,7 @@ HEADLINE = {
 class ReportData:
     """The contents of a report. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
 
-    title           of the report
+    title           of the report: any text, shown as it is, on one line of printable characters
     metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are shown as 'n/a'; other scalar
                     entries are listed with the settings. `history` is a list of dicts with `iteration`,
                     `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
@@ -130,6 +132,7 @@ class ReportData:
         for name in ('volume', 'views'):
             if getattr(self, name) is not None and getattr(self, name).size == 0:
                 raise InputError(f'{name} of the report is empty')
+        object.__setattr__(self, 'title', brief(self.title, 120))
         object.__setattr__(self, 'history', list(self.metrics.get('history') or []))
 
 
@@ -140,10 +143,12 @@ def write_report(folder: PathLike | str, data: ReportData) -> Path:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / 'report.png').write_bytes(figures.overview(data, headline(data.metrics)))
-    page = folder / 'report.html'
-    page.write_text(_page(data), encoding='utf-8')
-    return page
+    # Both are made before either is written, so that there are both or neither.
+    picture, page = figures.overview(data, headline(data.metrics)), _page(data)
+    with replacing(folder / PICTURE) as temporary:
+        temporary.write_bytes(picture)
+    write_text(folder / PAGE, page)
+    return folder / PAGE
 
 
 def headline(metrics: dict) -> str:

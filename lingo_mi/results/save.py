@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import time
+import warnings
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,13 +12,27 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.file_access import replacing
+from lingo_mi.errors import InputError, brief
+from lingo_mi.file_access import writing
 from lingo_mi.files.images import write_exr
 from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
-from lingo_mi.fitting.checkpoint import METRICS
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.models.alpha import harmonics
+from lingo_mi.output_folder import (
+    CHECKPOINT,
+    CLOUD,
+    METRICS,
+    PAGE,
+    PICTURE,
+    SCENE,
+    VIEWS,
+    VOLUME,
+    begin,
+    complete,
+    remove_others,
+    view_name,
+)
 from lingo_mi.report.page import ReportData, write_report
 from lingo_mi.results.measure import Measured
 from lingo_mi.results.scene_file import write_scene
@@ -28,9 +42,11 @@ def save(
     folder: Path, fitted: Fitted, measured: Measured, *, title: str = 'fit', method: str = '', command: str = ''
 ) -> dict:
     """Write all files into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
-    `metrics.json`, `report.png`, `report.html`. metrics.json is written last, so that it marks a complete result.
+    `report.png`, `report.html`, `metrics.json`. Files of an earlier result are replaced or removed, others are left alone.
+    metrics.json goes first and comes last, with a digest of all others and of the checkpoint beside them, so that it marks a
+    whole result (see `output_folder`). A report that cannot be drawn is a warning.
 
-    folder     an existing folder
+    folder     an existing folder, which no other process writes to
     measured   the measured fit
     title      of the report
     method     the recipe's name, for metrics.json and the report
@@ -40,18 +56,19 @@ def save(
     Raises InputError if a file cannot be written.
     """
     geometry, cloud = fitted.geometry, fitted.world_gaussians()
+    names = result_names(measured.volume is not None, 0 if measured.views is None else len(measured.views))
+    begin(folder, names)
+    if (folder / CHECKPOINT).exists():
+        names |= {CHECKPOINT}
+    remove_others(folder, names)
     if measured.volume is None:
-        for stale in 'volume.nii.gz', 'result.xml':
-            (folder / stale).unlink(missing_ok=True)
-        write_radiance_ply(folder / 'gaussians.ply', *cloud, *harmonics(fitted.state.values))
+        write_radiance_ply(folder / CLOUD, *cloud, *harmonics(fitted.state.values))
     else:
-        write_volume(
-            folder / 'volume.nii.gz', measured.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm'
-        )
-        write_ply(folder / 'gaussians.ply', *cloud, fitted.shares())
-        write_scene(folder / 'result.xml', fitted.corrected, fitted.settings.model.extent, fitted.effects)
+        write_volume(folder / VOLUME, measured.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+        write_ply(folder / CLOUD, *cloud, fitted.shares())
+        write_scene(folder / SCENE, fitted.corrected, fitted.settings.model.extent, fitted.effects)
     if measured.views is not None:
-        _write_views(folder / 'views', measured.views)
+        _write_views(folder, measured.views)
     numbers = measured.numbers | dict(
         method=method,
         seed=fitted.seed,
@@ -65,10 +82,23 @@ def save(
         test_angles=[] if measured.test is None else np.degrees(measured.test.geometry.angles).tolist(),
         versions=versions(),
     )
-    write_report(folder, report_data(fitted, replace(measured, numbers=numbers), title))
-    with replacing(folder / METRICS) as temporary:
-        temporary.write_text(json.dumps(numbers, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
-    return numbers
+    try:
+        write_report(folder, report_data(fitted, replace(measured, numbers=numbers), title))
+    except InputError:  # the disk is full, and the like
+        raise
+    except Exception as error:  # of the libraries that draw: the numbers are worth more than their picture
+        warnings.warn(
+            f'{folder}: the report could not be drawn ({brief(error, 150)}); all else is written', stacklevel=2
+        )
+        names -= {PICTURE, PAGE}
+        remove_others(folder, names)
+    return complete(folder, names - {METRICS}, numbers, default=np.generic.item)
+
+
+def result_names(volume: bool, views: int) -> frozenset[str]:
+    """The files that `save` writes: with a volume or without, and of so many held-out views."""
+    names = {CLOUD, PICTURE, PAGE, METRICS, *map(view_name, range(views))}
+    return frozenset(names | {VOLUME, SCENE} if volume else names)
 
 
 def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
@@ -97,12 +127,11 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
 
 
 def _write_views(folder: Path, rendered: np.ndarray):
-    """Write one image per view; those of an earlier result are removed."""
-    folder.mkdir(exist_ok=True)
-    for stale in folder.glob('*.exr'):
-        stale.unlink()
+    """Write one image per view."""
+    with writing(folder):
+        (folder / VIEWS).mkdir(exist_ok=True)
     for i, image in enumerate(rendered):
-        write_exr(folder / f'{i:04d}.exr', image)
+        write_exr(folder / view_name(i), image)
 
 
 def _corrections(fitted: Fitted) -> dict:

@@ -7,6 +7,7 @@ from xml.sax.saxutils import quoteattr
 
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
+from lingo_mi.file_access import write_text
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.scene.description import describe
 
@@ -41,7 +42,7 @@ def write_scene(path: Path, geometry: Geometry, extent: float, effects: Effects 
             given['material'] = ' + '.join(effects.tube.fitted())
         scatter = effects.scatter.within(geometry).given if effects.scatter else {}
         lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot | scatter, 8), '    </emitter>']
-    path.write_text('\n'.join([*lines, '</scene>']) + '\n', encoding='utf-8')
+    write_text(path, '\n'.join([*lines, '</scene>']) + '\n')
 
 
 def _parameters(values: dict, indent: int) -> list[str]:

@@ -28,7 +28,6 @@ from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import replacing
 from lingo_mi.fitting import checkpoint
-from lingo_mi.fitting.checkpoint import CHECKPOINT
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
@@ -36,6 +35,7 @@ from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.resume import extensible
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.interrupts import between_steps
+from lingo_mi.output_folder import CHECKPOINT
 from lingo_mi.phantoms.x3d_scan import scan
 from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Refined, progress_bar

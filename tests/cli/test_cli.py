@@ -76,6 +76,7 @@ def metrics_of(folder):
 def test_everything_is_written(result):
     folder, _, out = result
     assert sorted(p.name for p in folder.iterdir()) == [
+        '.lingo_mi.json',
         'checkpoint.npz',
         'gaussians.ply',
         'metrics.json',
@@ -256,7 +257,7 @@ def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and '--resume' in err and 'Traceback' not in err
-    assert [p.name for p in out.iterdir()] == ['checkpoint.npz']
+    assert sorted(p.name for p in out.iterdir()) == ['.lingo_mi.json', 'checkpoint.npz']
 
 
 # ---- the scenes that come with the project ---------------------------------------------------------------------------

@@ -1,0 +1,172 @@
+"""What `lingo-mi fit` and `Result.save` do to a folder that has something in it already."""
+
+import hashlib
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from helpers.script import FIT, fit, fit_process, run
+from lingo_mi.folder_lock import LOCK, locked
+from lingo_mi.output_folder import MANIFEST
+
+QUICK = '--iterations', '2', '-D', 'n_points=100'
+
+
+@pytest.fixture(scope='module')
+def made(scene):
+    folder = scene.parent / 'made'
+    code, _, err = fit(scene, *QUICK, '--out', folder, report=True)
+    assert code == 0, err
+    return folder
+
+
+@pytest.fixture
+def result(made, tmp_path):
+    """A copy of a result, to be spoiled."""
+    return shutil.copytree(made, tmp_path / 'result')
+
+
+def contents(folder):
+    return {p: hashlib.sha256(p.read_bytes()).digest() for p in sorted(folder.rglob('*')) if p.is_file()}
+
+
+def refused(code, err, *words):
+    assert code == 2 and err.count('\n') == 1 and err.startswith('error: '), err
+    assert len(err) < 308 and all(word in err for word in words), err
+
+
+def test_force_leaves_foreign_files_alone(scene, result):
+    mine = [result / '.writable', result / 'views' / 'mine.exr', result / 'metrics.json.partial', result / 'notes']
+    for path in mine:
+        path.write_text('mine')
+    code, _, err = fit(scene, *QUICK, '--seed', 3, '--out', result, '--force', '-D', 'views=4')
+    assert code == 0 and all(path.read_text() == 'mine' for path in mine), err
+    assert lm.load_result(result).fitted.seed == 3
+
+
+@pytest.mark.parametrize('name', ['result.xml', 'report.html', 'views', 'metrics.json', 'views/0001.exr', MANIFEST])
+def test_force_does_not_follow_links(scene, result, tmp_path, name):
+    target = tmp_path / 'target'
+    shutil.move(result / name, target)
+    (result / name).symlink_to(target)
+    before = contents(tmp_path)
+    code, _, err = fit(scene, *QUICK, '--out', result, '--force')
+    refused(code, err.splitlines(True)[-1], name, 'link')
+    assert 'Fit' not in err, 'it has worked in vain'
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize('name', ['result.xml', 'metrics.json', 'checkpoint.npz', 'views/0002.exr', 'report.png'])
+def test_force_refuses_a_foreign_file_of_a_name_that_it_needs(scene, tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('mine')
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path, '--force')
+    refused(code, err.splitlines(True)[-1], name, 'was not written by lingo_mi')
+    assert 'Fit' not in err and contents(tmp_path).keys() == {path} and path.read_text() == 'mine'
+
+
+def test_force_replaces_a_result_of_an_earlier_version(scene, result):
+    (result / MANIFEST).unlink()
+    (result / 'views' / 'mine.exr').write_text('mine')
+    code, _, err = fit(scene, *QUICK, '--seed', 4, '--out', result, '--force')
+    assert code == 0 and (result / 'views' / 'mine.exr').read_text() == 'mine', err
+    assert lm.load_result(result).fitted.seed == 4
+
+
+def test_an_empty_folder_but_for_leftovers(scene, tmp_path):
+    """What a killed process leaves behind before its first checkpoint: neither a result nor something to go on from."""
+    leftover = tmp_path / f'.lingo_mi-{16 * "0"}-checkpoint.npz'
+    for path in (leftover, tmp_path / 'checkpoint.npz.partial', tmp_path / LOCK):
+        path.touch()
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path, '--resume')
+    refused(code, err, 'no checkpoint', 'run without --resume')
+    assert '--force' not in err
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path)
+    assert code == 0 and not leftover.exists(), err
+
+
+def test_advice_that_helps(scene, tmp_path):
+    (tmp_path / 'notes').touch()
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path)
+    refused(code, err, 'is not empty', '--force')
+    assert '--resume' not in err
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path, '--resume')
+    refused(code, err, 'run without --resume, with --force')
+
+
+def test_one_writer_at_a_time(scene, result, tmp_path):
+    before = contents(result)
+    loaded = lm.load_result(result)
+    with locked(result):
+        code, _, err = fit(scene, *QUICK, '--out', result, '--force')
+        refused(code, err, str(os.getpid()), 'is writing there')
+        with pytest.raises(lm.InputError, match='is writing there'):
+            loaded.save(result, force=True)
+        assert contents(result).keys() - before.keys() == {result / LOCK}
+    assert contents(result) == before
+
+
+def test_a_killed_fit_holds_no_lock(scene, tmp_path):
+    long = scene, '--iterations', '1000000', '-D', 'n_points=100', '--out', tmp_path / 'a'
+    process = fit_process(*long, '-D', 'checkpoint_seconds=0')
+    while not (tmp_path / 'a' / 'checkpoint.npz').exists():
+        assert process.poll() is None
+    code, _, err = fit(*long, '--force')
+    refused(code, err, f'process {process.pid} on', 'is writing there')
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--force')
+    assert code == 0, err
+
+
+@pytest.mark.parametrize('option', ['--complete', '--start'])
+@pytest.mark.parametrize('name', ['result.xml', 'gaussians.ply'])
+def test_parts_of_two_results_are_refused(scene, result, tmp_path, name, option):
+    script = FIT.with_name('reconstruct.py')
+    code, _, err = fit(scene, *QUICK, '--seed', 5, '--out', tmp_path / 'other', '-D', 'extent=2')
+    assert code == 0, err
+    shutil.copy(tmp_path / 'other' / name, result / name)
+    more = ('--views', 12) if option == '--complete' else ()
+    arguments = scene, '--algorithm', 'refined', option, result / 'result.xml', '--out', tmp_path / 'v.nii', *more
+    code, _, err = run(script, *arguments)
+    refused(code, err, name, 'metrics.json beside it tells of')
+    with pytest.raises(lm.InputError, match='tells of'):
+        lm.load_result(result)
+    (result / 'metrics.json').unlink()  # as where a result was begun over another
+    (result / MANIFEST).write_text((result / MANIFEST).read_text().replace('false', 'true'))
+    code, _, err = run(script, *arguments)
+    refused(code, err, 'not completed')
+    with pytest.raises(lm.InputError, match='not completed'):
+        lm.load_result(result)
+    assert len(lm.load_result(result / 'checkpoint.npz')) == 100
+
+
+def test_files_copied_from_a_result_are_read(scene, result, tmp_path):
+    (tmp_path / 'copy').mkdir()
+    for name in ('result.xml', 'gaussians.ply'):
+        shutil.copy(result / name, tmp_path / 'copy' / name)
+    script = FIT.with_name('reconstruct.py')
+    arguments = scene, '--algorithm', 'voxelize', '--complete', tmp_path / 'copy' / 'result.xml'
+    code, _, err = run(script, *arguments, '--out', tmp_path / 'v.nii')
+    assert code == 0, err
+
+
+def test_save_goes_by_the_same_rules(result, tmp_path):
+    loaded = lm.load_result(result)
+    (tmp_path / 'new' / 'views').mkdir(parents=True)
+    (tmp_path / 'new' / 'report.html').write_text('mine')
+    with pytest.raises(lm.InputError, match='not empty'):
+        loaded.save(tmp_path / 'new')
+    with pytest.raises(lm.InputError, match='not written by lingo_mi'):
+        loaded.save(tmp_path / 'new', force=True)
+    assert sorted(contents(tmp_path / 'new')) == [tmp_path / 'new' / 'report.html']
+    (result / 'volume.nii.gz').write_bytes(b'')
+    (result / 'views' / 'mine.exr').write_text('mine')
+    loaded.save(result, force=True)
+    assert sorted(p.name for p in (result / 'views').iterdir()) == ['mine.exr']  # no held-out views are known any more
+    np.testing.assert_array_equal(lm.load_result(result).gaussians.means, loaded.gaussians.means)
