@@ -1,4 +1,4 @@
-"""Ctrl-C between the steps of a long loop, never within one."""
+"""Ctrl-C: between the steps of a long loop, never within one; and out of libraries that make another error of it."""
 
 from __future__ import annotations
 
@@ -36,3 +36,34 @@ def between_steps() -> Iterator[Callable[[], None]]:
         yield check
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def noticed() -> Iterator[None]:
+    """Raises KeyboardInterrupt where Ctrl-C was pressed within the block, whatever a library has made of it there.
+
+    Mitsuba turns an exception of a plugin into a RuntimeError of its own, whose text depends on where it was raised.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    pressed = []
+
+    def press(number, frame):
+        pressed.append(True)
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
+        if pressed:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt

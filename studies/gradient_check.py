@@ -29,7 +29,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.sensors import view_of
-from lingo_mi.scene.load import plain
+from lingo_mi.scene.load import load_file
 from lingo_mi.studies.oracle import Pose, one_integral
 
 EXTENT = 8.0
@@ -57,10 +57,7 @@ def load_scene_file(path: PathLike | str) -> Any:
     """Any Mitsuba scene, with or without a scanner. Raises InputError, in one line, for whatever Mitsuba finds wrong."""
     if not Path(path).is_file():
         raise InputError(f'{path}: there is no such file')
-    try:
-        return mi.load_file(str(path), parallel=False)  # as in `scene.load.load_scene`
-    except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
-        raise InputError(f'{path}: {plain(error)}') from None
+    return load_file(Path(path))
 
 
 def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:

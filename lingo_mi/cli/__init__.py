@@ -32,8 +32,8 @@ MODULES = {'import': 'import_frames', 'inspect': 'inspect_scan'}  # names that P
 
 def run(command: str) -> None:
     """Run one command with the arguments in `sys.argv`, and exit."""
-    module = importlib.import_module(f'lingo_mi.cli.{MODULES.get(command, command.replace("-", "_"))}')
-    guard(module.main)
+    name = MODULES.get(command, command.replace('-', '_'))
+    guard(lambda: importlib.import_module(f'lingo_mi.cli.{name}').main())
 
 
 def main() -> None:

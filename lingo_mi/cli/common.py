@@ -16,6 +16,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError, brief, shown
 from lingo_mi.file_access import require_writable
+from lingo_mi.interrupts import noticed
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
 MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
@@ -36,7 +37,7 @@ def guard(main: Callable[[], int | None]) -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be text
         sys.stdout.reconfigure(errors='backslashreplace')
     try:
-        with warnings.catch_warnings():
+        with noticed(), warnings.catch_warnings():
             warnings.simplefilter('ignore', RuntimeWarning)
             warnings.showwarning = lambda message, *_: print(f'warning: {brief(message, 1000)}', file=sys.stderr)
             sys.exit(main() or 0)

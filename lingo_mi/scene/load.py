@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
+from lingo_mi.interrupts import noticed
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.outline import outline
 
@@ -44,13 +45,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
             f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
             f'it has {", ".join(sorted(known)) or "none"}'
         )
-    try:
-        # With one thread: with several, Mitsuba rarely fails to create a plugin (bad_alloc in a gridvolume, 1 in thousands).
-        scene = mi.load_file(str(path), parallel=False, **(parameters or {}))
-    except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
-        if 'KeyboardInterrupt' in str(error).splitlines()[-1]:  # Ctrl-C within a plugin
-            raise KeyboardInterrupt from None
-        raise InputError(f'{path}: {plain(error)}') from None
+    scene = load_file(path, parameters)
     if not isinstance(scene, mi.Scene):
         raise InputError(f'{path}: this is a {type(scene).__name__}, not a scene')
     scanner = next((s for s in scene.sensors() if hasattr(s, 'geometry')), None)
@@ -62,6 +57,27 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
     return LoadedScene(scene, scanner, path)
+
+
+def load_file(path: Path, parameters: dict | None = None) -> Any:
+    """What Mitsuba makes of a scene file.
+
+    Raises InputError, in one line, for whatever it finds wrong, and KeyboardInterrupt after Ctrl-C, also within a plugin.
+    """
+    try:
+        str(path).encode('utf-8')
+    except UnicodeEncodeError:
+        raise InputError(
+            f'{path}: Mitsuba reads files whose names are UTF-8; give it and its folders such names'
+        ) from None
+    with noticed():
+        try:
+            # With one thread: with several, Mitsuba rarely fails to create a plugin (bad_alloc in a gridvolume, 1 in thousands).
+            return mi.load_file(str(path), parallel=False, **(parameters or {}))
+        except Exception as error:  # Mitsuba wraps a plugin's own exceptions in RuntimeErrors of many lines
+            if 'KeyboardInterrupt' in str(error).splitlines()[-1]:
+                raise KeyboardInterrupt from None
+            raise InputError(f'{path}: {plain(error)}') from None
 
 
 def defaults(path: PathLike | str) -> set[str]:

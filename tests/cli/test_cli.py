@@ -15,7 +15,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from helpers.script import FIT, fit, fit_process
+from helpers.script import FIT, SCENE, fit, fit_process
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import write_scan
@@ -258,6 +258,21 @@ def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130 and '--resume' in err and 'Traceback' not in err
     assert sorted(p.name for p in out.iterdir()) == ['.lingo_mi.json', 'checkpoint.npz']
+
+
+def test_interrupt_while_a_scene_loads(tmp_path):
+    """Where Mitsuba makes an error of its own of it, in the plugin that makes a large phantom."""
+    (tmp_path / 'slow.xml').write_text(
+        SCENE.replace('<integer name="size" value="24"/>', '<integer name="size" value="400"/>')
+    )
+    process = fit_process(tmp_path / 'slow.xml', '--out', tmp_path / 'a')
+    while not (tmp_path / 'a').exists():  # it is made right before the scene is loaded
+        assert process.poll() is None
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130 and err.splitlines()[-1] == 'interrupted' and 'Traceback' not in err, err
+    assert not (tmp_path / 'a').exists()
 
 
 # ---- the scenes that come with the project ---------------------------------------------------------------------------

@@ -4,12 +4,14 @@ import hashlib
 import os
 import shutil
 import signal
+from unittest import mock
 
 import numpy as np
 import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, fit, fit_process, run
+from lingo_mi.files.volumes import write_volume
 from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.output_folder import MANIFEST
 
@@ -170,3 +172,27 @@ def test_save_goes_by_the_same_rules(result, tmp_path):
     loaded.save(result, force=True)
     assert sorted(p.name for p in (result / 'views').iterdir()) == ['mine.exr']  # no held-out views are known any more
     np.testing.assert_array_equal(lm.load_result(result).gaussians.means, loaded.gaussians.means)
+
+
+@pytest.mark.parametrize('name', [b'$\\frac{a$', b'\xff\xfe', b'<script>alert(1)<script>', b'\n\x1b[31m', b'a' * 200])
+def test_no_result_depends_on_a_name(scene, tmp_path, name):
+    """Of a volume and of the folder: what is written is written, and shown as text."""
+    volume, out = tmp_path / os.fsdecode(name + b'.nii.gz'), tmp_path / os.fsdecode(name)
+    write_volume(volume, np.random.default_rng(0).random((12, 12, 12)), 1)
+    code, said, err = fit(scene, *QUICK, '--volume', volume, '--out', out, report=True)
+    assert code == 0 and 'warning' not in err, err
+    page = (out / 'report.html').read_text(encoding='utf-8')
+    assert '<script' not in page and {'metrics.json', 'report.png'} <= {p.name for p in out.iterdir()}
+    loaded = lm.load_result(out)
+    loaded.save(tmp_path / 'again')
+    assert (tmp_path / 'again' / 'report.png').stat().st_size > 0
+    assert sorted(p.name for p in (out / 'views').iterdir()) == ['0000.exr', '0001.exr', '0002.exr']
+
+
+def test_a_report_that_cannot_be_drawn_is_a_warning(scene, result):
+    with mock.patch('lingo_mi.report.figures.overview', side_effect=RuntimeError('no\nfont')):
+        code, _, err = fit(scene, *QUICK, '--seed', 6, '--out', result, '--force', report=True)
+    assert code == 0 and [line for line in err.splitlines() if line.startswith('warning: ')], err
+    assert 'report could not be drawn (no font)' in err and 'Traceback' not in err
+    assert lm.load_result(result).fitted.seed == 6
+    assert not {'report.png', 'report.html'} & {p.name for p in result.iterdir()}, 'the old one would lie'

@@ -1,6 +1,8 @@
 """Scene files that would end the process, or never end, are refused before Mitsuba sees them."""
 
+import contextlib
 import os
+import signal
 
 import pytest
 
@@ -126,6 +128,35 @@ def test_ctrl_c_while_a_scene_loads(tmp_path, monkeypatch):
     (tmp_path / 'scene.xml').write_text(SCENE)
     with pytest.raises(KeyboardInterrupt):
         load_scene(tmp_path / 'scene.xml')
+
+
+@pytest.mark.parametrize('then', [None, ValueError('something else')])
+def test_ctrl_c_that_a_plugin_swallows(tmp_path, monkeypatch, then):
+    """By a signal, as from a terminal; the plugin goes on, or makes another error of it."""
+    from lingo_mi.plugins import ct_volume
+
+    make = ct_volume.make
+
+    def stop(*arguments):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        if then:
+            raise then
+        return make(*arguments)
+
+    monkeypatch.setattr(ct_volume, 'make', stop)
+    (tmp_path / 'scene.xml').write_text(SCENE)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        load_scene(tmp_path / 'scene.xml')
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_name_that_is_not_utf_8(tmp_path):
+    path = tmp_path / os.fsdecode(b'\xff.xml')
+    path.write_text(SCENE)
+    with pytest.raises(InputError, match='names are UTF-8'):
+        load_scene(path)
 
 
 SCANNER = SCENE[: SCENE.index('<shape')] + SCENE[SCENE.index('</shape>') + len('</shape>') :]  # which takes no time
