@@ -1,0 +1,250 @@
+"""Whatever call that writes is the last one, a folder holds the old result whole, or the new one whole, or a checkpoint that
+resumes to the same metrics.
+
+A share of the calls is tried in every run, LINGO_MI_CRASH_POINTS of them (500 unless set) with --slow.
+"""
+
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from helpers.fault_server import Server
+from helpers.script import SCENE
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.output_folder import CHECKPOINT, METRICS, digest
+
+SHARE = 16
+KINDS = 'kill', 'full', 'denied'
+KEYS = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians'
+TINY = (('value="12"', 'value="5"'), ('value="24"', 'value="10"'), ('32, 40', '10, 12'), ('24, 24, 24', '10, 10, 10'))
+FIT = (
+    '--iterations',
+    '5',
+    '-D',
+    'n_points=40',
+    '-D',
+    'checkpoint_seconds=0',
+    '-D',
+    'densify_from=1',
+    '-D',
+    'densify_every=2',
+)
+MINE = 'notes.txt', '.writable', 'metrics.json.partial', 'views/mine.exr'
+
+
+@dataclass
+class Case:
+    """What is interrupted.
+
+    prepare   makes the folder as it is before
+    task, arguments   as of `Server.run`
+    accept    looks at the folder afterwards
+    """
+
+    name: str
+    task: str
+    arguments: list
+    prepare: Callable[[], None]
+    accept: Callable[[], None]
+    calls: int = field(default=0)
+
+
+class Bench:
+    """A folder, a tiny scene, and what commands leave there when nothing goes wrong."""
+
+    def __init__(self, server, home):
+        self.server, self.home, self.box = server, home, home / 'box'
+        self.out, self.volume, self.tables = self.box / 'result', self.box / 'volume.nii', self.box / 'tables'
+        scene = SCENE
+        for old, new in TINY:
+            scene = scene.replace(old, new)
+        self.scene = home / 'tiny.xml'
+        self.scene.write_text(scene)
+        self.seeds = {seed: self.fit(seed) for seed in (0, 1)}
+        self.metrics = {}
+        for seed, command in self.seeds.items():
+            self.box.mkdir(exist_ok=True)
+            self.go('fit', command)
+            shutil.move(self.out, self.kept(seed))
+            self.metrics[seed] = json.loads((self.kept(seed) / METRICS).read_text())
+        assert abs(self.metrics[0]['psnr_2d'] - self.metrics[1]['psnr_2d']) > 0.01, 'the test could not tell them apart'
+        self.fdk = [self.scene, '--algorithm', 'fdk', '--out', self.volume, '-D', 'views=7', '--force']
+        self.table = [
+            'ct',
+            '--objects',
+            'foot',
+            '--views',
+            '3',
+            '--iterations',
+            '3',
+            '--methods',
+            'r2',
+            '--out',
+            self.tables,
+        ]
+        self.table += ['--algorithms', 'fdk', 'voxelize']
+        self.go('reconstruct', self.fdk)
+        self.new_volume = read_volume(self.volume).data
+        self.go('tables', self.table)
+        self.rows = json.loads((self.tables / 'ct.json').read_text())
+
+    def fit(self, seed, *more):
+        return [self.scene, *FIT, '--seed', seed, '--out', self.out, *more]
+
+    def kept(self, seed):
+        return self.home / f'seed_{seed}'
+
+    def go(self, task, arguments):
+        """Run a command that must succeed."""
+        code, err, _ = self.server.run(task, arguments)
+        assert code == 0, err
+
+    # ---- before ----
+
+    def empty(self):
+        shutil.rmtree(self.box, ignore_errors=True)
+        self.box.mkdir()
+
+    def old_result(self):
+        """A result of seed 0 and files of somebody else."""
+        self.empty()
+        shutil.copytree(self.kept(0), self.out)
+        for name in MINE:
+            (self.out / name).write_text('mine')
+
+    def half_a_fit(self):
+        self.empty()
+        code, _, _ = self.server.run('fit', self.seeds[1], self.box, self.whole_fit // 2)
+        assert code == -signal.SIGKILL and (self.out / CHECKPOINT).exists() and not (self.out / METRICS).exists()
+
+    def old_volume(self):
+        self.empty()
+        np.save(self.box / 'mine.npy', [1])
+        self.go('reconstruct', [self.scene, '--algorithm', 'fdk', '--out', self.volume, '-D', 'views=4'])
+        self.before = read_volume(self.volume).data
+
+    # ---- afterwards ----
+
+    def require_whole(self, seeds):
+        """metrics.json tells of the files as they are, and of one of these fits; the view files are its own."""
+        found = json.loads((self.out / METRICS).read_text())
+        assert {'result.xml', 'gaussians.ply', 'volume.nii.gz', 'report.html', CHECKPOINT} <= found['files'].keys()
+        for name, value in found['files'].items():
+            assert digest(self.out / name) == value, name
+        assert any(self.same(found, self.metrics[seed]) for seed in seeds), {k: found[k] for k in KEYS}
+
+    @staticmethod
+    def same(found, wanted):
+        return all(found[k] == pytest.approx(wanted[k], rel=1e-4) for k in KEYS)
+
+    def require_result(self, seeds, empty=False):
+        """A whole result of one of these seeds, or a checkpoint of it; or nothing, where there was nothing."""
+        mine = [self.out / name for name in MINE] if 0 in seeds else []
+        assert all(path.read_text() == 'mine' for path in mine)
+        if (self.out / METRICS).exists():
+            self.require_whole(seeds)
+            return
+        if empty and not (self.out / CHECKPOINT).exists():
+            self.go('fit', self.seeds[1])
+            self.require_whole([1])
+        else:
+            for seed in sorted(seeds, reverse=True):
+                code, err, _ = self.server.run('fit', self.fit(seed, '--resume'))
+                if code == 0:
+                    self.require_whole([seed])
+                    break
+                assert 'other values of seed' in err, err
+            else:
+                raise AssertionError('no command goes on')
+        assert all(path.read_text() == 'mine' for path in mine)
+        left = {p.name for p in self.out.iterdir() if p.name.startswith('.lingo_mi')}
+        assert left == {'.lingo_mi.json'}, left
+
+    def require_volume(self):
+        found = read_volume(self.volume).data
+        assert any(np.allclose(found, wanted, atol=1e-6) for wanted in (self.before, self.new_volume))
+        assert np.load(self.box / 'mine.npy') == [1]
+
+    def require_table(self):
+        """Every file is whole, and the same command goes on to the same table."""
+        for path in self.tables.rglob('[!.]*.json'):
+            json.loads(path.read_text())
+        self.go('tables', self.table)
+        again = json.loads((self.tables / 'ct.json').read_text())
+        assert len(again) == len(self.rows)
+        for a, b in zip(again, self.rows):
+            for column, values in b['columns'].items():
+                assert (
+                    values is None
+                    and a['columns'][column] is None
+                    or a['columns'][column] == pytest.approx(values, rel=1e-4)
+                )
+
+    def cases(self):
+        """All that is interrupted, with the number of its calls that write."""
+        whole = [
+            Case('fit', 'fit', self.seeds[1], self.empty, lambda: self.require_result([1], empty=True)),
+            Case('force', 'fit', self.fit(1, '--force'), self.old_result, lambda: self.require_result([0, 1])),
+            Case('resume', 'fit', self.fit(1, '--resume'), self.half_a_fit, lambda: self.require_result([1])),
+            Case('save', 'save', [self.kept(1), self.out], self.old_result, lambda: self.require_result([0, 1])),
+            Case('reconstruct', 'reconstruct', self.fdk, self.old_volume, self.require_volume),
+            Case('tables', 'tables', self.table, self.empty, self.require_table),
+        ]
+        for case in whole:
+            case.prepare()
+            code, err, case.calls = self.server.run(case.task, case.arguments, self.box)
+            assert code == 0, err
+            self.whole_fit = whole[0].calls
+        return whole
+
+    def try_point(self, case, kind, at):
+        """Let the call number `at` be the last that works, and look at what is left."""
+        case.prepare()
+        code, err, _ = self.server.run(case.task, case.arguments, self.box, at, kind)
+        if at >= case.calls - 1 and code == 0:  # what fails last is to remove the lock, which changes nothing
+            assert 'error' not in err
+        elif kind == 'kill':
+            assert code == -signal.SIGKILL
+        else:
+            said = [line for line in err.splitlines() if line.startswith('error: ')]
+            assert code == 2 and len(said) == 1 and 'Traceback' not in err and len(said[0]) < 308, (code, err)
+        case.accept()
+
+
+@pytest.fixture(scope='module')
+def bench(tmp_path_factory):
+    if not hasattr(os, 'fork'):
+        pytest.skip('needs fork')
+    with Server() as server:
+        yield Bench(server, tmp_path_factory.mktemp('crashes'))
+
+
+def try_points(bench, count):
+    began, cases = time.monotonic(), bench.cases()
+    points = [(case, kind, at) for case in cases for kind in KINDS for at in range(1, case.calls + 1)]
+    chosen = [points[i] for i in np.unique(np.linspace(0, len(points) - 1, min(count, len(points))).astype(int))]
+    failed = {}
+    for case, kind, at in chosen:
+        try:
+            bench.try_point(case, kind, at)
+        except Exception as error:
+            failed[f'{case.name}, {kind} at call {at} of {case.calls}'] = error
+    took = time.monotonic() - began
+    print(f'{len(chosen)} of {len(points)} points in {took:.0f} s: {len(failed)} failed')
+    assert not failed, '\n'.join(f'{name}: {error}' for name, error in failed.items())
+
+
+def test_a_share_of_all_calls_that_write(bench):
+    try_points(bench, SHARE)
+
+
+@pytest.mark.slow
+def test_calls_that_write(bench):
+    try_points(bench, int(os.environ.get('LINGO_MI_CRASH_POINTS', 500)))

@@ -1,0 +1,96 @@
+"""Faults at the n-th call that writes below a folder: the process is killed, the disk is full, or may not be written to.
+
+Python's own calls are counted: opening for writing, each write of a file object, fsync, rename, unlink, mkdir, rmdir, ftruncate.
+What a library in C writes to a file counts by the calls before and after it.
+"""
+
+import builtins
+import errno
+import io
+import os
+import signal
+
+ERRORS = dict(full=errno.ENOSPC, denied=errno.EACCES)
+WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+
+
+class Faults:
+    """Counts calls from `install` on.
+
+    folder   below which calls count
+    at       number of the first call that fails; those after it fail as well. None: only count
+    kind     'kill', 'full' or 'denied'
+    """
+
+    def __init__(self, folder, at=None, kind='kill'):
+        self.folder, self.at, self.kind, self.count = os.fsencode(os.path.realpath(folder)), at, kind, 0
+
+    def within(self, path, dir_fd=None):
+        """Whether calls for this path, or open file, count."""
+        try:
+            if dir_fd is not None:
+                return False
+            name = os.readlink(f'/proc/self/fd/{path}') if isinstance(path, int) else os.path.abspath(path)
+            parent, base = os.path.split(os.fsencode(name))
+            return os.path.join(os.path.realpath(parent), base).startswith(self.folder)
+        except OSError:
+            return False
+
+    def due(self, path, frees=False):
+        """Count a call. Whether it is to fail; frees: it needs no room."""
+        if not self.within(path):
+            return False
+        self.count += 1
+        return self.at is not None and self.count >= self.at and not (frees and self.kind == 'full')
+
+    def fail(self, path):
+        if self.kind == 'kill':
+            os.kill(os.getpid(), signal.SIGKILL)
+        number = ERRORS[self.kind]
+        raise OSError(number, os.strerror(number), None if isinstance(path, int) else path)
+
+    def install(self):
+        """From here on, in this process, for ever."""
+        for name in ('replace', 'rename', 'mkdir', 'fsync', 'ftruncate', 'unlink', 'remove', 'rmdir', 'write', 'link'):
+            setattr(os, name, self._wrapped(getattr(os, name), frees=name in ('unlink', 'remove', 'rmdir')))
+        own = os.open
+
+        def open_(path, flags, mode=0o777, *, dir_fd=None):
+            if flags & WRITES and self.within(path, dir_fd) and self.due(path):
+                self.fail(path)
+            return own(path, flags, mode, dir_fd=dir_fd)
+
+        os.open = open_
+        builtins.open = io.open = self._opening(io.open)
+
+    def _wrapped(self, own, frees):
+        def call(path, *arguments, **options):
+            if options.get('dir_fd') is None and self.due(path, frees):
+                self.fail(path)
+            return own(path, *arguments, **options)
+
+        return call
+
+    def _opening(self, own):
+        faults = self
+
+        class File(io.FileIO):
+            def write(self, data):
+                if faults.due(self.fileno()):
+                    half = memoryview(data).cast('B')
+                    super().write(half[: len(half) // 2])
+                    faults.fail(self.fileno())
+                return super().write(data)
+
+        def open_(file, mode='r', buffering=-1, encoding=None, errors=None, newline=None, closefd=True, opener=None):
+            if not {*mode} & {*'wxa+'} or not self.within(file):
+                return own(file, mode, buffering, encoding, errors, newline, closefd, opener)
+            if self.due(file):
+                self.fail(file)
+            raw = File(file, mode.replace('b', '').replace('t', ''), closefd, opener)
+            if buffering == 0:
+                return raw
+            stream = (io.BufferedRandom if '+' in mode else io.BufferedWriter)(raw)
+            return stream if 'b' in mode else io.TextIOWrapper(stream, encoding, errors, newline)
+
+        return open_
