@@ -20,6 +20,7 @@ from os import PathLike
 from pathlib import Path
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import replacing
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.metrics import current_names
 
@@ -128,4 +129,5 @@ def draw(results: Results, figure: Path) -> None:
             axis.grid(alpha=0.3, which='both')
             axis.legend()
     figure.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(figure, dpi=90)
+    with replacing(figure) as temporary:
+        fig.savefig(temporary, dpi=90)

@@ -19,6 +19,7 @@ from typing import Any
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 from lingo_mi.runtime import use_variant
 
 MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
@@ -63,4 +64,4 @@ def main() -> None:
         result |= bench.against_tree()
         print(describe_tree(result))
     if args.json:
-        args.json.write_text(json.dumps(result, indent=1) + '\n')
+        write_text(args.json, json.dumps(result, indent=1) + '\n')

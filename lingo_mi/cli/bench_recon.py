@@ -21,6 +21,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 from lingo_mi.runtime import use_variant
 
 os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # idle threads of one package must not slow the next one's
@@ -45,4 +46,4 @@ def main() -> None:
     result = measure(args.size, args.views, args.repeats)
     print('\n'.join(describe(result)))
     if args.json:
-        args.json.write_text(json.dumps(result, indent=1) + '\n')
+        write_text(args.json, json.dumps(result, indent=1) + '\n')

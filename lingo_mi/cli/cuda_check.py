@@ -16,6 +16,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 
 
 def arguments() -> argparse.Namespace:
@@ -60,7 +61,7 @@ def main() -> int:
     text = page(outcomes, kernels)
     print(text)
     if args.markdown:
-        args.markdown.write_text(text, encoding='utf-8')
+        write_text(args.markdown, text)
         write_provenance(args.markdown)
     failed = [name for outcome in outcomes.values() for name in outcome.failed]
     for name in failed:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 
 
 def arguments() -> argparse.Namespace:
@@ -64,6 +65,6 @@ def main() -> int:
         where = save_case(name, args.seed, number, what, args.out)
         print(f'failed: {name}, case {number}: {what} ({where})', file=sys.stderr)
     if args.markdown:
-        args.markdown.write_text(text, encoding='utf-8')
+        write_text(args.markdown, text)
         write_provenance(args.markdown)
     return int(bool(failures))

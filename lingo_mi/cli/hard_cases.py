@@ -18,6 +18,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 from lingo_mi.runtime import use_variant
 
 
@@ -55,7 +56,7 @@ def main() -> int:
     table = markdown(results, beside)
     print(table, end='')
     if args.markdown:
-        args.markdown.write_text(table, encoding='utf-8')
+        write_text(args.markdown, table)
         write_provenance(args.markdown)
     if args.json:
         store(args.json, variant, results)

@@ -7,6 +7,7 @@ from typing import Any
 from lingo_mi import phantoms
 from lingo_mi.cli.common import Parser, check_seed
 from lingo_mi.errors import InputError, shown
+from lingo_mi.file_access import replacing
 from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.memory import room
 from lingo_mi.phantoms.x3d_scan import PIXELS
@@ -143,7 +144,8 @@ def write_ply(path: Path, phantom: phantoms.Phantom) -> None:
     from lingo_mi.phantoms.mesh import bolts
 
     for name, mesh in ((path, analytic.mesh), (bolts_beside(path), bolts())):
-        mesh.export(name)
+        with replacing(name) as temporary:
+            mesh.export(temporary)
         print(f'{name}: {len(mesh.faces)} triangles')
 
 

@@ -16,6 +16,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
+from lingo_mi.file_access import write_text
 from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
 
 
@@ -58,6 +59,6 @@ def main() -> None:
         if str(metrics.get('variant')).startswith('cuda'):
             print(beside(f'{scene}, {method}, a step', 'step', metrics['ms_per_iteration'] / 1e3, metrics['gaussians']))
     path = args.out / 'recipes.md'
-    path.write_text(text + '\n', encoding='utf-8')
+    write_text(path, text + '\n')
     write_provenance(path)
     draw(results, args.figure or args.out / 'recipes.png')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lingo_mi.file_access import replacing
 from lingo_mi.report.figures import STYLE
 from lingo_mi.studies.accuracy.tables import BACKWARD
 from lingo_mi.studies.closed_form import NAMES
@@ -24,7 +25,8 @@ def _save(path, plot, found, size):
     with rc_context(STYLE):
         fig = Figure(figsize=size, layout='constrained')
         plot(fig, found)
-        fig.savefig(path, dpi=90)
+        with replacing(path) as temporary:
+            fig.savefig(temporary, dpi=90)
 
 
 def _pareto(fig, found):

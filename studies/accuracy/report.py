@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from lingo_mi.file_access import write_text
 from lingo_mi.studies.accuracy.plots import draw
 from lingo_mi.studies.accuracy.tables import TITLES, make_tables
 from lingo_mi.studies.markdown import insert_into
@@ -23,9 +24,9 @@ def write(found: dict, folder: Path, figures: Path, document: Path | None = None
     """
     tables = make_tables(found, beside)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / 'accuracy.json').write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+    write_text(folder / 'accuracy.json', json.dumps(found, indent=1) + '\n')
     text = '\n\n'.join(f'## {TITLES[name]}\n\n{table}' for name, table in tables.items())
-    (folder / 'accuracy.md').write_text(f'# Accuracy against time\n\n{text}\n', encoding='utf-8')
+    write_text(folder / 'accuracy.md', f'# Accuracy against time\n\n{text}\n')
     write_provenance(folder / 'accuracy.md')
     if 'methods' in found:
         figures.mkdir(parents=True, exist_ok=True)

@@ -18,6 +18,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from lingo_mi.file_access import write_text
+
 KINDS = 'fp32', 'fp64', 'int', 'mufu', 'load', 'store', 'atomic', 'branch', 'sync', 'other'
 SECTORS = {'l': 'loads', 's': 'stores', 'a': 'atomics'}
 
@@ -80,7 +82,7 @@ def main() -> None:
     args = p.parse_args()
     clouds = dict(foot=args.foot, chest=args.chest, giants='giants')
     found = {name: counted(args.stand_in, cloud) for name, cloud in clouds.items()}
-    args.json.write_text(json.dumps(found, indent=1) + '\n')
+    write_text(args.json, json.dumps(found, indent=1) + '\n')
 
 
 if __name__ == '__main__':

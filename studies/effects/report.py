@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lingo_mi.file_access import replacing, write_text
 from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
 from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS
 from lingo_mi.studies.markdown import insert_into, table
@@ -38,9 +39,9 @@ def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | 
     path = folder / 'effects.json'
     known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
     numbers = {name: known[name] for name in EXPERIMENTS if name in known}
-    path.write_text(json.dumps(numbers, indent=1) + '\n', encoding='utf-8')
+    write_text(path, json.dumps(numbers, indent=1) + '\n')
     text = make_table(numbers)
-    (folder / 'effects.md').write_text(f'# What modelling an effect is worth\n\n{text}\n', encoding='utf-8')
+    write_text(folder / 'effects.md', f'# What modelling an effect is worth\n\n{text}\n')
     write_provenance(folder / 'effects.md')
     if document:
         insert_into(document, {TABLE: text})
@@ -96,4 +97,5 @@ def draw(result: dict, path: Path) -> None:
             ax.set_ylabel('y [mm]')
         fig.colorbar(grid[0, 0].images[0], ax=list(grid[0]), label='density [1/mm]', aspect=22, pad=0.015)
         fig.colorbar(grid[1, 0].images[0], ax=list(grid[1]), label='difference [1/mm]', aspect=22, pad=0.015)
-        fig.savefig(path, dpi=90)
+        with replacing(path) as temporary:
+            fig.savefig(temporary, dpi=90)

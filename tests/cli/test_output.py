@@ -196,3 +196,12 @@ def test_a_report_that_cannot_be_drawn_is_a_warning(scene, result):
     assert 'report could not be drawn (no font)' in err and 'Traceback' not in err
     assert lm.load_result(result).fitted.seed == 6
     assert not {'report.png', 'report.html'} & {p.name for p in result.iterdir()}, 'the old one would lie'
+
+
+def test_a_home_and_caches_that_cannot_be_written(scene, tmp_path):
+    """Not even by root."""
+    nowhere = dict.fromkeys(('HOME', 'XDG_CACHE_HOME', 'XDG_CONFIG_HOME', 'MPLCONFIGDIR'), '/proc/none')
+    process = fit_process(scene, *QUICK, '--out', tmp_path / 'a', env=os.environ | nowhere)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0 and 'Traceback' not in err, err
+    assert {'metrics.json', 'report.html', 'volume.nii.gz'} <= {p.name for p in (tmp_path / 'a').iterdir()}

@@ -1,0 +1,85 @@
+"""What a file, a scene or a command says is text in the report, never markup: by a parser, and in a browser if there is one."""
+
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from lingo_mi.report.page import ReportData, write_report
+
+RUN = 'document.documentElement.dataset.ran=1'
+MARKUP = (
+    f'<script>{RUN}</script>',
+    f'"><img src=x onerror="{RUN}">',
+    f"'><svg onload='{RUN}'>",
+    f'</title><script>{RUN}</script>',
+    f'</pre></style><body onload={RUN}>&lt;b&gt;',
+    f'\udcff<iframe src="javascript:{RUN}">',
+)
+BROWSERS = 'chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome'
+
+
+def page(folder, markup):
+    """A report that has the markup wherever a user's text may stand."""
+    metrics = dict(psnr_3d=30.0, method=markup, variant=markup, versions={markup: markup}, note=markup) | {
+        markup: markup
+    }
+    volume = np.linspace(0, 1, 512).reshape(8, 8, 8)
+    return write_report(
+        folder, ReportData(title=markup, metrics=metrics, volume=volume, spacing=(1, 1, 1), command=markup)
+    )
+
+
+class Reader(HTMLParser):
+    """The tags, the attributes that name an event or an address, and the text of a page."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.active, self.text = set(), [], ''
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.active += [(k, v) for k, v in attrs if k.startswith('on') or k in ('src', 'href', 'srcdoc', 'style')]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize('markup', MARKUP)
+def test_markup_is_text(tmp_path, markup):
+    reader = Reader()
+    reader.feed(page(tmp_path, markup).read_text(encoding='utf-8'))
+    known = 'html head meta title style body main h1 h2 p div section table tr th td figure img figcaption pre'
+    assert reader.tags <= {*known.split()}
+    assert all(name == 'src' and value.startswith('data:image/png;base64,') for name, value in reader.active)
+    assert reader.text.count(markup.replace('\udcff', '\\udcff')) >= 7  # title, heading, command, and the settings
+
+
+def dom(path, home):
+    """What a browser has made of a page, as HTML."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip(f'no browser is installed: none of {", ".join(BROWSERS)}')
+    options = (
+        '--headless',
+        '--no-sandbox',
+        '--disable-gpu',
+        '--dump-dom',
+        f'--user-data-dir={home}',
+        '--virtual-time-budget=500',
+    )
+    done = subprocess.run([browser, *options, path.as_uri()], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_no_script_runs_in_a_browser(tmp_path):
+    """A page with a script of its own shows that one would be seen."""
+    control = tmp_path / 'control.html'
+    control.write_text(f'<!doctype html><html><body><script>{RUN}</script></body></html>')
+    assert 'data-ran' in dom(control, tmp_path / 'home').partition('>')[2].partition('>')[0]
+    for markup in MARKUP:
+        found = dom(page(tmp_path, markup), tmp_path / 'home')
+        assert 'data-ran' not in found.partition('<head>')[0] and '<h1>' in found and '<script' not in found
