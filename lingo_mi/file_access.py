@@ -54,7 +54,7 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
 
 # What a kill may leave behind. The suffix stays at the end because several libraries choose the format by it.
 _TEMPORARY = '.lingo_mi-{}-{}'
-LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
+_LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
 
 
 @contextmanager
@@ -124,6 +124,12 @@ def replacing(path: PathLike | str) -> Iterator[Path]:
     """
     with _temporary(path, _new_file, _remove_file) as temporary:
         yield temporary
+
+
+def leftovers(folder: Path) -> list[tuple[Path, str]]:
+    """Files in a folder that a killed process of ours has left behind, and the names that they were to get (their ends)."""
+    found = [(path, _LEFTOVER.fullmatch(path.name)) for path in folder.iterdir()]
+    return [(path, match[1]) for path, match in found if match and path.is_file() and not path.is_symlink()]
 
 
 def write_text(path: PathLike | str, text: str) -> None:

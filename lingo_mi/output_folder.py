@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import LEFTOVER, flush_folder, reading, replacing, writing
+from lingo_mi.file_access import flush_folder, leftovers, reading, replacing, writing
 from lingo_mi.folder_lock import LOCK
 
 METRICS, CHECKPOINT, MANIFEST, VIEWS = 'metrics.json', 'checkpoint.npz', '.lingo_mi.json', 'views'
@@ -150,25 +150,24 @@ def require_together(folder: Path, names: Iterable[str]) -> None:
 
 def occupants(folder: Path) -> list[str]:
     """Names in a folder, without what a killed process of ours has left behind."""
-    passed_over = MANIFEST, LOCK, _EARLIER
-    return sorted(path.name for path in folder.iterdir() if not (_is_leftover(path) or path.name in passed_over))
+    passed_over = {MANIFEST, LOCK, _EARLIER, *(path.name for path in _leftovers(folder))}
+    return sorted(path.name for path in folder.iterdir() if path.name not in passed_over)
 
 
 def clear_leftovers(folder: Path) -> None:
     """Remove what killed processes of ours have left behind; only to be called by one that holds the folder's lock."""
     with writing(folder):
-        for inside, name in ((folder, '{}'), (folder / VIEWS, f'{VIEWS}/{{}}')):
-            if inside.is_dir() and not (inside == folder / VIEWS and inside.is_symlink()):
-                for path in [*inside.iterdir()]:
-                    if _is_leftover(path, name):
-                        path.unlink(missing_ok=True)
+        for path in _leftovers(folder):
+            path.unlink(missing_ok=True)
 
 
-def _is_leftover(path: Path, name: str = '{}') -> bool:
-    """Whether a file is one of ours that never got its name."""
-    found = LEFTOVER.fullmatch(path.name)
-    target = name.format(found[1]) if found else ''
-    return (target == MANIFEST or _is_name(target)) and path.is_file() and not path.is_symlink()
+def _leftovers(folder: Path) -> list[Path]:
+    """Files of a result that never got their names."""
+    found = [path for path, target in leftovers(folder) if target == MANIFEST or _is_name(target)]
+    views = folder / VIEWS
+    if views.is_dir() and not views.is_symlink():
+        found += [path for path, target in leftovers(views) if _is_name(f'{VIEWS}/{target}')]
+    return found
 
 
 def _is_name(name: str) -> bool:

@@ -8,14 +8,16 @@ import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from lingo_mi.errors import InputError, brief, shown
-from lingo_mi.file_access import require_writable
+from lingo_mi.file_access import leftovers, require_writable
+from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import noticed
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
@@ -180,6 +182,16 @@ def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
     return document, figures
 
 
+@contextmanager
+def writing_file(path: Path) -> Iterator[None]:
+    """Keeps other processes from writing this output file; what a killed one has left of it is removed."""
+    with locked(path.parent, f'{LOCK}-{path.name[-40:]}'):
+        for leftover, target in leftovers(path.parent):
+            if target == path.name[-40:]:
+                leftover.unlink(missing_ok=True)
+        yield
+
+
 def definitions(pairs: Iterable[str]) -> dict[str, str]:
     """The NAME=VALUE arguments of -D as a dictionary."""
     out = {}
@@ -229,6 +241,8 @@ def writable_file(path: Path, force: bool) -> Path:
     path = Path(path)
     if path.is_dir():
         raise InputError(f'{path}: is a folder; choose another --out')
+    if path.is_symlink():
+        raise InputError(f'{path}: is a link, which is not written to; choose another --out')
     if path.exists() and not force:
         raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
     require_writable(path.parent, path, 'choose another --out')

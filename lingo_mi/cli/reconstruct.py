@@ -22,7 +22,15 @@ import argparse
 import time
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser, check_input, definitions, input_arguments, read_input, writable_file
+from lingo_mi.cli.common import (
+    Parser,
+    check_input,
+    definitions,
+    input_arguments,
+    read_input,
+    writable_file,
+    writing_file,
+)
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
@@ -134,7 +142,19 @@ def main() -> None:
         chosen = dict(completed_niter='0') | chosen
     algorithm = algorithm_of(args.algorithm, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
-    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own})
+    with writing_file(out):
+        reconstruct_into(out, args, algorithm, effects, {k: v for k, v in defined.items() if k in own})
+
+
+def reconstruct_into(
+    out: Path, args: argparse.Namespace, algorithm: Algorithm | None, effects: str, parameters: dict[str, str]
+) -> None:
+    """Reconstruct, and write the volume into a file that no other process writes.
+
+    effects      'model' or 'ignore'
+    parameters   of the scene file
+    """
+    scene = load_scene(args.scene, parameters)
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
     if (args.algorithm in FROM_CLOUD or args.start) and not hasattr(cloud, 'gaussians'):
         raise InputError(

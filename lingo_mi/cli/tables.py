@@ -24,7 +24,7 @@ from typing import Any
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
+from lingo_mi.file_access import leftovers, require_writable
 from lingo_mi.fitting.recipes import METHODS, settings_of
 from lingo_mi.folder_lock import locked
 from lingo_mi.runtime import use_variant
@@ -117,6 +117,9 @@ def compute(args: argparse.Namespace, cells: Any, rows: list, objects: list[str]
     """Compute what is missing of a table's cells, and write the table, in a folder that no other process writes to."""
     from lingo_mi.studies.tables.report import plan, write
 
+    for inside in (cells.folder, *(path for path in cells.folder.rglob('*') if path.is_dir())):
+        for leftover, _ in leftovers(inside):  # the lock is ours, so nobody is writing them
+            leftover.unlink(missing_ok=True)
     planned = plan(rows, objects)
     failed = cells.compute_missing(planned, lambda: write(args.table, rows, objects, cells, args.scale))
     print(write(args.table, rows, objects, cells, args.scale))

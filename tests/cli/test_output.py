@@ -148,6 +148,26 @@ def test_parts_of_two_results_are_refused(scene, result, tmp_path, name, option)
     assert len(lm.load_result(result / 'checkpoint.npz')) == 100
 
 
+def test_a_volume_is_written_by_one(scene, tmp_path):
+    out, script = tmp_path / 'v.nii', FIT.with_name('reconstruct.py')
+    leftover, other = (tmp_path / f'.lingo_mi-{16 * "b"}-{name}' for name in ('v.nii', 'w.nii'))
+    leftover.touch()
+    other.touch()
+    with locked(tmp_path, f'{LOCK}-v.nii'):
+        code, _, err = run(script, scene, '--out', out)
+        refused(code, err, 'is writing there')
+        code, _, err = run(script, scene, '--out', tmp_path / 'w.nii')
+        assert code == 0, err
+    code, _, err = run(script, scene, '--out', out)
+    assert code == 0 and {p.name for p in tmp_path.iterdir()} == {'v.nii', 'w.nii'}, err
+    target = tmp_path / 'mine.nii'
+    out.rename(target)
+    out.symlink_to(target)
+    code, _, err = run(script, scene, '--out', out, '--force')
+    refused(code, err, 'is a link')
+    assert out.is_symlink()
+
+
 def test_files_copied_from_a_result_are_read(scene, result, tmp_path):
     (tmp_path / 'copy').mkdir()
     for name in ('result.xml', 'gaussians.ply'):
