@@ -218,8 +218,12 @@ class Bench:
         """Let the call number `at` be the last that works, and look at what is left."""
         case.prepare()
         code, err, _ = self.server.run(case.task, case.arguments, self.box, at, kind)
-        if at >= case.calls - 1 and code == 0:  # what fails last is to remove the lock, which changes nothing
-            assert 'error' not in err
+        if (
+            code == 0
+        ):  # the run had a call less than the one that was counted, or all that failed was to remove the lock
+            folders = self.out.name, self.tables.name
+            harmless = {name for name in self.server.failed if name.startswith('.lingo_mi.lock') or name in folders}
+            assert at > case.calls - 10 and harmless == {*self.server.failed} and 'error' not in err, self.server.failed
         elif kind == 'kill':
             assert code == -signal.SIGKILL
         else:

@@ -16,7 +16,7 @@ class Server:
 
     task        'fit', 'reconstruct', 'tables', or 'save': `load_result(arguments[0]).save(arguments[1], force=True)`
     folder      below which calls are counted; None: none are
-    at, kind    see `write_faults.Faults`
+    at, kind    see `write_faults.Faults`; its `failed`, of the last command, is an attribute
     """
 
     def __enter__(self):
@@ -31,6 +31,7 @@ class Server:
         request = dict(task=task, arguments=[*map(str, arguments)], folder=folder and str(folder), at=at, kind=kind)
         print(json.dumps(request), file=self.process.stdin, flush=True)
         answer = json.loads(self.process.stdout.readline())
+        self.failed = answer['failed']
         return answer['code'], answer['err'], answer['calls']
 
     def __exit__(self, *_):
@@ -68,7 +69,7 @@ def work(request, calls):
             faults.install()
             guard(mains[request['task']])
     finally:
-        os.pwrite(calls, str(faults.count).encode(), 0)
+        os.pwrite(calls, json.dumps(dict(calls=faults.count, failed=faults.failed)).encode(), 0)
 
 
 def serve():
@@ -102,7 +103,7 @@ def serve():
             calls.seek(0)
             err.seek(0)
             text = err.read().decode(errors='backslashreplace')
-            answer = dict(code=status, err=text, calls=int(calls.read() or 0))
+            answer = dict(code=status, err=text) | json.loads(calls.read() or '{"calls": 0, "failed": []}')
             os.write(answers, (json.dumps(answer) + '\n').encode())
 
 

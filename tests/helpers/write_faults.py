@@ -20,10 +20,12 @@ class Faults:
     folder   below which calls count
     at       number of the first call that fails; those after it fail as well. None: only count
     kind     'kill', 'full' or 'denied'
+    failed   names of the files for which calls have failed
     """
 
     def __init__(self, folder, at=None, kind='kill'):
         self.folder, self.at, self.kind, self.count = os.fsencode(os.path.realpath(folder)), at, kind, 0
+        self.failed = []
 
     def within(self, path, dir_fd=None):
         """Whether calls for this path, or open file, count."""
@@ -46,6 +48,8 @@ class Faults:
     def fail(self, path):
         if self.kind == 'kill':
             os.kill(os.getpid(), signal.SIGKILL)
+        name = os.readlink(f'/proc/self/fd/{path}') if isinstance(path, int) else os.fspath(path)
+        self.failed.append(os.path.basename(os.fsdecode(name)))
         number = ERRORS[self.kind]
         raise OSError(number, os.strerror(number), None if isinstance(path, int) else path)
 
@@ -65,7 +69,8 @@ class Faults:
 
     def _wrapped(self, own, frees):
         def call(path, *arguments, **options):
-            if options.get('dir_fd') is None and self.due(path, frees):
+            missing = frees and not os.path.lexists(path)  # nothing is written then
+            if not missing and options.get('dir_fd') is None and self.due(path, frees):
                 self.fail(path)
             return own(path, *arguments, **options)
 
