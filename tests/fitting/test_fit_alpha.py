@@ -12,6 +12,7 @@ from helpers.checkpoints import contents, write_as_before
 from helpers.fits import assert_equal_states, error_of, geometry, stop_at, tiny_scan
 from helpers.script import FIT, fit
 from helpers.script import run as run_script
+from lingo_mi import output_folder
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.densify import clone, prune, reset_opacity, split
 from lingo_mi.fitting.initial import initial_cloud
@@ -291,7 +292,9 @@ def result(scene):
     """The folder of a fit to four of eight views, in place of an earlier result, and the text printed."""
     folder = scene.parent / 'alpha'
     folder.mkdir()
-    for stale in 'volume.nii.gz', 'result.xml':
+    earlier = 'volume.nii.gz', 'result.xml'
+    output_folder.begin(folder, earlier)
+    for stale in earlier:
         (folder / stale).write_text('of an earlier fit')
     code, out, err = fit(
         scene,
