@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+from dataclasses import replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -130,7 +131,16 @@ class Result:
 
     @cached_property
     def _measured(self) -> Measured:
-        return measure(self.fitted) if self.data is None else measure(self.fitted, self.data.test, self.data.volume)
+        if self.data is not None:
+            return measure(self.fitted, self.data.test, self.data.volume)
+        measured = measure(self.fitted)
+        known = self._numbers(self._stored or {})  # what there is no truth for now was measured when there was one
+        unknown = {name: known.get(name) for name, value in measured.numbers.items() if value is None}
+        return replace(measured, numbers=measured.numbers | unknown)
+
+    @staticmethod
+    def _numbers(found: dict) -> dict[str, float | None]:
+        return {name: value for name, value in found.items() if value is None or isinstance(value, int | float)}
 
     def metrics(self, data: Dataset | None = None) -> dict[str, float | None]:
         """PSNR and SSIM of held-out views and volume, IPSD, times; None where there is no truth to compare with.
@@ -145,7 +155,7 @@ class Result:
             numbers = measure(self.fitted, data.test, data.volume).numbers
         else:
             numbers = self._measured.numbers if self._stored is None else self._stored
-        return {name: value for name, value in numbers.items() if value is None or isinstance(value, int | float)}
+        return self._numbers(numbers)
 
     def save(self, folder: str | PathLike, *, title: str = '', force: bool = False) -> Path:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz; returns the folder.
@@ -153,6 +163,7 @@ class Result:
         title   of the report (default: the folder's name)
         force   replace an earlier result; other files in the folder are left alone
 
+        Of a loaded result, metrics.json keeps the comparison with the truth; the held-out views are not in it.
         Raises InputError where the folder holds files already, cannot be written, or another process writes to it.
         """
         folder = as_path('folder', folder)

@@ -246,6 +246,11 @@ def test_save_and_load(result, data, tmp_path):
     assert again.metrics()['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'])
     assert again.metrics(data)['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'], abs=1e-4)
     assert len(lm.load_result(folder / 'checkpoint.npz')) == len(result)
+    for copy in tmp_path / 'copy', folder:  # the truth is gone, its numbers are not
+        again.save(copy, force=True)
+        kept = lm.load_result(copy).metrics()
+        for name in 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d':
+            assert kept[name] is not None and kept[name] == again.metrics()[name], name
     for damaged in '[]', '{':
         (folder / 'metrics.json').write_text(damaged)
         with pytest.raises(lm.InputError, match='metrics.json: is damaged'):
