@@ -1,11 +1,15 @@
 """What all tests share: the variant, slow tests, and the folder of test volumes."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
 STAND_IN = 'LINGO_MI_CUDA_STAND_IN' in os.environ  # for the CUDA driver: one thread, without OptiX

@@ -320,6 +320,7 @@ def result(scene):
 def test_what_a_fit_leaves(result):
     folder, out = result
     assert sorted(p.name for p in folder.iterdir()) == [
+        '.lingo_mi.json',
         'checkpoint.npz',
         'gaussians.ply',
         'metrics.json',
