@@ -42,6 +42,7 @@ BINARY = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mu
 COMPARED = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
             ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In}  # fmt: skip
 MESSAGES = 'InputError', 'TypeError', 'ValueError', 'warn', 'optional'
+CHECKS = '_require', 'fail', 'require_type'  # their texts are messages, too
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,11 @@ def _visited(node: ast.AST) -> Iterator[ast.AST]:
     if isinstance(node, ast.Call) and ast.unparse(node.func).split('.')[-1] in MESSAGES:
         return
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+        return
+    if isinstance(node, ast.Call) and ast.unparse(node.func).split('.')[-1] in CHECKS:
+        for each in node.args:
+            if not (isinstance(each, ast.Constant) and isinstance(each.value, str)):
+                yield from _visited(each)
         return
     yield node
     for name, child in ast.iter_fields(node):

@@ -48,7 +48,7 @@ def main() -> int:
     beside = stored(args.beside) if args.beside else None
     cases = [case for case in all_cases(steps=args.steps) if not any(text in case.name for text in args.without)]
     results = [(case, measure(case)) for case in cases]
-    missed = [(case.name, wrong) for case, result in results if (wrong := miss(case, result))]
+    missed = [(case.name, wrong) for case, result in results if (wrong := miss(case, result, variant))]
     if beside:
         missed += [(f'{name}, {beside.title}', wrong) for name, wrong in beside.misses(cases).items()]
     for name, wrong in missed:

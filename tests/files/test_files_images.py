@@ -59,6 +59,9 @@ def test_bad_files(tmp_path):
     for content in (b'', b'hello', raw[:20], raw[: len(raw) // 2], raw[:-5]):
         path.write_bytes(content)
         refused(path, 'damaged')
+    size = raw.index(b'\0', raw.index(b'\0', 8) + 1) + 1  # of the first attribute
+    path.write_bytes(raw[:size] + (-4).to_bytes(4, 'little', signed=True) + raw[size + 4 :])
+    refused(path, 'an attribute has no end')
     write_channels(path, {'Y': IMAGE * np.float32('nan')})
     refused(path, 'NaN')
 

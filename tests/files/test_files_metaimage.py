@@ -66,6 +66,11 @@ def test_as_simpleitk_reads_it(tmp_path):
     np.testing.assert_allclose(affine[:3, 3], image.GetOrigin())
 
 
+def test_what_the_header_leaves_out(tmp_path):
+    """Voxels of 1 mm along the axes, the first at the origin, as SimpleITK has it."""
+    np.testing.assert_array_equal(metaimage.read(written(tmp_path / 'v.mha'))[1], np.eye(4))
+
+
 def test_voxels_at_the_end_and_below(tmp_path):
     (tmp_path / 'below').mkdir()
     (tmp_path / 'below' / 'v.raw').write_bytes(b'skipped' + VALUES.astype('u1').tobytes('F'))

@@ -34,6 +34,14 @@ def test_quaternions_are_normalised_and_density_may_be_a_column(tmp_path):
     np.testing.assert_allclose(read_ply(tmp_path / 'a.ply')[2], q, rtol=1e-6)
 
 
+def test_remarks_in_the_header_are_passed_over(tmp_path):
+    path = tmp_path / 'a.ply'
+    write_ply(path, *cloud())
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b'element', b'obj_info by hand\ncomment property x\nelement', 1))
+    np.testing.assert_allclose(read_ply(path)[0], cloud()[0], rtol=2e-6)
+
+
 def test_mitsuba_reads_the_same_cloud(tmp_path):
     path = tmp_path / 'a.ply'
     write_ply(path, *cloud())

@@ -24,6 +24,13 @@ def test_images_do_not_depend_on_the_voxels_of_a_geometry(fitted):
         np.testing.assert_allclose(fitted.render(other), expected, atol=1e-5 * expected.max())
 
 
+def test_progress_counts_the_views(fitted):
+    seen = []
+    fitted.render(fitted.geometry, progress=lambda done, of: seen.append((done, of)))
+    n = len(fitted.geometry)
+    assert seen == [(k, n) for k in range(1, n + 1)]
+
+
 def test_the_volume_on_another_grid(fitted):
     """Smaller voxels in a part of the volume, beside its centre: the densities of the cloud at these places."""
     g = fitted.geometry

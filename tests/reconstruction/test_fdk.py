@@ -8,7 +8,7 @@ from helpers.balls import BALL, centres, ellipsoids, geometry
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.fdk import FDK, WINDOWS, ramp, ray_weights, view_weights
+from lingo_mi.reconstruction.fdk import FDK, WINDOWS, filtered, ramp, ray_weights, view_weights
 from lingo_mi.scan import Scan
 
 
@@ -93,6 +93,41 @@ def test_filters_keep_the_density():
         assert ramp(64, 1.0, name)[-1] <= ramp(64, 1.0)[-1] + 1e-12
     with pytest.raises(InputError, match='ram-lak'):
         FDK('ramlak')
+
+
+def test_windows():
+    """At zero, half and the whole of the Nyquist frequency."""
+    f = np.array([0, 0.5, 1])
+    for name, expected in {
+        'ram-lak': [1, 1, 1],
+        'shepp-logan': [1, np.sin(np.pi / 4) / (np.pi / 4), 2 / np.pi],
+        'cosine': [1, np.sqrt(0.5), 0],
+        'hamming': [1, 0.54, 0.08],
+        'hann': [1, 0.5, 0],
+    }.items():
+        np.testing.assert_allclose(WINDOWS[name](f), expected, atol=1e-15, err_msg=name)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_filtering_in_other_units(mode):
+    """All lengths twice as long: the same cosines, and per mm half as much."""
+    once = geometry(mode, circular(3))
+    lengths = 'DSO', 'DSD', 'dDetector', 'dVoxel', 'offOrigin', 'offDetector'
+    twice = geometry(mode, circular(3), **{name: np.multiply(getattr(once, name), 2) for name in lengths})
+    projections = np.random.default_rng(0).random((3, *once.nDetector), dtype=np.float32)
+    found, expected = filtered(projections, twice), filtered(projections, once) / 2
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('side', ['u', 'v'])
+def test_the_cosine_is_that_of_the_offset_panel(side):
+    """A row far from the axis: what FDK weighs it by is DSD over the ray's length to each pixel."""
+    offset = (0.0, 60.0) if side == 'u' else (60.0, 0.0)
+    geo = geometry(angles=[0.0], nDetector=(1, 1), dDetector=(2.0, 3.0), offDetector=offset)
+    centred = geometry(angles=[0.0], nDetector=(1, 1), dDetector=(2.0, 3.0), offDetector=(0.0, 0.0))
+    one = np.ones((1, 1, 1), np.float32)
+    ratio = filtered(one, geo) / filtered(one, centred)
+    np.testing.assert_allclose(ratio, 450 / np.hypot(450, 60), rtol=1e-5)
 
 
 def test_view_weights():
