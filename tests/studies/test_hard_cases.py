@@ -115,7 +115,7 @@ def test_table_of_two_variants(tmp_path):
     by_title = dict(zip(head, rows[0]))
     assert by_title['image, CUDA'] == '5e-07' and by_title['derivatives, CUDA'] == '6e-03'
     assert by_title['image'] == '1e-07' and by_title['scale'] == '2e-07'
-    assert by_title['remark'] == 'CUDA: error of a derivative 6.0e-03, at most 1e-05'
+    assert by_title['remark'] == 'CUDA: error of a derivative 6.0e-03, at most 1.6e-05'
     assert [dict(zip(head, row))['remark'] for row in rows[1:]] == ['30 steps; CUDA: 3 steps', 'CUDA: not measured']
 
 
