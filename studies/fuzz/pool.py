@@ -123,7 +123,12 @@ def run(
                     return
                 while first < last:
                     child = child or _Child(memory)
-                    child, first = _chunk(child, name, seed, first, last, seconds, tallies[name], lock)
+                    began = time.monotonic()
+                    results, child, first = _chunk(child, name, seed, first, last, seconds)
+                    with lock:
+                        tallies[name].seconds += time.monotonic() - began
+                        for number, result in results.items():
+                            tallies[name].add(number, result)
                 with lock:
                     done['cases'] = sum(tally.cases for tally in tallies.values())
                     report(done['cases'])
@@ -143,9 +148,9 @@ def run(
     return tallies
 
 
-def _chunk(child, name, seed, first, last, seconds, tally, lock):
-    """Has a child read the cases from `first` to before `last`. Returns the child, None where it has died, and the next case."""
-    began = time.monotonic()
+def _chunk(child, name, seed, first, last, seconds):
+    """Has a child read the cases from `first` to before `last`. Returns the results by number, the child, None where it has died,
+    and the next case."""
     child.ask(f'{name}\t{seed}\t{first}\t{last}\n')
     at, patience, died = first - 1, seconds + 60, None  # the first case waits for the imports
     results = {}
@@ -170,11 +175,7 @@ def _chunk(child, name, seed, first, last, seconds, tally, lock):
             raise RuntimeError(f'{name}: the child does not start ({died}, exit code {code})')
         results[at] = died + (f', exit code {code}' if lines is not None else '')
         child = None
-    with lock:
-        tally.seconds += time.monotonic() - began
-        for number, result in results.items():
-            tally.add(number, result)
-    return child, at + 1
+    return results, child, at + 1
 
 
 def save_case(name: str, seed: int, number: int, what: str, folder: Path) -> Path:

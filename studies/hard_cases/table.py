@@ -41,7 +41,9 @@ class Stored:
 
     def misses(self, cases: Sequence) -> dict[str, str]:
         """What cases show that they may not, in words, by name; a case that was not measured misses nothing."""
-        found = {case.name: miss(case, self.results[case.name], self.variant) for case in cases if case.name in self.results}
+        found = {
+            case.name: miss(case, self.results[case.name], self.variant) for case in cases if case.name in self.results
+        }
         return {name: wrong for name, wrong in found.items() if wrong}
 
 
