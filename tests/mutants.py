@@ -6,7 +6,7 @@
 A mutant is the package with one expression changed: `+` for `-`, `<` for `<=`, `and` for `or`, a number doubled, a flag
 turned round, a text with a letter more. Texts of messages, annotations and docstrings are left alone. The test files that
 execute the changed line run on it, the shortest first, until one fails. A mutant that none notices has survived: it needs a
-test, or a reason in tests/mutants_accepted.txt (one a line: file | change | reason).
+test, or a reason in tests/mutants_accepted.json.
 
 Two copies of the checkout work side by side. Which test executes which line is measured first, in one run of all tests
 (`--lines FILE` keeps it). Exit code 1 where fewer than 90 % are noticed.
@@ -35,7 +35,7 @@ PLACES = ('geometry', 'files', 'projectors', 'lingo', 'reconstruction', 'fitting
 NEEDED = 0.9  # share of the mutants that the tests must notice
 ENOUGH = 150  # seconds of tests that one mutant gets
 LEFT_OUT = '.git', 'out', 'build', '__pycache__', '*.egg-info', '.pytest_cache', '.ruff_cache'
-ACCEPTED = ROOT / 'tests' / 'mutants_accepted.txt'
+ACCEPTED = ROOT / 'tests' / 'mutants_accepted.json'
 
 BINARY = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Div, ast.Mod: ast.Mult,
           ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.MatMult: ast.Mult}  # fmt: skip
@@ -51,11 +51,13 @@ class Mutant:
 
     file         relative to the checkout
     line         its first line, from 1
+    around       the text of that line
     begin, end   offsets in the file's characters
     """
 
     file: str
     line: int
+    around: str
     begin: int
     end: int
     before: str
@@ -79,7 +81,8 @@ def mutants(path: Path) -> Iterator[Mutant]:
 
     for node, change in _changes(ast.parse(source)):
         begin, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
-        yield Mutant(str(path.relative_to(ROOT)), node.lineno, begin, end, source[begin:end], change)
+        around = source[starts[node.lineno - 1] : starts[node.lineno]].strip()
+        yield Mutant(str(path.relative_to(ROOT)), node.lineno, around, begin, end, source[begin:end], change)
 
 
 def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
@@ -237,12 +240,9 @@ def tests_of(mutant: Mutant, lines: dict) -> list[tuple[str, float]]:
     return sorted(found, key=lambda x: (own not in x[0], x[1]))
 
 
-def accepted() -> set[tuple[str, str]]:
-    """Survivors that have a reason: (file, change)."""
-    if not ACCEPTED.exists():
-        return set()
-    rows = (line.split(' | ') for line in ACCEPTED.read_text(encoding='utf-8').splitlines() if ' | ' in line)
-    return {(row[0].strip(), row[1].strip()) for row in rows}
+def accepted() -> set[tuple[str, str, str]]:
+    """Survivors that have a reason: (file, text of the line, change)."""
+    return {(x['file'], x['line'], x['change']) for x in json.loads(ACCEPTED.read_text(encoding='utf-8'))}
 
 
 def main() -> int:
@@ -272,7 +272,7 @@ def main() -> int:
         known = json.loads(args.lines.read_text()) if args.lines and args.lines.exists() else {}
         lines = measure_lines(checkouts, known, lambda x: args.lines and args.lines.write_text(json.dumps(x)))
         reasons = accepted()
-        chosen = [m for m in every if (m.file, m.change) not in reasons][: args.count]
+        chosen = [m for m in every if (m.file, m.around, m.change) not in reasons][: args.count]
 
         def one(mutant):
             checkout = checkouts.get()
