@@ -9,7 +9,8 @@ execute the changed line run on it, the shortest first, until one fails. A mutan
 test, or a reason in tests/mutants_accepted.json.
 
 Two copies of the checkout work side by side. Which test executes which line is measured first, in one run of all tests
-(`--lines FILE` keeps it). Exit code 1 where fewer than 90 % are noticed.
+(`--lines FILE` keeps it). With `--outcomes FILE` a stopped run goes on where it was, and after new tests only the survivors
+are tried again. Exit code 1 where fewer than 90 % are noticed.
 """
 
 from __future__ import annotations
@@ -51,12 +52,14 @@ class Mutant:
 
     file         relative to the checkout
     line         its first line, from 1
+    column       of its first character there, from 0
     around       the text of that line
     begin, end   offsets in the file's characters
     """
 
     file: str
     line: int
+    column: int
     around: str
     begin: int
     end: int
@@ -66,6 +69,11 @@ class Mutant:
     @property
     def change(self) -> str:
         return f'{" ".join(self.before.split())}  ->  {self.text}'
+
+    @property
+    def key(self) -> str:
+        """The same where lines were added or removed above it."""
+        return f'{self.file}  {self.around}  {self.column}  {self.change}'
 
 
 def mutants(path: Path) -> Iterator[Mutant]:
@@ -82,7 +90,8 @@ def mutants(path: Path) -> Iterator[Mutant]:
     for node, change in _changes(ast.parse(source)):
         begin, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
         around = source[starts[node.lineno - 1] : starts[node.lineno]].strip()
-        yield Mutant(str(path.relative_to(ROOT)), node.lineno, around, begin, end, source[begin:end], change)
+        file, column = str(path.relative_to(ROOT)), begin - starts[node.lineno - 1]
+        yield Mutant(file, node.lineno, column, around, begin, end, source[begin:end], change)
 
 
 def _changes(tree: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str]]:
@@ -254,6 +263,12 @@ def main() -> int:
     p.add_argument(
         '--lines', type=Path, metavar='FILE', help='what each test executes (JSON); measured if it is not there'
     )
+    p.add_argument(
+        '--outcomes',
+        type=Path,
+        metavar='FILE',
+        help='what noticed which mutant (JSON); those noticed are not tried again',
+    )
     p.add_argument('--report', type=Path, metavar='FILE', help='write the page there, too')
     args = p.parse_args()
 
@@ -274,10 +289,18 @@ def main() -> int:
         reasons = accepted()
         chosen = [m for m in every if (m.file, m.around, m.change) not in reasons][: args.count]
 
+        noticed = json.loads(args.outcomes.read_text()) if args.outcomes and args.outcomes.exists() else {}
+
         def one(mutant):
+            if mutant.key in noticed:
+                return noticed[mutant.key]
             checkout = checkouts.get()
             try:
                 by = checkout.tried(mutant, tests_of(mutant, lines))
+                if by:
+                    noticed[mutant.key] = by
+                if args.outcomes:
+                    args.outcomes.write_text(json.dumps(noticed, indent=1))
             finally:
                 checkouts.put(checkout)
             print(f'{"noticed " if by else "SURVIVED"} {mutant.file}:{mutant.line}  {mutant.change}  {by}', flush=True)

@@ -105,6 +105,7 @@ def test_wrong_numbers_of_dimensions(tmp_path, n):
         (dict(DimSize=None), 'DimSize'),
         (dict(ElementType='MET_STRING'), 'ElementType'),
         (dict(ElementNumberOfChannels='3'), '3 values a voxel'),
+        (dict(NDims=None), 'has 0 dimensions'),
         (dict(BinaryData='False'), 'BinaryData'),
         (dict(HeaderSize='-2'), 'HeaderSize'),
         (dict(HeaderSize='9' * 300), 'cannot hold'),
@@ -121,3 +122,18 @@ def test_headers_that_lie(tmp_path, changes, match):
 def test_no_end_of_the_header(tmp_path):
     (tmp_path / 'v.mha').write_bytes(b'NDims = 3\n' * 20000)
     refused(tmp_path / 'v.mha', 'no end')
+
+
+@pytest.mark.parametrize(
+    'name, dtype',
+    [
+        *(('MET_CHAR', 'i1'), ('MET_UCHAR', 'u1'), ('MET_SHORT', 'i2'), ('MET_USHORT', 'u2'), ('MET_INT', 'i4')),
+        *(('MET_UINT', 'u4'), ('MET_LONG', 'i4'), ('MET_ULONG', 'u4'), ('MET_LONG_LONG', 'i8')),
+        *(('MET_ULONG_LONG', 'u8'), ('MET_FLOAT', 'f4'), ('MET_DOUBLE', 'f8')),
+    ],
+)
+def test_types(tmp_path, name, dtype):
+    """Those of the format's description; its long has 4 bytes."""
+    data, _ = metaimage.read(written(tmp_path / 'v.mha', VALUES.astype(dtype).tobytes('F'), ElementType=name))
+    assert data.dtype == dtype
+    np.testing.assert_array_equal(data, VALUES)

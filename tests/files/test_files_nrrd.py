@@ -76,6 +76,7 @@ def test_packings_and_byte_orders(tmp_path):
         ({'data file': 'gone.raw'}, 'no such file'),
         ({'dimension': '4294967296'}, 'dimensions'),
         ({'dimension': '-1'}, 'dimensions'),
+        ({'dimension': ''}, 'has 0 dimensions'),
         ({'dimension': '1e400'}, 'dimension'),
         ({'kinds': 'vector domain domain'}, 'dimensions'),
         ({'sizes': '4 5 99999999999'}, 'cannot hold'),
@@ -107,3 +108,10 @@ def test_no_header(tmp_path):
         (tmp_path / 'v.nrrd').write_bytes(content)
         with pytest.raises(InputError):
             nrrd.read(tmp_path / 'v.nrrd')
+
+
+def test_what_the_header_leaves_out(tmp_path):
+    """Voxels of 1 mm, the first at the origin; a kind may be none."""
+    np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd'))[1], np.eye(4))
+    changes = {'space': 'LPS', 'space directions': '(2,0,0) (0,3,0) (0,0,4)', 'kinds': 'none domain ???'}
+    np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))[1], np.diag([2, 3, 4, 1]))

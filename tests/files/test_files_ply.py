@@ -184,3 +184,12 @@ def test_elements_of_any_ply(tmp_path, kind, body):
         path.write_bytes((PLY % kind + body).replace(old, new, 1))
         with pytest.raises(InputError, match=match):
             require_elements(path)
+
+
+@pytest.mark.parametrize('missing', [1, 4])
+def test_a_file_that_lacks_its_last_bytes(tmp_path, missing):
+    write_ply(tmp_path / 'a.ply', *cloud())
+    require_elements(tmp_path / 'a.ply')
+    (tmp_path / 'a.ply').write_bytes((tmp_path / 'a.ply').read_bytes()[:-missing])
+    with pytest.raises(InputError, match='announces more'):
+        require_elements(tmp_path / 'a.ply')

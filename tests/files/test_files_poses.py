@@ -1,5 +1,8 @@
 """Poses in the conventions of RTK, ASTRA and projection matrices: by hand, round trips, through scans and scenes."""
 
+from dataclasses import replace
+from xml.etree import ElementTree
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -399,8 +402,6 @@ def test_bad_matrices(tmp_path):
 
 
 def test_what_rtk_cannot_say(tmp_path):
-    from dataclasses import replace
-
     f, path = scan_of().rays(), tmp_path / 'g.xml'
     tilted = scan_of('parallel', rotDetector=(0.1, 0.0, 0.0)).rays()
     for bad, match in (
@@ -433,3 +434,18 @@ def test_bad_poses_in_yaml(tmp_path, changes, match):
     with pytest.raises(InputError, match=match) as caught:
         read_scan(path)
     assert '\n' not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_what_rtk_calls_its_numbers(tmp_path):
+    """Its reader looks for these names, and takes what is absent for zero."""
+    rtk.write(tmp_path / 'g.xml', scan_of().rays(), SHAPE)
+    (shared, *views) = ElementTree.parse(tmp_path / 'g.xml').getroot().iter()
+    names = {e.tag for e in (shared, *views)}
+    known = {
+        'RTKThreeDCircularGeometry',
+        'Projection',
+        'Matrix',
+        *('SourceToIsocenterDistance', 'SourceToDetectorDistance', 'GantryAngle', 'OutOfPlaneAngle', 'InPlaneAngle'),
+        *('ProjectionOffsetX', 'ProjectionOffsetY', 'SourceOffsetX', 'SourceOffsetY'),
+    }
+    assert names == known

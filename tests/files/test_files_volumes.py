@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import io
 import os
 import struct
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 
 from lingo_mi import file_access
 from lingo_mi.errors import InputError
-from lingo_mi.files import volumes
+from lingo_mi.files import volumes, voxels
 from lingo_mi.files.volumes import centred_affine, first_voxel, git_blob_sha1, read_volume, write_volume
 from lingo_mi.geometry.base import CircularGeometry
 
@@ -282,6 +283,9 @@ def test_known_raw_files_need_no_shape(tmp_path, monkeypatch):
     refused(path, 'give the shape')
     monkeypatch.setitem(volumes._KNOWN_RAW, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint8'))
     np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
+    path.write_bytes(COUNTS.transpose(2, 1, 0).astype('u2').tobytes())
+    monkeypatch.setitem(volumes._KNOWN_RAW, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint16'))
+    np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
 
 
 def test_bad_raw(tmp_path):
@@ -350,6 +354,13 @@ def test_tiff_stack_and_folder(tmp_path):
     for v in (a, b):
         np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
     assert a.spacing == SPACING
+    with tifffile.TiffWriter(tmp_path / 'plain.tiff') as writer:  # images one after another, without a word about them
+        for z in (*range(6), *range(6)):
+            writer.write(COUNTS[:, :, z].T, metadata=None, contiguous=False)
+    with tifffile.TiffFile(tmp_path / 'plain.tiff') as file:
+        assert file.series[0].kind == 'uniform'
+    twice = np.concatenate([COUNTS, COUNTS], 2)
+    np.testing.assert_allclose(read_volume(tmp_path / 'plain.tiff').data, twice / 119, rtol=1e-6)
     tifffile.imwrite(tmp_path / 'slices' / 's20.tiff', COUNTS[:, :, 0])
     refused(tmp_path / 'slices', 'one size')
     (tmp_path / 'slices' / 's20.tiff').write_bytes(b'hello')
@@ -557,3 +568,28 @@ def test_real_chest():
     assert v.data.shape == (256, 256, 275) and v.spacing == (1.5625, 1.5625, 1)
     assert v.data.min() == 0 and v.data.max() == pytest.approx((1876 + 1000) / 3000)
     assert v.unit == 'normalised'
+
+
+def test_a_little_below_zero_is_noise(tmp_path):
+    """Up to a tenth of the highest value, also where that is not 1."""
+    values = np.where(COUNTS == 3, -0.15, COUNTS * (2.0 / 119) + 1e-3)
+    assert read_array(tmp_path, values).data.min() <= 0
+    np.save(tmp_path / 'v.npy', np.where(COUNTS == 3, -0.25, values))
+    refused(tmp_path / 'v.npy', 'Hounsfield')
+
+
+@pytest.mark.parametrize('ratio, bytes_a_voxel', [(1, 8), (1000, 12)])
+def test_memory_that_an_array_of_a_file_needs(tmp_path, monkeypatch, ratio, bytes_a_voxel):
+    """float32 twice, and its own bytes where they are unpacked first."""
+    asked = []
+    monkeypatch.setattr(voxels, 'require_room', lambda size, *_: asked.append(size))
+    (tmp_path / 'v').write_bytes(bytes(480))
+    assert voxels.require_claim(tmp_path / 'v', SHAPE, np.dtype('f4'), ratio) == 480
+    assert asked == [120 * bytes_a_voxel]
+
+
+def test_what_follows_an_array_is_read_only_where_asked():
+    content = bytes(120 + 2 * voxels._CHUNK)
+    assert len(voxels.read_exactly(io.BytesIO(content), 'v', 0, 120)) == 120
+    with pytest.raises(InputError, match='more data follow'):
+        voxels.read_exactly(io.BytesIO(content), 'v', 0, 120, finish=True)

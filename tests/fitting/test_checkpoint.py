@@ -11,7 +11,7 @@ import pytest
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, tiny_scan
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting import checkpoint, checkpoint_schema
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run
 
@@ -238,6 +238,17 @@ def test_checksums(whole, refused):
     later = json.loads(str(content['extra'])) | {'version': 2}
     bare = {k: v for k, v in content.items() if k != 'checksum'}
     assert 'version is 2' in refused({**bare, 'extra': np.array(json.dumps(later))})
+
+
+@pytest.mark.parametrize('name', ['unit', 'effects'])
+def test_a_checkpoint_with_a_version_has_all_of_it(whole, tmp_path, name):
+    _, content = whole
+    extra = json.loads(str(content['extra']))
+    assert 'version' in extra
+    short = {k: v for k, v in extra.items() if k != name}
+    arrays = {k: v for k, v in content.items() if k not in ('extra', 'checksum')}
+    with pytest.raises(InputError, match=f'{name} is missing'):
+        checkpoint_schema.require_sound(arrays, short)
 
 
 def test_sizes_are_checked_before_memory_is_taken(whole, refused, tmp_path):

@@ -7,6 +7,9 @@ import pytest
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.recipes import R2
+from lingo_mi.fitting.view_loss import Target
 from lingo_mi.functional import voxelize
 
 
@@ -39,3 +42,19 @@ def test_the_volume_on_another_grid(fitted):
     expected = voxelize(*fitted.world_gaussians(), part, extent=fitted.settings.model.extent)
     assert found.shape == (6, 5, 4) and expected.max() > 0
     np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
+
+
+def test_gaussians_on_the_faces_of_the_volume_stay():
+    half = np.array([1.0, 2.0, 3.0])
+    centre = np.array([half, -half, half * (1, 1, 1.001)])
+    stays = forward_model(R2).may_stay(centre, np.ones((3, 3)), half, 1.0)
+    np.testing.assert_array_equal(stays, [True, True, False])
+
+
+def test_pixels_are_compared_in_units_of_their_noise():
+    """Weights multiply both images."""
+    scan = tiny_scan(geometry())
+    weights = np.random.default_rng(0).uniform(0.5, 2, scan.projections.shape).astype(np.float32)
+    plain, weighted = (Target.of(scan, 1, 1.0, w).pixels for w in (None, weights))
+    np.testing.assert_allclose(weighted.numpy(), plain.numpy() * weights[1].ravel(), rtol=1e-6)
+    np.testing.assert_array_equal(Target.of(scan, 1, 1.0, weights).weights.numpy(), weights[1].ravel())

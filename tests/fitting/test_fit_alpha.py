@@ -405,3 +405,11 @@ def test_help_names_every_method():
 def test_bad_combination_on_the_command_line(scene, tmp_path):
     code, _, err = fit(scene, '--method', '3dgs', '--init', 'r2', '--out', tmp_path / 'a')
     assert code == 2 and err.count('\n') == 1 and 'init is' in err and not list(tmp_path.iterdir())
+
+
+def test_a_radiance_without_directions_as_a_harmonic():
+    """1/2 plus the coefficient times the harmonic of degree 0, 1 / (2 sqrt(pi))."""
+    raw = np.array([[-3.0], [0.0], [2.0]])
+    degree0, more = harmonics({'radiance': raw})
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * degree0, 1 / (1 + np.exp(-raw[:, 0])), rtol=1e-12)
+    assert more.shape == (3, 0)

@@ -209,3 +209,9 @@ def test_other_content_compiles_nothing():
         step(1)
         kernels = [k for k in dr.kernel_history() if k['type'] == dr.KernelType.JIT]
     assert kernels and all(k['cache_hit'] for k in kernels)
+
+
+def test_otsu_may_part_the_two_highest_bins():
+    image = np.repeat(np.float32([254, 255]), 2**19)
+    image[0] = 0
+    assert otsu(mi.Float(image)).numpy()[0] == pytest.approx(threshold_otsu(image, nbins=256), abs=0.1)

@@ -16,3 +16,31 @@ def test_settings_by_name_and_value():
     assert settings_of('lingo', iterations=7) == METHODS['lingo'].changed(iterations=7)
     with pytest.raises(InputError, match='lingo'):
         settings_of('lingoX')
+
+
+# Thresholds as released, for a loss that weighs L1 by 0.8; rates as released.
+PUBLISHED = {
+    '3dgs': dict(
+        rate_centre=(1.6e-4, 1.6e-6),
+        rate_scale=(5e-3, 5e-3),
+        rate_rotation=(1e-3, 1e-3),
+        densify_threshold=2e-4 / 0.8,
+        split_size=0.01,
+        prune_density=0.005,
+        reset_every=3000,
+    ),
+    'xgaussian': dict(
+        iterations=20_000,
+        rate_radiance=(2e-3, 2e-3),
+        rate_opacity=(6e-3, 6e-3),
+        densify_threshold=2.7e-5 / 0.8,
+        densify_every=800,
+        reset_every=1200,
+    ),
+}
+
+
+@pytest.mark.parametrize('name', PUBLISHED)
+def test_published_settings(name):
+    flat = METHODS[name].flat()
+    assert {k: flat[k] for k in PUBLISHED[name]} == {k: pytest.approx(v) for k, v in PUBLISHED[name].items()}

@@ -166,3 +166,18 @@ def test_changed_keeps_the_rest():
     after = before.changed(lambda_tv=0.1, iterations=800)
     assert after.flat() == before.flat() | dict(lambda_tv=0.1, iterations=800)
     assert after.adam is before.adam and before.loss.lambda_tv == 0.15
+
+
+@pytest.mark.parametrize(
+    'name, within, beyond',
+    [
+        ('cuboid_step', 10**6, 10**6 + 1),
+        ('fdk_threshold', 1e6, 1.5e6),
+        ('fdk_threshold', -1e6, -1.5e6),
+        ('fdk_rescale', 1e6, 1.5e6),
+    ],
+)
+def test_limits(name, within, beyond):
+    assert Settings().changed(**{name: within}).flat()[name] == within
+    with pytest.raises(InputError, match=name):
+        Settings().changed(**{name: beyond})

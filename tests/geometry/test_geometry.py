@@ -332,3 +332,14 @@ def test_angles_that_look_like_degrees_cause_a_warning():
         warnings.simplefilter('error')
         Geometry.parallel(**panel, angles=np.arange(6))
         Geometry.cone(**panel, DSO=100, DSD=150, angles=circular(100, 3600))
+
+
+def test_a_panel_that_is_hardly_one():
+    """Steps that are nearly parallel: refused from 1e-9 on."""
+    for angle, good in ((1.5e-9, True), (0.7e-9, False)):
+        f = Rays(*(np.array([a]) for a in ([0, -9.0, 0], [0, 9.0, 0], [1.0, 0, 0], [1.0, 0, angle])), parallel=False)
+        if good:
+            f.checked()
+        else:
+            with pytest.raises(InputError, match='span no panel'):
+                f.checked()

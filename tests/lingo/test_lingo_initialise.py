@@ -238,3 +238,15 @@ def test_r2_cloud():
     assert len(r2_initialise(volume, half, rng, threshold=0.9)) == (volume > 0.9).sum()
     with pytest.raises(InputError, match='threshold'):
         r2_initialise(volume, half, rng, threshold=2.0)
+
+
+def test_the_factor_is_that_of_eight_views():
+    geometry, frames, projections = sphere_scan(n=16)
+    seen = []
+
+    def render(points, density, spacing, views):
+        seen.extend(views.tolist())
+        return projections[views]
+
+    initialise(Scan(geometry, projections), LingoSettings(n_points=300), np.random.default_rng(0), render)
+    assert seen == [0, 2, 4, 6, 8, 10, 12, 14]

@@ -239,3 +239,14 @@ def test_errors():
         backproject(np.ones((4, 21, 17)), scan())
     with pytest.raises(InputError, match='values'):
         line_integrals(mi.Float([1, 2, 3]), (1, 1, 2), [0, 0, 0], [1, 1, 1], Lines(mi.Point3f(0), mi.Vector3f(1)))
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_origins_of_rays_are_near_the_volume(mode):
+    """On a plane through its centre: the distance of a source costs no digits."""
+    geometry = scan(mode)
+    table = view_table(geometry).astype(float)
+    centre, source = table[:, :3], table[:, 9:12] / np.linalg.norm(table[:, 9:12], axis=1, keepdims=True)
+    normal = np.cross(geometry.rays().u, geometry.rays().v)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert np.abs(np.sum(centre * normal, 1)).max() < 1e-4 and np.isfinite(source).all()

@@ -7,13 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from lingo_mi.errors import AccuracyWarning
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.depth import deepest
 from lingo_mi.projectors.exponential import exp2_of_negative
 from lingo_mi.projectors.footprint import NAMES, project
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.splat import splat
+from lingo_mi.projectors.usable import require_usable
 from lingo_mi.projectors.view import View
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
@@ -337,3 +340,37 @@ def test_powers_of_two(variant):
     if not cuda:
         np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
     assert np.all(exp2_of_negative(mi.Float([-126, -127, -200, -1e30, -np.inf])).numpy() <= 2.0**-126)
+
+
+@pytest.mark.parametrize('aspect, warns', [(0.9e6, False), (1.5e6, True)])
+def test_needles_are_announced(aspect, warns):
+    gaussians = mi.Point3f(0), mi.Vector3f(1, 1, aspect), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    if warns:
+        with pytest.warns(AccuracyWarning, match='Gaussian 0 of here'):
+            assert not require_usable(*gaussians, 'here')
+    else:
+        assert require_usable(*gaussians, 'here')
+
+
+def test_few_items_have_no_depth():
+    zeros = dr.zeros(mi.Int32, 10)
+    assert deepest((zeros, zeros), dr.full(mi.Float, 4, 10), (8, 8)).numpy() == 0
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_pixels_that_a_footprint_covers(mode):
+    """A round one covers pi / 4 of its box."""
+    frames, shape = scanner(mode, shape=(90, 90))
+    gaussians = mi.Point3f(0), mi.Vector3f(0.1), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    found = project(gaussians, View.of(frames, 0, *shape), 3.0)
+    rows, columns = found.row_end[0] - found.row_begin[0], found.width[0]
+    assert rows > 15 and found.area[0] == pytest.approx(np.pi / 4 * rows * columns, rel=0.2)
+
+
+def test_footprints_are_not_widened_unasked():
+    frames, shape = scanner()
+    gaussians = mi.Point3f(0.1), mi.Vector3f(0.1, 0.2, 0.3), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    plain, none, some = (project(gaussians, View.of(frames, 0, *shape), 3.0, *w) for w in ((), (0.0,), (1.0,)))
+    for a, b in zip(plain.values, none.values):
+        assert a[0] == b[0]
+    assert some.values[1][0] < 0.99 * none.values[1][0]

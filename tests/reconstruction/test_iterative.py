@@ -25,6 +25,7 @@ from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refi
 from lingo_mi.reconstruction.asd_pocs import tv_floor, tv_gradient
 from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.sart import blocks
+from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
 
@@ -418,3 +419,27 @@ def test_the_projector_refuses_other_poses():
                 geo.rays().moved(shift=np.array([[0, 0, 0], [0, 0, 1.0]])), geo.nDetector, geo.nVoxel, geo.dVoxel
             )
         )
+
+
+def test_what_counts_as_matched_where_fdk_cannot_say(system):
+    """Nothing, so that the descent stays in bounds."""
+    geo = small(n=5)
+    moved = Geometry.from_poses(
+        geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]), geo.nDetector, geo.nVoxel, geo.dVoxel
+    )
+    scan = Scan(moved, np.ones((5, *geo.nDetector), np.float32))
+    assert ASDPOCS()._maxl2err(System(scan), scan) == 0
+
+
+@pytest.mark.parametrize('every, times', [(0, 0), (1, 7), (5, 2)])
+def test_passes_between_corrections(system, monkeypatch, every, times):
+    calls, correct = [], System.correct
+    monkeypatch.setattr(System, 'correct', lambda self, x: calls.append(1) or correct(self, x))
+    ASDPOCS(niter=7, exact_every=every, alpha_red=1.0, tviter=1).run(system[0])
+    assert len(calls) == times
+
+
+def test_blocks_go_by_their_middle_view():
+    """At 10, 40 and 120 degrees; the first views of the blocks would give another order."""
+    found = blocks(np.radians([0, 10, 170, 40, 60, 120]), 2, 'angularDistance', np.random.default_rng(0))
+    assert [b.tolist() for b in found] == [[0, 1], [4, 5], [2, 3]]

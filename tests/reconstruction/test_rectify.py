@@ -132,3 +132,10 @@ def test_other_motions_are_refused(mode, motion, says):
     assert not can_rectify(scan)
     with pytest.raises(InputError, match=f'filtered backprojection needs.*{says}'):
         FDK().run(scan)
+
+
+@pytest.mark.parametrize('degrees', [(3.0, 0.0, 0.0), (0.0, 2.0, 0.0)])
+def test_the_upright_panel_stands_where_the_real_one_is(degrees):
+    geo = geometry('cone', circular(6))
+    found = rectified_geometry(moved(geo, degrees))
+    assert found.DSO == pytest.approx(geo.DSO) and found.DSD == pytest.approx(geo.DSD, rel=2e-3)
