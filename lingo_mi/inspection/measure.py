@@ -8,12 +8,15 @@ import numpy as np
 
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
+from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.scan import Scan
 
 COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
 VIEWS = 40  # of the plane: the time goes with its square
 CLEAR = 0.01  # a disagreement that is more than discretisation
+UNSTEADY = 0.5  # pixels of jitter that blur a volume
+UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
 
 
 @dataclass
@@ -64,6 +67,8 @@ def look(scan: Scan) -> Findings:
     air = 0.0 if np.isnan(found.air) else found.air
     found.mass = np.array([(p[i][valid[i]].mean() - air) if valid[i].any() else 0.0 for i in range(n)])
     _views(found, p - air, valid)
+    _masses(found, scan, valid)
+    _jitter(found, scan, air)
     _angles(found, scan, air)
     return found
 
@@ -117,6 +122,37 @@ def _views(found, p, valid):
             found.advice.append(
                 f'{_named(doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
             )
+
+
+def _masses(found, scan, valid):
+    """The views of a parallel beam all have the object's mass."""
+    mass = np.delete(found.mass, found.suspects)
+    if scan.geometry.mode != 'parallel' or not valid.all() or len(mass) < 3 or not mass.mean() > 0:
+        return
+    if any(fact.startswith('truncation') for fact in found.facts):
+        return
+    spread = mass.std() / mass.mean()
+    found.facts.append(f'mass: equal in all views to {spread:.2%} rms')
+    if spread > UNEQUAL:
+        found.advice.append(
+            f'the mass of the views differs by {spread:.1%} rms: the beam or the exposure drifts; import again with --air, which '
+            'scales every view by its own air'
+        )
+
+
+def _jitter(found, scan, air):
+    """Unsteady motion along columns and rows."""
+    if not isinstance(scan.geometry, CircularGeometry) or found.suspects or scan.valid is not None:
+        return
+    values = outline_jitter(scan.projections - air, scan.geometry.angles)
+    known = [(x, name) for x, name in zip(values[::-1], ('rows', 'columns')) if np.isfinite(x)]
+    if known:
+        found.facts.append('jitter of the outline: ' + ', '.join(f'{x:.2g} pixels along {name}' for x, name in known))
+    if any(x > UNSTEADY for x, _ in known):
+        found.advice.append(
+            'the object or the panel moves from view to view: fit with -D rate_pose=2e-3,2e-4, and keep it if the held-out views '
+            'get better'
+        )
 
 
 def _plane(scan, air):
@@ -198,9 +234,7 @@ def _angles(found, scan, air):
         found.facts.append(
             f'axis: {shift:+.3g} mm on the panel ({shift / pixel:+.2g} pixels) lets them agree to {best:.2%}'
         )
-        found.advice.append(
-            f'the axis is off: add {shift:+.3g} mm to the second number of offDetector, or fit with -D rate_pose=2e-3,2e-4'
-        )
+        found.advice.append(f'the axis is off: add {shift:+.3g} mm to the second number of offDetector')
 
 
 def _named(views):

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import lingo_mi as lm
 from lingo_mi.geometry import circular
+from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import look
 
 PIXELS, SIZE = 96, 40
@@ -90,3 +92,33 @@ def test_noise(foot):
     noisy = -np.log(rng.poisson(2e4 * np.exp(-p)) / 2e4)
     fact = next(fact for fact in look(lm.Scan(foot.geometry, noisy)).facts if fact.startswith('noise'))
     assert float(fact.split(' of ')[1].split()[0]) == pytest.approx(2e4, rel=0.2)
+
+
+@pytest.fixture(scope='module')
+def dense():
+    return scanned('foot', views=90)
+
+
+@pytest.mark.parametrize(('deviation', 'advised'), [(0.4, False), (1.5, True)])
+def test_jitter_is_measured(dense, deviation, advised):
+    """To 30 %, of 90 views."""
+    by = np.random.default_rng(0).normal(0, deviation, (len(dense), 2))
+    moved = np.stack([ndimage.shift(v, s, order=1) for v, s in zip(dense.projections, by)])
+    found = look(lm.Scan(dense.geometry, moved))
+    fact = next(fact for fact in found.facts if fact.startswith('jitter'))
+    rows = float(fact.split(' pixels along rows')[0].split()[-1])
+    assert rows == pytest.approx(deviation, rel=0.3)
+    assert any('-D rate_pose' in line for line in found.advice) == advised
+
+
+def test_a_steady_outline(dense):
+    assert all(x < 0.15 for x in outline_jitter(dense.projections, dense.geometry.angles))
+    sparse = np.delete(dense.projections, np.arange(0, 90, 2), 0)
+    assert np.isnan(outline_jitter(sparse, dense.geometry.angles[1::2])).all()  # 8 degrees apart
+
+
+def test_parallel_views_have_one_mass():
+    scan = scanned('foot', 'parallel')
+    gain = 1 + 0.1 * np.sin(np.arange(len(scan)))
+    found = only(lm.Scan(scan.geometry, scan.projections * gain[:, None, None]), 'the mass of the views differs by 7')
+    assert found.advice and not look(scan).advice
