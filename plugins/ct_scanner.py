@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -12,8 +13,9 @@ from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.projectors.view import View
+from lingo_mi.scan import Dataset
 from lingo_mi.scene.data_files import data_file
-from lingo_mi.scene.description import NAMES, describe, parameter, read_scanner
+from lingo_mi.scene.description import NAMES, describe, own_grid, parameter, read_scanner
 
 
 class CTScanner(mi.Sensor):
@@ -39,7 +41,8 @@ class CTScanner(mi.Sensor):
        - Shift of the panel in mm, (v, u), positive v towards +z. (Default: 0)
      * - nVoxel, dVoxel
        - |string|
-       - The grid to reconstruct on, (x, y, z), and the voxel size in mm.
+       - The grid to reconstruct on, (x, y, z), and the voxel size in mm. With `projections`: in place of the file's own,
+         unless the file holds a true volume.
      * - offOrigin
        - |string|
        - Centre of that grid in mm. (Default: 0)
@@ -94,7 +97,7 @@ class CTScanner(mi.Sensor):
                 )
             projections = parameter(props, 'projections', '')
             if projections:
-                self.dataset = read_scan(data_file(projections, 'projections'))
+                self.dataset = self._measured(projections, props)
                 self.geometry = self.dataset.train.geometry
                 self.test_geometry = self.dataset.test.geometry if self.dataset.test else None
             else:
@@ -119,6 +122,15 @@ class CTScanner(mi.Sensor):
             + np.linalg.norm(self.geometry.offOrigin)
             + np.linalg.norm(self.geometry.sVoxel)
         )
+
+    @staticmethod
+    def _measured(name, props):
+        """A file of projections, on the voxels that the scene names."""
+        found = read_scan(data_file(name, 'projections'))
+        if found.volume is not None:  # the true one, on the file's own voxels
+            return found
+        scans = (s and replace(s, geometry=own_grid(props, s.geometry)) for s in (found.train, found.test))
+        return Dataset(*scans)
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
         """The sensor of one view, of this scan or of another geometry, with the same detector."""

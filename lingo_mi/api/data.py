@@ -109,7 +109,7 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
     """Read a measured or stored scan.
 
     path       a pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images,
-               `scan.npy` [view, v, u] with `scan.yml` beside it, or the Helsinki Tomography Challenge's .npz
+               `scan.npy` [view, v, u] with `scan.yml` beside it, or the .npz of a public scan
     geometry   the geometry file of an .npy, where it is another than that of the same stem
     views      how many of the views to fit, evenly spaced; the rest are held out (default: all)
 

@@ -76,7 +76,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--projections',
         metavar='F',
-        help='measured projections: X3D/NAF pickle, R2 folder, HTC .npz, '
+        help='measured projections: X3D/NAF pickle, R2 folder, HTC or walnut .npz, '
         '.npy with a geometry .yml beside it, or a folder of EXR images',
     )
     parser.add_argument(

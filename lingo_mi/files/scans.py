@@ -35,8 +35,7 @@ describe the scanner and are ignored.
 A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
 
-The Helsinki Tomography Challenge 2022 as .npz: `sinogram_<name>` [angles, pixels] of a fan beam, which is a
-cone beam with one row.
+Public measured scans as .npz: see `lingo_mi.files.public_scans`.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ import yaml
 
 from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import beside, new_folder, reading, replacing
-from lingo_mi.files import arrays, naf, plain_yaml, r2
+from lingo_mi.files import arrays, naf, plain_yaml, public_scans, r2
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import (
@@ -305,58 +304,17 @@ def _write_exr_folder(path, dataset):
         _dump_yaml(folder / 'geometry.yml', geometry, dataset.test and dataset.test.geometry, input='line_integral')
 
 
-# ---- Helsinki Tomography Challenge 2022 --------------------------------------------------------------------
-
-
-def _read_htc(path, name):
-    data = arrays.load_many(path)
-    names = sorted(key[len('sinogram_') :] for key in data if key.startswith('sinogram_'))
-    if not names or not {'DSO', 'DSD', 'dDetector', 'angles_deg'} <= data.keys():
-        raise InputError(
-            f'{path}: is no scan of the Helsinki Tomography Challenge (sinogram_<name>, DSO, '
-            'DSD, dDetector, '
-            'angles_deg), the only .npz scan that can be read; give .npy with a .yml beside it'
-        )
-    if name not in names:
-        raise InputError(f'{path}: has no sinogram {shown(name)}; it has {", ".join(names)}')
-    sinogram = arrays.numeric(data[f'sinogram_{name}'], f'{path}: sinogram_{name}', 2)
-    degrees = arrays.numeric(data['angles_deg'], f'{path}: angles_deg', 1).astype(float)
-    if len(degrees) != len(sinogram):
-        raise InputError(
-            f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these must agree'
-        )
-    if len(degrees) > 1 and np.isclose(degrees[-1] - degrees[0], 360):
-        degrees, sinogram = degrees[:-1], sinogram[:-1]
-    pixel = data['dDetector']
-    # Their source is at DSO (sin a, -cos a, 0) and their columns run along (cos a, sin a): ours at a - 90
-    # degrees. The row is as high as a pixel is wide; the slice is one voxel of the challenge's reference
-    # reconstructions.
-    geometry = to_geometry(
-        {
-            'DSO': data['DSO'],
-            'DSD': data['DSD'],
-            'nDetector': (1, sinogram.shape[1]),
-            'dDetector': pixel,
-            'nVoxel': (512, 512, 1),
-            'dVoxel': 0.1483,
-        },
-        np.radians(degrees - 90),
-        path,
-    )
-    return Dataset(make_scan(geometry, sinogram[:, None, :], path))
-
-
 # ---- any format --------------------------------------------------------------------------------------------
 
 
 def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Dataset:
     """Reads a scan; the format follows from the path.
 
-    path       .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: Helsinki
-               Tomography Challenge; a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR
+    path       .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: a public
+               scan (`public_scans`); a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR
                views)
     geometry   the geometry file of an .npy; without it, the .yml or .yaml of the same stem
-    name       which sinogram of an .npz
+    name       which sinogram of the Helsinki Tomography Challenge
 
     Returns a Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are
     None where the format has none. Raises InputError if a file is missing, damaged, unknown, or contradicts
@@ -381,7 +339,7 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
     if suffix == '.npy':
         return _read_npy(path, geometry)
     if suffix == '.npz':
-        return _read_htc(path, name)
+        return public_scans.read(path, name)
     raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
 
 

@@ -111,6 +111,14 @@ def _counts(props, name):
     return values
 
 
+def own_grid(props: Any, geometry: Geometry) -> Geometry:
+    """A geometry with the voxels that a plugin's properties name, where they name any."""
+    if not ('nVoxel' in props or 'dVoxel' in props):
+        return geometry
+    count = _counts(props, 'nVoxel') if 'nVoxel' in props else geometry.nVoxel
+    return geometry.with_volume(count, _numbers(props, 'dVoxel') if 'dVoxel' in props else geometry.dVoxel)
+
+
 def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     """The scan's and the held-out views' geometry from a plugin's properties."""
     mode = parameter(props, 'mode', 'cone')

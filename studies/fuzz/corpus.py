@@ -197,6 +197,9 @@ def scans() -> dict[str, list[Sample]]:
         posed | dict(poses='p.xml'),
     ]
     htc = dict(sinogram_ta=PROJECTIONS[0], DSO=410.0, DSD=553.0, dDetector=0.2, angles_deg=np.arange(4.0))
+    walnut = dict(
+        projections=PROJECTIONS, DSO=210.0, DSD=553.0, dDetector=[0.4, 0.4], angles=np.arange(3.0), air=np.float32(0.1)
+    )
     mask = npy(np.ones((3, 4, 5), bool))
     return {
         'naf': [
@@ -207,7 +210,7 @@ def scans() -> dict[str, list[Sample]]:
             Sample('s.npy', {'s.npy': npy(PROJECTIONS), 's.yml': Structured(g, as_yaml), 'm.npy': mask, 'p.xml': RTK})
             for g in geometries
         ],
-        'htc': [Sample('s.npz', {'s.npz': npz(htc)})],
+        'public scans': [Sample('s.npz', {'s.npz': npz(data)}) for data in (htc, walnut)],
         'exr folder': [
             Sample(
                 '',

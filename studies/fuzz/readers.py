@@ -129,8 +129,8 @@ def scenes() -> dict[str, tuple[Callable[[Path, Random], None], list[Sample]]]:
 
 
 NAMES = (
-    'npy', 'npz', 'nii', 'nii.gz', 'hdr, img', 'nrrd', 'mha, mhd', 'raw', 'tiff', 'dicom', 'naf', 'r2', 'npy, yml', 'htc',
-    'exr folder', 'ply', 'exr', 'poses', 'checkpoint', 'scene',
+    'npy', 'npz', 'nii', 'nii.gz', 'hdr, img', 'nrrd', 'mha, mhd', 'raw', 'tiff', 'dicom', 'naf', 'r2', 'npy, yml',
+    'public scans', 'exr folder', 'ply', 'exr', 'poses', 'checkpoint', 'scene',
 )  # fmt: skip
 
 

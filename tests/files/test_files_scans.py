@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
@@ -11,6 +12,7 @@ import yaml
 from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.reconstruction import CGLS
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -297,6 +299,74 @@ def test_htc_choice_and_bad_input(tmp_path):
         ({'dDetector': 'a'}, 'must be numbers'),
     ):
         assert 'htc.npz' in refused(htc(tmp_path, **changes), match)
+
+
+def walnut(tmp_path, **changes):
+    data = {
+        'projections': np.arange(120, dtype=np.float16).reshape(4, 5, 6),
+        'angles': np.array([0, -90, -180, -270.0]),
+        'DSO': 210.66,
+        'DSD': 553.74,
+        'dDetector': np.array([0.4, 0.5]),
+        'air': np.float32(0.5),
+        'source': 'a walnut',
+    } | changes
+    np.savez(tmp_path / 'walnut.npz', **{key: v for key, v in data.items() if v is not ...})
+    return tmp_path / 'walnut.npz'
+
+
+def test_walnut_geometry(tmp_path):
+    scan = read_scan(walnut(tmp_path)).train
+    g, rays = scan.geometry, scan.geometry.rays()
+    assert (g.nDetector, g.dDetector, g.nVoxel, g.dVoxel) == ((5, 6), (0.4, 0.5), (128,) * 3, (0.305,) * 3)
+    # theirs: source DSO (-sin a, cos a, 0), columns along (cos a, sin a), which are turned round here
+    for view, a in enumerate(np.radians([0, -90, -180, -270])):
+        np.testing.assert_allclose(rays.source[view], 210.66 * np.array([-np.sin(a), np.cos(a), 0]), atol=1e-9)
+        np.testing.assert_allclose(rays.u[view] / 0.5, [-np.cos(a), -np.sin(a), 0], atol=1e-12)
+        assert rays.v[view][2] < 0  # row 0 is the top
+    np.testing.assert_array_equal(scan.projections, np.arange(120.0).reshape(4, 5, 6)[:, :, ::-1] - 0.5)
+
+
+def test_bad_walnuts(tmp_path):
+    for changes, match in (
+        ({'air': ...}, 'the only .npz scans'),
+        ({'projections': ...}, 'the only .npz scans'),
+        ({'angles': np.arange(5.0)}, 'must agree'),
+        ({'projections': np.ones((4, 5))}, '3 dimensions'),
+        ({'projections': np.full((4, 5, 6), np.nan)}, 'NaN'),
+        ({'air': np.ones(2)}, 'one number'),
+        ({'air': np.float32('nan')}, 'NaN'),
+        ({'DSO': 600.0}, 'DSD >= DSO'),
+        ({'dDetector': 'a'}, 'must be numbers'),
+    ):
+        assert 'walnut.npz' in refused(walnut(tmp_path, **changes), match)
+
+
+def test_the_voxels_of_a_scene_are_used_with_measured_projections(tmp_path):
+    path = walnut(tmp_path)
+    for given, count, size in (
+        (dict(nVoxel='7, 8, 9', dVoxel='2'), (7, 8, 9), (2.0,) * 3),
+        (dict(dVoxel='1, 2, 3'), (128,) * 3, (1.0, 2.0, 3.0)),
+        ({}, (128,) * 3, (0.305,) * 3),
+    ):
+        scanner = mi.load_dict({'type': 'ct_scanner', 'projections': str(path), **given})
+        assert (scanner.geometry.nVoxel, scanner.geometry.dVoxel) == (count, size)
+        assert scanner.dataset.train.geometry is scanner.geometry
+
+
+def test_measured_walnut(data):
+    """A volume meets the views where they turn as stated, and not where they turn the other way."""
+    path = data / 'walnut_cone.npz'
+    if not path.exists():
+        pytest.skip('LINGO_MI_DATA names no folder with walnut_cone.npz')
+    scan = read_scan(path).train
+    scan = Scan(scan.geometry.binned(4), scan.projections.reshape(120, 64, 4, 64, 4).mean((2, 4))).subset(
+        range(0, 120, 3)
+    )
+    scan = replace(scan, geometry=scan.geometry.with_volume(64, 0.61))
+    other = replace(scan, geometry=replace(scan.geometry, angles=-scan.geometry.angles))
+    residual, wrong = (CGLS(niter=8).run(s).residuals[-1] for s in (scan, other))
+    assert residual < 0.05 and wrong > 1.5 * residual
 
 
 def fan_fbp(scan, n, size):
