@@ -219,13 +219,13 @@ def as_path(name: str, value: Any) -> Path:
         raise InputError(f'{name} must be a path, not {type(value).__name__}') from None
 
 
-def optional(module: str) -> Any:
-    """Imports a package of the `formats` extra. Raises InputError with the command that installs it."""
+def optional(module: str, extra: str = 'formats') -> Any:
+    """Imports a package of an extra. Raises InputError with the command that installs it."""
     import importlib
 
     try:
         return importlib.import_module(module)
     except ImportError:
         raise InputError(
-            f"this format needs the package {module}: pip install '.[formats]' in a checkout of lingo_mi"
+            f"this format needs the package {module}: pip install '.[{extra}]' in a checkout of lingo_mi"
         ) from None

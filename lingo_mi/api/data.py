@@ -135,7 +135,8 @@ def load_raw(
 ) -> Scan:
     """Read a scanner's raw frames and turn them into line integrals, one frame at a time.
 
-    frames     a folder of TIFF or EDF images, a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as NXtomo or DXchange
+    frames     a folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as
+               NXtomo or DXchange
     geometry   of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml
     progress   whether to show a progress bar on standard error
     options    flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');

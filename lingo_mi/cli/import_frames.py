@@ -9,7 +9,7 @@ from lingo_mi.errors import InputError
 EPILOG = """\
 examples:
   lingo-mi import frames/ --flats flats/ --darks darks/ --geometry scan.yml --out scan.npy
-      folders of TIFF or EDF images; scan.yml needs DSO, DSD, dDetector and angles or totalAngle
+      folders of images; scan.yml needs DSO, DSD, dDetector and angles or totalAngle
   lingo-mi import tomo.h5 --geometry scan.yml --binning 2 --out scan.npy
       NXtomo or DXchange, with its own flats, darks and angles
   lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
@@ -20,7 +20,10 @@ examples:
 def arguments() -> argparse.Namespace:
     parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add('frames', help='a folder of .tif or .edf images, a multi-page .tif, a .edf, .npy [n, v, u], or .h5 / .nxs')
+    add(
+        'frames',
+        help='a folder of .tif, .edf, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, .npy [n, v, u], or .h5 / .nxs',
+    )
     add('--geometry', required=True, metavar='F', help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml")
     add(
         '--out', required=True, type=Path, metavar='F.npy', help='the scan; F.yml and F.valid.npy are written beside it'

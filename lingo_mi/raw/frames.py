@@ -1,4 +1,4 @@
-"""Raw frames, read one at a time: a TIFF stack, a folder of TIFF or EDF images, a .npy, or HDF5 (NXtomo, DXchange)."""
+"""Raw frames, read one at a time: a TIFF stack, a folder of images (TIFF, EDF, those that RTK reads), a .npy, or HDF5."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from lingo_mi.file_access import one_line, optional, reading
 from lingo_mi.files import arrays
 from lingo_mi.files.slices import read_tiff_file, require_chain
 
-IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'}
+RTK = '.his', '.hnd', '.hnc', '.xim'  # of Elekta's and Varian's scanners, one frame a file
+IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'} | dict.fromkeys(RTK, 'itk')
 HDF5 = ('.h5', '.hdf5', '.hdf', '.nxs', '.nx')
 
 
@@ -78,8 +79,8 @@ class Recording:
 def open_recording(path: PathLike | str) -> Recording:
     """Opens raw frames; nothing but the first frame is read.
 
-    path   a folder of .tif, .tiff or .edf images, in the order of the numbers in their names; a multi-page .tif; a
-           multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data)
+    path   a folder of .tif, .tiff, .edf, .his, .hnd, .hnc or .xim images, in the order of the numbers in their names; a
+           multi-page .tif; a multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data)
 
     Raises InputError where the path is missing or unknown, or a package is needed that is not installed.
     """
@@ -93,6 +94,8 @@ def open_recording(path: PathLike | str) -> Recording:
         return Recording(_array(path))
     if suffix in HDF5:
         return _hdf5(path)
+    if suffix in RTK:
+        raise InputError(f'{path}: is one frame; give the folder of the frames')
     if suffix in IMAGES:
         return Recording(_image_stack(path))
     raise InputError(
@@ -107,7 +110,7 @@ def _natural(path):
 def _folder(path):
     files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGES), key=_natural)
     if not files:
-        raise InputError(f'{path}: holds no .tif, .tiff or .edf images; give the folder of the frames')
+        raise InputError(f'{path}: holds no {", ".join(IMAGES)} images; give the folder of the frames')
     first = _checked(path, lambda: _image(files[0]))
 
     def read(i):
@@ -122,7 +125,13 @@ def _folder(path):
 
 
 def _image(path):
-    if IMAGES[path.suffix.lower()] == 'fabio':
+    package = IMAGES[path.suffix.lower()]
+    if package == 'itk':
+        itk = optional('itk', 'reference')
+        if not hasattr(itk, 'RTK'):  # to ask for it loads it, and it tells ITK of its formats
+            raise InputError(f"{path}: needs RTK: pip install '.[reference]' in a checkout of lingo_mi")
+        image = np.asarray(itk.imread(str(path)))
+    elif package == 'fabio':
         with optional('fabio').open(str(path)) as file:
             image = np.asarray(file.data)
     else:

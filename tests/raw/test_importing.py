@@ -1,5 +1,7 @@
 """Raw frames to line integrals: the truth comes back, from every layout, and what is wrong is said in one line."""
 
+import struct
+import sys
 import warnings
 
 import numpy as np
@@ -8,6 +10,8 @@ import yaml
 
 import lingo_mi as lm
 from helpers.raw_frames import raw_frames
+from lingo_mi.errors import InputError
+from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.importing import Options, import_raw
 from lingo_mi.raw.line_integrals import photons_of_images
 
@@ -87,6 +91,42 @@ def test_edf(tmp_path, raw, scan_yml):
     for i, image in enumerate(raw.views):
         edf(data=image).write(str(tmp_path / 'views' / f'{i}.edf'))
     check(load(tmp_path / 'views', scan_yml, **save(tmp_path, raw)), raw)
+
+
+def write_his(path, image):
+    """Elekta's format: a header of 68 bytes with corners, count and type, 32 further bytes, then the counts."""
+    header, n = bytearray(100), len(image)
+    header[:4] = 0, 0x70, 68, 0
+    struct.pack_into('<H', header, 10, 32)
+    struct.pack_into('<5H', header, 12, 1, 1, n, n, 1)
+    header[32] = 4
+    path.write_bytes(bytes(header) + image.astype('<u2').tobytes())
+
+
+def test_frames_that_rtk_reads(tmp_path):
+    pytest.importorskip('itk')
+    frames = np.random.default_rng(0).integers(0, 60_000, (11, 8, 8))
+    for i, image in enumerate(frames):
+        write_his(tmp_path / f'{i}.his', image)
+    found = open_recording(tmp_path).views
+    assert (len(found), found.shape, found.dtype) == (11, (8, 8), np.uint16)
+    np.testing.assert_array_equal([found[i] for i in range(11)], frames)
+    (tmp_path / '3.his').write_bytes((tmp_path / '3.his').read_bytes()[:90])
+    with pytest.raises(InputError, match='3.his|frame 3'):
+        open_recording(tmp_path).views[3]
+
+
+def test_one_frame_is_no_recording(tmp_path):
+    write_his(tmp_path / '0.his', np.zeros((8, 8)))
+    with pytest.raises(InputError, match='give the folder'):
+        open_recording(tmp_path / '0.his')
+
+
+def test_what_rtk_needs(tmp_path, monkeypatch):
+    write_his(tmp_path / '0.his', np.zeros((8, 8)))
+    monkeypatch.setitem(sys.modules, 'itk', None)
+    with pytest.raises(InputError, match="'.\\[reference\\]'"):
+        open_recording(tmp_path)
 
 
 @pytest.mark.parametrize('layout', ['dxchange', 'nxtomo'])
