@@ -5,7 +5,7 @@
 
 A mutant is the package with one expression changed: `+` for `-`, `<` for `<=`, `and` for `or`, a number doubled, a flag
 turned round, a text with a letter more. Texts of messages, annotations and docstrings are left alone. The test files that
-execute the changed line run on it, the shortest first, until one fails. A mutant that none notices has survived: it needs a
+execute the changed line run on it until one fails, those first that name its module. A mutant that none notices has survived: it needs a
 test, or a reason in tests/mutants_accepted.json.
 
 Two copies of the checkout work side by side. Which test executes which line is measured first, in one run of all tests
@@ -20,6 +20,7 @@ import ast
 import json
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -243,10 +244,14 @@ def measure_lines(checkouts: Queue[Checkout], known: dict, keep: Callable[[dict]
 
 
 def tests_of(mutant: Mutant, lines: dict) -> list[tuple[str, float]]:
-    """Test files that execute a mutant's line, with their seconds: its own first, then the shortest."""
+    """Test files that execute a mutant's line, with their seconds: its own first, then those that name it, then the shortest."""
     own = Path(mutant.file).stem
     found = [(f, x['seconds']) for f, x in lines.items() if mutant.line in x['lines'].get(mutant.file, ())]
-    return sorted(found, key=lambda x: (own not in x[0], x[1]))
+
+    def names(file):
+        return bool(re.search(rf'\b{own}\b', (ROOT / file).read_text(encoding='utf-8')))
+
+    return sorted(found, key=lambda x: (own not in x[0], not names(x[0]), x[1]))
 
 
 def accepted() -> set[tuple[str, str, str]]:
