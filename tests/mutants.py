@@ -5,8 +5,8 @@
 
 A mutant is the package with one expression changed: `+` for `-`, `<` for `<=`, `and` for `or`, a number doubled, a flag
 turned round, a text with a letter more. Texts of messages, annotations and docstrings are left alone. The test files that
-execute the changed line run on it until one fails, those first that name its module. A mutant that none notices has survived: it needs a
-test, or a reason in tests/mutants_accepted.json.
+execute the changed line run on it until one fails, those first that name its module. A mutant that none notices has
+survived: it needs a test, or a reason in tests/mutants_accepted.json.
 
 Two copies of the checkout work side by side. Which test executes which line is measured first, in one run of all tests
 (`--lines FILE` keeps it). With `--outcomes FILE` a stopped run goes on where it was, and after new tests only the survivors
