@@ -129,8 +129,11 @@ class CTScanner(mi.Sensor):
         found = read_scan(data_file(name, 'projections'))
         if found.volume is not None:  # the true one, on the file's own voxels
             return found
-        scans = (s and replace(s, geometry=own_grid(props, s.geometry)) for s in (found.train, found.test))
-        return Dataset(*scans)
+
+        def on_grid(scan):
+            return replace(scan, geometry=own_grid(props, scan.geometry))
+
+        return Dataset(on_grid(found.train), found.test and on_grid(found.test))
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
         """The sensor of one view, of this scan or of another geometry, with the same detector."""
