@@ -82,7 +82,9 @@ class ModelSettings:
 class LossSettings:
     """The loss (paper, section III-C).
 
+    lambda_l1          weight of the mean absolute error (1)
     lambda_ssim        weight of 1 - SSIM (0.25)
+    lambda_gradient    weight of the root mean square of the error's gradient (own; see `losses.gradient_error`)
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
@@ -92,7 +94,9 @@ class LossSettings:
                        factor on the densification statistic only (Adam cancels a constant factor of the loss)
     """
 
+    lambda_l1: float = 1.0
     lambda_ssim: float = 0.25
+    lambda_gradient: float = 0.0
     lambda_tv: float = 0.05
     tv_size: int = 32
     tv_stride: int = 1
@@ -100,7 +104,12 @@ class LossSettings:
     loss_scale: str = 'none'
 
     def __post_init__(self):
-        require_ranges(self, lambda_ssim=(0, 1e6), lambda_tv=(0, 1e6), tv_size=(1, 1e6), tv_stride=(1, 1e6))
+        weights = dict.fromkeys(('lambda_l1', 'lambda_ssim', 'lambda_gradient', 'lambda_tv'), (0, 1e6))
+        require_ranges(self, **weights, tv_size=(1, 1e6), tv_stride=(1, 1e6))
+        _require(
+            self.lambda_l1 + self.lambda_ssim + self.lambda_gradient > 0,
+            'one of lambda_l1, lambda_ssim and lambda_gradient must be above 0: nothing else compares with the projections',
+        )
         _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
         _require(
             self.loss_scale in ('none', 'dynamic', 'statistic'),

@@ -47,7 +47,9 @@ def test_values(name, text, value):
         *(
             (name, '-1', f'{name} must lie in [0, ')
             for name in (
+                'lambda_l1',
                 'lambda_ssim',
+                'lambda_gradient',
                 'lambda_tv',
                 'epsilon',
                 'decay_steps',
