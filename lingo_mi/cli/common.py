@@ -144,6 +144,46 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
     return take_scan(scene, views or 0, volume, seed)
 
 
+def cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --cluster and --threads; see `runner_of`."""
+    parser.add_argument(
+        '--cluster',
+        metavar='ADDRESS|local:N',
+        help="work on a Dask cluster: its scheduler's address or file, or N processes of this machine (default: in this process)",
+    )
+    parser.add_argument(
+        '--threads',
+        type=int,
+        default=0,
+        metavar='N',
+        help='of a worker on the CPU (default: all that it has; of local:N, its share)',
+    )
+
+
+@contextmanager
+def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
+    """What runs jobs, by the arguments that `cluster_arguments` added: this process, or a cluster, which is open in the block.
+
+    folder   that all workers must see; it exists
+
+    Raises InputError where --cluster leads nowhere.
+    """
+    from lingo_mi.jobs.in_process import InProcess
+
+    if args.threads < 0:
+        raise InputError(f'--threads must be at least 1, not {args.threads}')
+    if args.cluster is None:
+        if args.threads:
+            raise InputError('--threads goes with --cluster')
+        yield InProcess()
+        return
+    from lingo_mi.jobs.cluster import opened
+
+    with opened(args.cluster, folder, args.threads, args.variant) as cluster:
+        print(f'dashboard: {cluster.dashboard}', file=sys.stderr)
+        yield cluster
+
+
 def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str) -> None:
     """Add the arguments that say which documentation to renew: --docs, --document, --figures; see `docs_of`.
 
