@@ -6,6 +6,7 @@ import argparse
 import io
 import os
 import shlex
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -123,12 +124,13 @@ def check_seed(seed: int) -> None:
         raise InputError(f'--seed must not be negative, nor above {MOST_SEED}, but is {shown(seed)}')
 
 
-def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0) -> Any:
+def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0, slab: int = 0) -> Any:
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
     scene   the `LoadedScene` of args.scene
     views   how many evenly spaced views to use (None: all)
     seed    of the noise, where the scene's detector has any
+    slab    slices of the volume that are in memory at once (0: all)
     """
     from lingo_mi.files.scans import read_scan
     from lingo_mi.files.volumes import read_volume
@@ -137,7 +139,8 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
 
     if args.projections:
         dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
-        check_memory(dataset.train.geometry)
+        geometry = dataset.train.geometry
+        check_memory(geometry.slab(0, min(slab, geometry.nVoxel[2])) if slab else geometry)
         warn_if_truncated(dataset.train.geometry)
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
@@ -229,6 +232,9 @@ def writing_file(path: Path) -> Iterator[None]:
         for leftover, target in leftovers(path.parent):
             if target == path.name[-40:]:
                 leftover.unlink(missing_ok=True)
+        for leftover, target in leftovers(path.parent, folders=True):
+            if target == path.name[-40:]:
+                shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 
