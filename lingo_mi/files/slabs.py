@@ -71,9 +71,10 @@ def _write_nifti(path, geometry, slabs, description):
     header = volume_header(path, geometry.nVoxel, geometry.dVoxel, first_voxel(geometry), description)
     with ExitStack() as stack:
         temporary = stack.enter_context(replacing(path))
-        gzipped = path.suffix == '.gz'
-        # The level at which nibabel writes, too.
-        file = stack.enter_context(gzip.open(temporary, 'wb', 1) if gzipped else open(temporary, 'wb'))
+        if path.suffix == '.gz':
+            file = stack.enter_context(gzip.open(temporary, 'wb', 1))  # nibabel's level
+        else:
+            file = stack.enter_context(open(temporary, 'wb'))
         file.write(header)
         for _, slab in _checked(path, geometry, slabs):
             file.write(slab.astype('<f4', copy=False).tobytes(order='F'))

@@ -1,8 +1,9 @@
 """The stages of a fit, as functions of the size of everything; run as a program, it measures one of them.
 
-    python -m lingo_mi.studies.growth.stages step 64 128 16 10000    # voxels a side, pixels a side, views, Gaussians
+    python -m lingo_mi.studies.growth.stages step 64,128,16,10000    # voxels a side, pixels a side, views, Gaussians; more sizes
 
-prints JSON: CPU seconds of a call (user and system), and the peak of memory above what a tiny call leaves, in bytes.
+prints a line of JSON for every size: CPU seconds of a call (user and system), and the peak of memory in bytes, inputs included,
+above what libraries and a tiny call take.
 """
 
 from __future__ import annotations
@@ -179,10 +180,21 @@ def _save(size: Size):
     return save
 
 
-def _peak() -> int:
-    """The largest memory that this process has had since `_forget_peak`, bytes."""
+def _memory(name: str) -> int:
+    """VmRSS, the memory of this process, or VmHWM, the largest since `_forget_peak`, bytes."""
     lines = Path('/proc/self/status').read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith('VmHWM'))
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def _forget_peak() -> int:
+    """Give back what nobody uses, and let the peak begin anew; the memory that is in use, bytes."""
+    import drjit as dr
+
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    Path('/proc/self/clear_refs').write_text('5')
+    return _memory('VmRSS')
 
 
 def _cpu() -> float:
@@ -190,11 +202,10 @@ def _cpu() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def measure(stage: str, size: Size, least: float = 0.5) -> dict:
-    """CPU seconds of a call, repeated until `least` seconds have gone; and the peak of memory above a tiny call's, bytes."""
-    prepare(stage, Size(*TINY))()
-    gc.collect()
-    before = _peak()
+def measure(stage: str, size: Size, least: float = 0.2) -> dict:
+    """CPU seconds of a call, the second and later ones for `least` seconds unless the first takes ten times that; and the peak of
+    memory, bytes."""
+    before = _forget_peak()
     call = prepare(stage, size)
     began, calls = _cpu(), 0
     while calls < 2 and _cpu() - began < 10 * least or _cpu() - began < least:
@@ -202,12 +213,13 @@ def measure(stage: str, size: Size, least: float = 0.5) -> dict:
             began = _cpu()
         call()
         calls += 1
-    calls = max(calls - 1, 1)
-    return dict(seconds=(_cpu() - began) / calls, peak=_peak() - before)
+    return dict(seconds=(_cpu() - began) / max(calls - 1, 1), peak=_memory('VmHWM') - before)
 
 
 if __name__ == '__main__':
     from lingo_mi.runtime import use_variant
 
     use_variant('llvm_ad_mono')
-    print(json.dumps(measure(sys.argv[1], Size(*map(int, sys.argv[2:6])))))
+    prepare(sys.argv[1], Size(*TINY))()
+    for word in sys.argv[2:]:
+        print(json.dumps(measure(sys.argv[1], Size(*map(int, word.split(','))))), flush=True)
