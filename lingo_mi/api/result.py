@@ -15,6 +15,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, replacing, writing
+from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
@@ -31,6 +32,7 @@ from lingo_mi.output_folder import (
     require_ours,
     require_together,
 )
+from lingo_mi.parsing import whole
 from lingo_mi.report.figures import overview
 from lingo_mi.report.page import headline
 from lingo_mi.results.measure import Measured, measure
@@ -119,6 +121,29 @@ class Result:
                 'lm.reconstruct(scan, algorithm, start=result, views=N)'
             )
         return volume
+
+    def save_volume(
+        self, path: str | PathLike, geometry: Geometry | None = None, *, slab: int = THICKNESS, force: bool = False
+    ) -> Path:
+        """Write `volume` slab by slab, so that it need not fit into memory; returns the path.
+
+        path       .nii, .nii.gz, or a new .ome.zarr; its folder is made
+        geometry   whose grid (default: the scan's); `scan.geometry.with_volume(nVoxel, dVoxel)` has a finer one
+        slab       slices that are in memory at once
+        force      replace an earlier file
+
+        Raises InputError as `volume`, and where the file is there already or cannot be written.
+
+            result.save_volume('foot.ome.zarr', scan.geometry.with_volume(2048, 0.125))
+        """
+        path, slab = as_path('path', path), whole('slab', slab, 1)
+        with writing(path):
+            if path.exists() and not force:
+                raise InputError(f'{path}: exists already; give force=True to replace it')
+            path.parent.mkdir(parents=True, exist_ok=True)
+        grid = self.fitted.geometry if geometry is None else geometry
+        write_slabs(path, grid, (self.volume(grid.slab(*part)) for part in grid.slabs(slab)))
+        return path
 
     def render(self, geometry: Geometry | None = None) -> np.ndarray:
         """Line integrals in the views of any geometry (default: the scan's), float32 [view, v, u], density times mm.

@@ -11,6 +11,7 @@ from lingo_mi.cli.common import guard
 # In the order of the help: command -> what it does.
 COMMANDS = {
     'fit': 'fit a cloud of 3D Gaussians to a scan; makes a volume and new views',
+    'batch': 'fit a cohort, a list of scans, here or on a cluster; makes a table of all results',
     'reconstruct': 'reconstruct a volume on voxels: FDK, SART, ASD-POCS and others',
     'import': "turn a scanner's raw frames into a scan",
     'inspect': 'look at a scan before work: air, noise, truncation, order of the views, axis',
@@ -21,6 +22,7 @@ COMMANDS = {
     'accuracy': 'measure what accuracy costs in time',
     'hard-cases': 'measure the hard cases: needles, grazing rays, coincident Gaussians',
     'effects': 'measure what modelling the effects of a real detector is worth',
+    'growth': 'measure how time and memory grow with voxels, pixels, views and Gaussians',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
     'bench-recon': 'time reconstruction on voxels against other packages',
     'fuzz': 'give every reader mutated files: a value, or one line that refuses it',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,10 @@ from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
+
+AT_ONCE = (
+    2**25
+)  # voxels that are sampled at once: a larger volume is made in slabs, since sampling takes several times its memory
 
 
 class CloudModel:
@@ -78,16 +83,27 @@ class CloudModel:
         """
         if not self.settings.volumetric:
             return None
-        own = self.geometry
-        if geometry is None:
-            grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+        own, gaussians = self.geometry, state.gaussians(self.settings)
+        extent, wanted = self.settings.model.extent, geometry or own
+
+        def values(part):
+            if part is None:
+                grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+            else:
+                low = np.array(part.offOrigin) - np.array(part.sVoxel) / 2 - own.offOrigin
+                step = np.array(part.dVoxel)
+                grid = Grid(vector64(low * own.scale), vector64(step * own.scale), part.nVoxel)
+            return grid.volume(voxelize(*gaussians, grid=grid, extent=extent, deep=True))
+
+        if math.prod(wanted.nVoxel) <= AT_ONCE:
+            out = values(geometry)
         else:
-            low = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 - own.offOrigin
-            step = np.array(geometry.dVoxel)
-            grid = Grid(vector64(low * own.scale), vector64(step * own.scale), geometry.nVoxel)
-        gaussians, extent = state.gaussians(self.settings), self.settings.model.extent
-        values = voxelize(*gaussians, grid=grid, extent=extent, deep=True)
-        return grid.volume(values) * np.float32(self.unit)
+            nx, ny, _ = wanted.nVoxel
+            out = np.empty(wanted.nVoxel, np.float32)
+            for begin, end in wanted.slabs(max(1, AT_ONCE // (4 * nx * ny))):
+                out[:, :, begin:end] = values(wanted.slab(begin, end))
+        out *= np.float32(self.unit)
+        return out
 
     def shares(self, state: DeviceState) -> Any:
         """The second material's share in every Gaussian's density, Float [N]; None for one material."""

@@ -349,6 +349,23 @@ class Geometry(ABC):
         """The same scan with another voxel grid, (x, y, z), about the same centre."""
         return replace(self, nVoxel=nVoxel, dVoxel=dVoxel)
 
+    def slab(self, begin: int, end: int) -> Geometry:
+        """The same scan with the slices begin <= z < end of the voxel grid alone, where they lie.
+
+        Raises InputError where there are no such slices.
+
+            geometry.slab(0, 32).nVoxel   # (512, 512, 32)
+        """
+        (nx, ny, nz), (x, y, z) = self.nVoxel, self.offOrigin
+        if not 0 <= begin < end <= nz:
+            raise InputError(f'the volume has the slices 0 to {nz}, so none from {begin} to {end}')
+        middle = z + ((begin + end) / 2 - nz / 2) * self.dVoxel[2]
+        return replace(self, nVoxel=(nx, ny, end - begin), offOrigin=(x, y, middle))
+
+    def slabs(self, thickness: int) -> list[tuple[int, int]]:
+        """(begin, end) of slabs of so many slices along z, from the first; the last may be thinner."""
+        return [(z, min(z + thickness, self.nVoxel[2])) for z in range(0, self.nVoxel[2], thickness)]
+
     @property
     def sDetector(self) -> tuple[float, float]:
         """Size of the panel, (v, u), mm."""

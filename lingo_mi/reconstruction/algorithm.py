@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from lingo_mi.arrays import as_numpy, short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path, writing
+from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import compared
@@ -59,9 +60,9 @@ class Reconstruction:
         return compared(self.volume, as_numpy(truth, 'the true volume'))
 
     def save(self, path: str | PathLike, *, force: bool = False) -> Path:
-        """Write the volume as NIfTI, densities per mm, with voxel size and position in mm; returns the path.
+        """Write the volume, densities per mm, with voxel size and position in mm; returns the path.
 
-        path    .nii or .nii.gz; its folder is made
+        path    .nii, .nii.gz, or a new .ome.zarr; its folder is made
         force   replace an earlier file
 
         Raises InputError for another suffix, a file that is there already, or one that cannot be written.
@@ -71,7 +72,10 @@ class Reconstruction:
             if path.exists() and not force:
                 raise InputError(f'{path}: exists already; give force=True to replace it')
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+            if path.name.endswith(ZARR):
+                write_slabs(path, geometry, (self.volume[:, :, a:b] for a, b in geometry.slabs(THICKNESS)))
+            else:
+                write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
         return path
 
 

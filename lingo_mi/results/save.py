@@ -39,7 +39,14 @@ from lingo_mi.results.scene_file import write_scene
 
 
 def save(
-    folder: Path, fitted: Fitted, measured: Measured, *, title: str = 'fit', method: str = '', command: str = ''
+    folder: Path,
+    fitted: Fitted,
+    measured: Measured,
+    *,
+    title: str = 'fit',
+    method: str = '',
+    command: str = '',
+    request: dict | None = None,
 ) -> dict:
     """Write all files into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `report.png`, `report.html`, `metrics.json`. Files of an earlier result are replaced or removed, others are left alone.
@@ -51,6 +58,7 @@ def save(
     title      of the report
     method     the recipe's name, for metrics.json and the report
     command    the command line that reproduces the result, for the same
+    request    what was asked for, if metrics.json is to say so
 
     For alpha compositing there is no volume, and no scene, because no integrator renders it.
     Raises InputError if a file cannot be written.
@@ -81,6 +89,7 @@ def save(
         angles=np.degrees(geometry.angles).tolist(),
         test_angles=[] if measured.test is None else np.degrees(measured.test.geometry.angles).tolist(),
         versions=versions(),
+        **({} if request is None else dict(request=request)),
     )
     try:
         write_report(folder, report_data(fitted, replace(measured, numbers=numbers), title))
