@@ -32,7 +32,7 @@ from lingo_mi.output_folder import (
     require_together,
 )
 from lingo_mi.report.figures import overview
-from lingo_mi.report.page import headline
+from lingo_mi.report.numbers import headline
 from lingo_mi.results.measure import Measured, measure
 from lingo_mi.results.save import report_data, result_names, save
 from lingo_mi.runtime import ensure_variant
