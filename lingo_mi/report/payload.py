@@ -13,7 +13,7 @@ from lingo_mi.report.packing import MOST_VOXELS, Packed, bits_within, pack, prev
 from lingo_mi.report.planes import grey_range, planes, richest
 
 MOST_PIXELS = 60 * 256**2  # of all held-out views in a page, each of rendered and measured
-VOLUME_BYTES, VIEW_BYTES = 20e6, 6e6  # as text; with libraries, cloud and surfaces a page stays below 30 MB
+VOLUME_BYTES, VIEW_BYTES = 19e6, 6e6  # as text; with libraries, cloud and surfaces a page stays below 30 MB
 SURFACE_VOXELS, MOST_VERTICES = 112, 60_000
 
 Arrays = dict[str, Packed]
@@ -95,17 +95,22 @@ def views(
     count, by = len(first), 1
     while count * (first.shape[1] // by) * (first.shape[2] // by) > MOST_PIXELS and min(first.shape[1:]) // by >= 256:
         by += 1
-    count = min(count, max(1, MOST_PIXELS // max(1, (first.shape[1] // by) * (first.shape[2] // by))))
-    order = np.argsort(np.asarray(angles), kind='stable')[np.arange(count) * len(first) // count]
-    images = {**rendered, **({} if measured is None else {'Measured': measured})}
-    small = {name: _binned(v[order], by) for name, v in images.items()}
-    low = min(float(v.min()) for v in small.values())
-    high = max(float(v.max()) for v in small.values())
-    # Packed as [u, v, view]: neighbours in a row are most alike.
-    turned = {name: np.ascontiguousarray(v.transpose(2, 1, 0)) for name, v in small.items()}
-    bits = bits_within(list(turned.values()), low, high, budget) or 8
+    while True:
+        size = max(1, (first.shape[1] // by) * (first.shape[2] // by))
+        count = min(len(first), max(1, MOST_PIXELS // size))
+        order = np.argsort(np.asarray(angles), kind='stable')[np.arange(count) * len(first) // count]
+        images = {**rendered, **({} if measured is None else {'Measured': measured})}
+        small = {name: _binned(v[order], by) for name, v in images.items()}
+        low = min(float(v.min()) for v in small.values())
+        high = max(float(v.max()) for v in small.values())
+        # Packed as [u, v, view]: neighbours in a row are most alike.
+        turned = {name: np.ascontiguousarray(v.transpose(2, 1, 0)) for name, v in small.items()}
+        bits = bits_within(list(turned.values()), low, high, budget)
+        if bits is not None or min(first.shape[1:]) // (by + 1) < 16:
+            break
+        by += 1
     for i, image in enumerate(turned.values()):
-        arrays[f'views{i}'] = pack(image, low, high, bits)
+        arrays[f'views{i}'] = pack(image, low, high, bits or 8)
     shown = next(iter(small.values()))
     return dict(
         shape=list(shown.shape),

@@ -29,6 +29,6 @@ function shown(value, step) {
   if (value === 0) return '0';
   const size = Math.abs(value);
   if (size < 1e-4 || size >= 1e6) return value.toExponential(3);
-  const digits = Math.min(8, Math.max(0, Math.ceil(-Math.log10(step || size * 1e-5))));
-  return value.toFixed(digits);
+  if (!step) return String(Number(value.toPrecision(5)));
+  return value.toFixed(Math.min(8, Math.max(0, Math.ceil(-Math.log10(step)))));
 }
