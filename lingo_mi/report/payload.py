@@ -31,7 +31,11 @@ def payload(data: ReportData) -> tuple[dict, Arrays]:
             volumes, data.spacing, data.centre, arrays, 'Truth' if data.truth is not None else None
         )
     if data.views is not None:
-        known['views'] = views({'Rendered': data.views}, data.views_truth, data.views_angles, data.pixel, arrays)
+        images = {'Rendered': data.views}
+        if data.views_truth is not None:
+            images['Measured'] = data.views_truth
+        reference = 'Measured' if len(images) == 2 else None
+        known['views'] = views(images, data.views_angles, data.pixel, arrays, reference)
     known['space'] = _space(data, arrays)
     return known, arrays
 
@@ -83,15 +87,18 @@ def slices(
 
 
 def views(
-    rendered: dict[str, np.ndarray],
-    measured: np.ndarray | None,
+    images: dict[str, np.ndarray],
     angles: Any,
     pixel: Any,
     arrays: Arrays,
+    reference: str | None = None,
     budget: float = VIEW_BYTES,
 ) -> dict:
-    """Held-out views [n, v, u], in the order of their angles; fewer and smaller ones where they are many and large."""
-    first = next(iter(rendered.values()))
+    """Held-out views [n, v, u], in the order of their angles; fewer and smaller ones where they are many and large.
+
+    reference   the images that the others are compared with
+    """
+    first = next(iter(images.values()))
     count, by = len(first), 1
     while count * (first.shape[1] // by) * (first.shape[2] // by) > MOST_PIXELS and min(first.shape[1:]) // by >= 256:
         by += 1
@@ -99,7 +106,6 @@ def views(
         size = max(1, (first.shape[1] // by) * (first.shape[2] // by))
         count = min(len(first), max(1, MOST_PIXELS // size))
         order = np.argsort(np.asarray(angles), kind='stable')[np.arange(count) * len(first) // count]
-        images = {**rendered, **({} if measured is None else {'Measured': measured})}
         small = {name: _binned(v[order], by) for name, v in images.items()}
         low = min(float(v.min()) for v in small.values())
         high = max(float(v.max()) for v in small.values())
@@ -120,7 +126,7 @@ def views(
         angles=[float(np.asarray(angles)[i]) for i in order],
         window=[float(x) for x in grey_range(next(reversed(small.values())))],
         images=[dict(name=name, array=f'views{i}') for i, name in enumerate(small)],
-        measured=measured is not None,
+        reference=list(small).index(reference) if reference else None,
     )
 
 

@@ -4,14 +4,11 @@ class Views {
   constructor(root, known, arrays, maps) {
     Object.assign(this, { root, known, maps, at: 0 });
     this.images = known.images.map((v) => ({ name: v.name, array: arrays[v.array] }));
-    const measured = this.images.findIndex((v) => v.name === 'Measured');
     this.panels = this.images.map((v, i) => ({ name: v.name, of: i }));
-    if (measured >= 0) {
-      this.images.forEach((v, i) => {
-        if (i === measured) return;
-        const plain = this.images.length === 2 ? '' : `: ${v.name} − measured`;
-        this.panels.push({ name: `Difference${plain}`, of: i, to: measured });
-      });
+    const to = known.reference;
+    if (to !== null) {
+      const pairs = this.images.map((v, of) => ({ name: `${v.name} − ${this.images[to].name}`, of, to }));
+      this.panels.push(...pairs.filter((pair) => pair.of !== to));
     }
     this.draw = onceAFrame(() => this.paint());
     this.build();
@@ -32,10 +29,9 @@ class Views {
     bar.append(this.slider);
     this.lines = rows === 1;
     this.grid = element('div', { class: 'grid' });
-    const said = ['Views that the fit has never seen, as line integrals ln(I0/I); v is down, as on the panel.'];
+    const said = ['Views that no fit has seen, as line integrals ln(I0/I); v is down, as on the panel.'];
     if (known.total > count) said.push(`${count} of ${known.total} are in this page.`);
     if (known.binning > 1) said.push(`Each pixel here is the mean of ${known.binning} × ${known.binning}.`);
-    if (known.measured) said.push('The difference is rendered minus measured.');
     this.note = text('p', said.join(' '), { class: 'note' });
     if (this.lines) {
       this.chart = element('div', { class: 'chart' });
@@ -132,7 +128,7 @@ class Views {
       panel.canvas.setAttribute('aria-label', `${panel.name} view at ${angle}`);
     }
     this.scales.replaceChildren(scaleBar(this.maps.grey, 'ln(I0/I)', ...known.window));
-    if (known.measured) this.scales.append(scaleBar(this.maps.difference, 'difference', -width / 20, width / 20));
+    if (known.reference !== null) this.scales.append(scaleBar(this.maps.difference, 'difference', -width / 20, width / 20));
   }
 
   paintLines() {
