@@ -6,7 +6,8 @@ import pytest
 from helpers.browser import CONTRAST, browser, opened, readout
 from lingo_mi.geometry import Geometry, circular
 from lingo_mi.report.data import ReportData
-from lingo_mi.report.page import write_report
+from lingo_mi.report.page import report_page, write_report
+from lingo_mi.report.view import Page
 
 SHAPE, SPACING, CENTRE = (24, 20, 16), (1.0, 1.5, 2.0), (10.0, 0.0, -5.0)
 MARKUP = '</script><img src=x onerror=alert(1)><b>$title'
@@ -267,6 +268,14 @@ def test_tab_reaches_everything(page):
         .filter((e) => !(e.getAttribute('aria-label') || e.closest('label')?.textContent)).length"""
     )
     assert names == 0  # none without a name
+
+
+def test_in_the_frame_of_a_notebook(chromium, data, tmp_path):
+    (tmp_path / 'notebook.html').write_text(f'<!doctype html><body>{Page(report_page(data))._repr_html_()}')
+    with opened(chromium, (tmp_path / 'notebook.html').as_uri(), ready=False) as page:
+        frame = page.frame_locator('iframe')
+        frame.locator('html[data-ready]').wait_for()
+        assert frame.locator('#slices canvas.picture').count() == 3
 
 
 @pytest.mark.parametrize('dark', [False, True], ids=['light', 'dark'])
