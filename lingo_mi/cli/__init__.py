@@ -13,6 +13,7 @@ COMMANDS = {
     'fit': 'fit a cloud of 3D Gaussians to a scan; makes a volume and new views',
     'batch': 'fit a cohort, a list of scans, here or on a cluster; makes a table of all results',
     'reconstruct': 'reconstruct a volume on voxels: FDK, SART, ASD-POCS and others',
+    'compare': 'show results side by side in one page',
     'import': "turn a scanner's raw frames into a scan",
     'inspect': 'look at a scan before work: air, noise, truncation, order of the views, axis',
     'phantom': 'make a test object and a scan of it',

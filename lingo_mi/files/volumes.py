@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi import notebook
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import reading, replacing
@@ -59,6 +60,11 @@ class Volume:
     unit: str
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """For a notebook: slices, each with a slider."""
+        centre = self.affine[:3, :3] @ ((np.array(self.data.shape) - 1) / 2) + self.affine[:3, 3]
+        return notebook.box(repr(self), notebook.slices(self.data, self.spacing, centre, self.unit))
 
 
 def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi import notebook
 from lingo_mi.arrays import as_numpy, short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path, writing
@@ -45,6 +46,13 @@ class Reconstruction:
     geometry: Geometry
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """For a notebook: slices, each with a slider."""
+        geometry = self.geometry
+        return notebook.box(
+            f'Reconstruction, {self.seconds:.1f} s', notebook.slices(self.volume, geometry.dVoxel, geometry.offOrigin)
+        )
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.volume, dtype) if copy else np.asarray(self.volume, dtype)

@@ -33,7 +33,8 @@ from lingo_mi.output_folder import (
     remove_others,
     view_name,
 )
-from lingo_mi.report.page import ReportData, write_report
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.page import write_report
 from lingo_mi.results.measure import Measured
 from lingo_mi.results.scene_file import write_scene
 
@@ -117,7 +118,7 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
     if test is not None:
         angles = np.degrees(test.geometry.angles)
         held_out = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
-    centres, _, _, density = fitted.world_gaussians()
+    centres, scales, quaternions, density = fitted.world_gaussians()
     return ReportData(
         title=title,
         metrics=measured.numbers,
@@ -129,6 +130,9 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
         pixel=geometry.dDetector,
         cloud_centres=centres,
         cloud_density=density,
+        cloud_scales=scales,
+        cloud_quaternions=quaternions,
+        scanner=fitted.corrected,
         cloud_unit='opacity' if measured.volume is None else 'density at the centre [1/mm]',
         command=measured.numbers.get('command', ''),
         **held_out,
