@@ -14,6 +14,7 @@ COMMANDS = {
     'reconstruct': 'reconstruct a volume on voxels: FDK, SART, ASD-POCS and others',
     'import': "turn a scanner's raw frames into a scan",
     'inspect': 'look at a scan before work: air, noise, truncation, order of the views, axis',
+    'calibrate': 'find where the panel really is: axis off centre, turn in its plane, drift',
     'phantom': 'make a test object and a scan of it',
     'gradcheck': "check the derivatives of a scene's image against differences",
     'recipes': 'compare recipes: quality against time',
