@@ -1,4 +1,5 @@
-"""Find where a scanner's panel really is: an axis off centre, a panel that is turned in its plane, and one that drifts."""
+"""Find where a scanner's panel really is (an axis off centre, a panel turned in its plane, one that drifts), and what its
+detector makes of line integrals."""
 
 import argparse
 from pathlib import Path
@@ -28,6 +29,16 @@ def main() -> None:
         metavar='N',
         help='degree of a polynomial in time for its shifts (default 0: none)',
     )
+    parser.add_argument('--air', action='store_true', help='also an air level, smooth in time')
+    parser.add_argument('--gain', action='store_true', help='also a gain of the views, smooth in time')
+    parser.add_argument(
+        '--curve',
+        type=int,
+        default=0,
+        metavar='K',
+        help='also a curve of K coefficients from line integral to measured value, as of beam hardening',
+    )
+    parser.add_argument('--scatter', action='store_true', help='also scattered light, one smooth image for all views')
     parser.add_argument(
         '--out', type=Path, metavar='F.npy', help='the scan with the geometry found; F.yml is written beside it'
     )
@@ -51,10 +62,12 @@ def main() -> None:
     from lingo_mi.files.scans import read_scan, write_scan
 
     scan = read_scan(args.scan).train
-    calibration = calibrate(scan, drift=args.drift)
+    calibration = calibrate(
+        scan, drift=args.drift, air=args.air, gain=args.gain, curve=args.curve, scatter=args.scatter
+    )
     print('\n'.join(calibration.lines()))
     if not calibration.needed:
-        print('the geometry is right as it is')
+        print('nothing to correct was found')
     if args.out is not None:
         history = dict(calibrated_from=Path(args.scan).name, calibration=calibration.lines())
         write_scan(args.out, calibration.corrected(scan), 'npy', history)

@@ -39,10 +39,7 @@ class CloudModel:
         """Raises InputError for effects that a fit cannot model."""
         self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
         self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
-        own = settings.calibration
-        self.response = Response.of(
-            geometry, air=own.fit_air, gain=own.fit_gain, curve=own.fit_curve, scatter=own.fit_scatter
-        )
+        self.response = Response.of(geometry, air=settings.calibration.fit_air, gain=settings.calibration.fit_gain)
 
     def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
         """What the scan's detector is expected to measure in the views of a geometry: `render` with the response found so far."""

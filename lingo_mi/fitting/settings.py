@@ -159,23 +159,19 @@ class CalibrationSettings:
     fit_air            air level of the views (see `lingo_mi.calibration.response.air`): 'off'; 'smooth', a cubic polynomial in
                        time; or 'view', every view for itself
     fit_gain           gain of the views, likewise
-    fit_curve          coefficients of the curve from line integral to measured value, 0 to 4 (`calibration.response.curve`)
-    fit_scatter        smooth scattered light in the views, 'off', 'smooth' or 'view' (`calibration.response.scatter`)
     pose_motion        of the corrections that `rate_pose` asks for: 'view', every view for itself; or 'smooth', cubic
                        polynomials in time, which views that are held out get, too
 
-    Time is told by the angles of the views, which must be in the order in which they were taken.
+    Time is told by the angles of the views, which must be in the order in which they were taken. A curve and scattered light,
+    which a cloud would explain away, are found before a fit: `lm.calibrate`.
     """
 
     fit_air: str = 'off'
     fit_gain: str = 'off'
-    fit_curve: int = 0
-    fit_scatter: str = 'off'
     pose_motion: str = 'view'
 
     def __post_init__(self):
-        require_ranges(self, fit_curve=(0, 4))
-        for name in ('fit_air', 'fit_gain', 'fit_scatter'):
+        for name in ('fit_air', 'fit_gain'):
             value = getattr(self, name)
             _require(value in VARIES, f'{name} is one of {", ".join(VARIES)}, not {shown(value)}')
         _require(
@@ -185,7 +181,7 @@ class CalibrationSettings:
     @property
     def responds(self) -> bool:
         """Whether a response of the detector is fitted."""
-        return bool(self.fit_curve) or any(x != 'off' for x in (self.fit_air, self.fit_gain, self.fit_scatter))
+        return self.fit_air != 'off' or self.fit_gain != 'off'
 
 
 @dataclass(frozen=True)
@@ -297,8 +293,7 @@ class Settings:
         )
         _require(
             self.volumetric or not self.calibration.responds,
-            'render=alpha composites grey images, which have neither air nor scatter: leave fit_air, fit_gain, fit_curve and '
-            'fit_scatter off',
+            'render=alpha composites grey images, which have no air level: leave fit_air and fit_gain off',
         )
         _require(
             not (self.volumetric and self.densification.reset_every),

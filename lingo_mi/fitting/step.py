@@ -54,7 +54,6 @@ class Stepper:
         self.unit, self.measured = unit, None
         if self.model.response is not None:
             self.measured = scan
-            self.model.response.reach(float(scan.projections.max()))
         self.forward = forward_model(settings)
         self.share: Any = None
         self.scattered: np.ndarray | None = None

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-VARIES = ('off', 'smooth', 'view')  # how a number changes from view to view
+VARIES = ('off', 'smooth', 'view')  # how air and gain change from view to view
 SMOOTH = 3  # degree in time of what is smooth
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,9 +48,10 @@ class Response:
     ) -> Response | None:
         """Nothing found yet. None without any part.
 
-        air, gain, scatter   'off', 'smooth' or 'view'
-        curve                number of coefficients
-        highest              the highest line integral
+        air, gain   'off', 'smooth' or 'view'
+        curve       number of coefficients, the same in all views
+        scatter     'off', or 'one' for the same image in all views
+        highest     the highest line integral, for the curve
         """
         parts: list[Part] = [
             *([Gain(gain)] if gain != 'off' else []),
@@ -90,23 +92,37 @@ class Response:
             self._step(p, m, inside, place, matrices)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All numbers by name, for a checkpoint: of each part [T, K], and `response.highest` [1], where there is a curve."""
-        highest = [part.highest for part in self.parts if isinstance(part, Curve)]
-        more = {'response.highest': np.array(highest, float)} if highest else {}
-        return {f'response.{part.name}': part.values for part in self.parts} | more
+        """All numbers by name, for a checkpoint."""
+        return {f'response.{part.name}': part.values for part in self.parts}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Restore the output of `arrays`."""
         for part in self.parts:
             part.values = np.array(arrays[f'response.{part.name}'], float)
-            if isinstance(part, Curve):
-                part.highest = float(arrays['response.highest'][0])
 
-    def reach(self, highest: float) -> None:
-        """Let curves end at this line integral."""
+    def names(self) -> dict[str, float]:
+        """What numbers are called in `changed`, with steps for differences: 'air0', of the constant, 'air1', of the first
+        polynomial in time, 'curve0_1', of the second coefficient. Those that `hold` takes out are left out."""
+        found = {}
         for part in self.parts:
-            if isinstance(part, Curve):
-                part.highest = highest
+            for row in range(part.varies != 'one' and part.name == 'gain', len(part.values)):
+                for k, deviation in enumerate(part.deviations):
+                    found[f'{part.name}{row}' + (f'_{k}' if len(part.deviations) > 1 else '')] = 0.1 * deviation
+        return found
+
+    def changed(self, numbers: dict[str, float]) -> Response:
+        """A copy with other numbers, by name. Those that are missing are 0, and names of no part are passed over."""
+        parts = []
+        for part in self.parts:
+            own = copy(part)
+            own.values = np.zeros_like(part.values)
+            for name, value in numbers.items():
+                row, _, k = name.removeprefix(part.name).partition('_')
+                if name.startswith(part.name) and row.isdigit():
+                    own.values[int(row), int(k or 0)] = value
+            own.hold()
+            parts.append(own)
+        return Response(self.geometry, parts)
 
     def report(self) -> dict[str, list[float]]:
         """What was found, in physical units, of every view (of a curve: once)."""

@@ -1,9 +1,8 @@
-"""Scattered light as a smooth image of every view.
+"""Scattered light as a smooth image, the same in all views.
 
     m = -ln(exp(-p) + S),    S = sum over i + j <= 2 of s_ij P_i(y) P_j(x)
 
-with Legendre's polynomials P over the panel. S is relative to the open beam, and not negative: where the polynomial is, it is 0.
-Air is where scatter would be the least; together with an air level, scatter is told by what the object absorbs.
+with Legendre's polynomials P over the panel. S is relative to the open beam. It is told by the object's most absorbing parts.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from lingo_mi.calibration.response.part import Part
 
 DEGREE = 2
 ORDERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
-LEAST_LIGHT = 0.1  # of what is measured: the rest at most is scatter
+LEAST_LIGHT = 0.1  # of what is measured is not scatter
 
 
 @dataclass
@@ -30,22 +29,23 @@ class Scatter(Part):
         return np.full(len(ORDERS), 0.03)
 
     def apply(self, p, c, place):
-        return -np.log(np.exp(-p) + self._image(c, place))
+        primary = np.exp(-p)
+        return -np.log(np.maximum(primary + self._image(c, place), LEAST_LIGHT * primary))
 
     def undo(self, m, c, place):
         light = np.exp(-m)
         return -np.log(np.maximum(light - self._image(c, place), LEAST_LIGHT * light))
 
     def slopes(self, p, c, place):
-        primary, S = np.exp(-p), self._image(c, place)
-        total = primary + S
+        primary = np.exp(-p)
+        total = np.maximum(primary + self._image(c, place), LEAST_LIGHT * primary)
         return [-basis / total for basis in _bases(place)], primary / total
 
     def report(self, c):
-        return {'scatter_percent_of_open_beam': (100 * np.maximum(c[:, 0], 0)).tolist()}  # the mean over the panel
+        return {'scatter_percent_of_open_beam': (100 * c[:, 0]).tolist()}  # the mean over the panel
 
     def _image(self, c, place):
-        return np.maximum(sum(x * basis for x, basis in zip(c, _bases(place))), 0.0)
+        return sum(x * basis for x, basis in zip(c, _bases(place)))
 
 
 def _bases(place):
