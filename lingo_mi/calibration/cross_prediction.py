@@ -13,8 +13,8 @@ from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
-PASSES = 3  # over the views: more resolve details that other views do not confirm
-RELAXATION = 0.5
+PASSES = 4  # over the views: fewer leave edges and peaks too low, which a curve of the detector would seem to explain
+RELAXATION = 1.0
 SMOOTH = 0.8  # pixels, standard deviation: leaves nothing that a shift by part of a pixel would smooth further
 EDGE = 0.15  # of the highest value: an object there goes on beyond the panel
 WIDER, MARGIN = 1.5, 1.15  # how much larger the volume then is, and otherwise: a panel that moves, moves the object

@@ -25,7 +25,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.scan import Scan
 
-FIRST, FINE = 32, (48, 64, 64)  # columns of the binned panel: for trials, and for one step each
+FIRST, FINE = 32, (32, 48)  # columns of the binned panel: for trials, and for one step each
 MOST_VIEWS = 60
 REACH = 0.06  # of the panel's width: how far off an axis is looked for
 LONGEST = 4.0  # steps for differences that a number may change by at a time

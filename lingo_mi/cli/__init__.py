@@ -22,6 +22,7 @@ COMMANDS = {
     'accuracy': 'measure what accuracy costs in time',
     'hard-cases': 'measure the hard cases: needles, grazing rays, coincident Gaussians',
     'effects': 'measure what modelling the effects of a real detector is worth',
+    'explain': 'measure which errors of a scanner explain what a reconstruction leaves of a measured scan',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
     'bench-recon': 'time reconstruction on voxels against other packages',
     'fuzz': 'give every reader mutated files: a value, or one line that refuses it',

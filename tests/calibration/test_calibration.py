@@ -8,6 +8,7 @@ import pytest
 import lingo_mi as lm
 from lingo_mi.calibration.drift import Drift, times
 from lingo_mi.calibration.panel import Panel
+from lingo_mi.calibration.response.response import Response
 from lingo_mi.geometry import circular
 from lingo_mi.projectors import grid
 
@@ -119,13 +120,42 @@ def test_a_sound_scan_is_left_as_it_is():
     assert all('not taken' in line for line in found.lines()[:-1])
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.slow)])
 def test_one_row(mode):
     geometry, data = scanner(40, mode=mode, flat=True)
     pixel = geometry.dDetector[1]
     found = lm.calibrate(scanned(geometry, data, Panel(u=3.3 * pixel)), progress=False)
     assert list(found.found.measured) == ['u']
     assert in_pixels(found, 'u') == pytest.approx(3.3, abs=0.05)
+
+
+def responding(numbers, **parts):
+    """Line integrals up to 2.5 as measured by a detector with these numbers, and as they are."""
+    geometry, data = scanner()
+    ideal = scanned(geometry, data, Panel())
+    p = ideal.projections * (2.5 / ideal.projections.max())
+    response = Response.of(geometry, highest=2.5, **parts).changed(numbers)
+    return lm.Scan(geometry, response.applied(p, geometry)), p
+
+
+def test_curve_of_the_detector():
+    """A fifth of the highest line integral is missing: three quarters of the error go, and a coefficient is told to 0.03."""
+    scan, p = responding({'curve0': -0.08}, curve=1)
+    found = lm.calibrate(scan, curve=1, progress=False)
+    assert found.found.measured['curve0'] == pytest.approx(-0.08, abs=0.03)
+    assert np.std(found.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
+
+
+@pytest.mark.slow
+def test_air_and_scatter():
+    """Air to 0.01, scatter to a hundredth of the open beam."""
+    scan, _ = responding({'air0': 0.05, 'air1': 0.03}, air='smooth')
+    found = lm.calibrate(scan, air=True, progress=False).found.measured
+    assert (found['air0'], found['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
+    scan, _ = responding({'scatter0_0': 0.03}, scatter='one')
+    assert lm.calibrate(scan, scatter=True, progress=False).found.measured['scatter0_0'] == pytest.approx(
+        0.03, abs=0.01
+    )
 
 
 @pytest.mark.slow
@@ -162,5 +192,9 @@ def test_bad_input():
         lm.calibrate(scan, drift=0.5)
     with pytest.raises(lm.InputError, match='0 to 8, not 9'):
         lm.calibrate(scan, drift=9)
+    with pytest.raises(lm.InputError, match='0 to 3, not 4'):
+        lm.calibrate(scan, curve=4)
+    with pytest.raises(lm.InputError, match='air'):
+        lm.calibrate(scan, air='smooth')
     with pytest.raises(lm.InputError, match='zero everywhere'):
         lm.calibrate(lm.Scan(geometry, np.zeros_like(scan.projections)))
