@@ -110,10 +110,16 @@ def report(found: list[Explained], folder: Path, title: str) -> str:
     return text
 
 
-def find(dataset: Dataset) -> Calibration:
-    """All numbers of a scan."""
+def find(dataset: Dataset, kinds: Iterable[str]) -> Calibration:
+    """The numbers of a scan: the panel's axis and turn, and of drift, air, gain, curve and scatter those named."""
+    asked = set(kinds)
     return calibrate(
-        dataset.train, drift=DRIFT, air=True, gain=True, curve=1, scatter=dataset.train.geometry.nVoxel[2] > 1
+        dataset.train,
+        drift=DRIFT if 'drift' in asked else 0,
+        air='air' in asked,
+        gain='gain' in asked,
+        curve=int('curve' in asked),
+        scatter='scatter' in asked and dataset.train.geometry.nVoxel[2] > 1,
     )
 
 

@@ -2,6 +2,7 @@
 
     lingo-mi explain walnut_cone.npz --views 30
     lingo-mi explain htc2022_fan.npz --views 60 --binning 2
+    lingo-mi explain walnut_cone.npz --views 30 --correct drift
     lingo-mi explain walnut_cone.npz --views 30 --with-cloud
 
 Calibrates the views that are kept, adds what was found kind by kind, and compares predictions of the other views with what was
@@ -15,6 +16,8 @@ from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
 from lingo_mi.runtime import use_variant
 
+KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
+
 
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -25,6 +28,14 @@ def arguments() -> argparse.Namespace:
         '--with-cloud',
         action='store_true',
         help='instead: corrections that fits of the recipe fast find with the cloud',
+    )
+    p.add_argument(
+        '--correct',
+        nargs='*',
+        default=list(KINDS),
+        choices=KINDS,
+        metavar='KIND',
+        help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
     )
     p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the recipe's)")
     p.add_argument('--out', type=Path, default=Path('out/explain'), metavar='D', help='folder of the results')
@@ -49,6 +60,6 @@ def main() -> None:
         found = list(cloud_rows(dataset, **settings))
         print(report(found, args.out, 'found with the cloud'))
         return
-    calibration = find(dataset)
+    calibration = find(dataset, args.correct)
     print('\n'.join(calibration.lines()))
     print(report(list(rows(dataset, calibration)), args.out, 'corrected'))
