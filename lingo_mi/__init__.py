@@ -34,6 +34,8 @@ __all__ = [  # noqa: RUF022 - in the order of their use
     'load',
     'load_raw',
     'phantom',
+    'calibrate',
+    'Calibration',
     'Geometry',
     'circular',
     'Scan',
@@ -59,6 +61,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
 ]
 
 if TYPE_CHECKING:
+    from lingo_mi.api.calibration import Calibration, calibrate
     from lingo_mi.api.data import load, load_raw, phantom, simulate
     from lingo_mi.api.fitting import fit
     from lingo_mi.api.result import Gaussians, Result, load_result
@@ -77,6 +80,8 @@ _PUBLIC = {
     'load': 'lingo_mi.api.data',
     'load_raw': 'lingo_mi.api.data',
     'phantom': 'lingo_mi.api.data',
+    'calibrate': 'lingo_mi.api.calibration',
+    'Calibration': 'lingo_mi.api.calibration',
     'Geometry': 'lingo_mi.geometry',
     'circular': 'lingo_mi.geometry',
     'Scan': 'lingo_mi.scan',

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.calibration.response.response import Response
 from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.expected_signal import ExpectedSignal
@@ -36,12 +37,19 @@ class CloudModel:
     unit       the fit's unit of density, 1/mm (`measured.density_unit`)
     effects    of the scan, if the fit models them (`measured.modelled_effects`); None: line integrals
     signal     `ExpectedSignal` of these effects; None without effects
+    response   what else the detector makes of line integrals, as far as it was found with the cloud; None if that is not fitted
     """
 
     def __init__(self, settings: Settings, geometry: Geometry, unit: float, effects: Effects | None = None):
         """Raises InputError for effects that a fit cannot model."""
         self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
         self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
+        self.response = Response.of(geometry, air=settings.calibration.fit_air, gain=settings.calibration.fit_gain)
+
+    def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
+        """What the scan's detector is expected to measure in the views of a geometry: `render` with the response found so far."""
+        rendered = self.render(state, geometry)
+        return rendered if self.response is None else self.response.applied(rendered, geometry)
 
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar
 
+from lingo_mi.calibration.response.part import VARIES
 from lingo_mi.errors import InputError, shown
 from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import checked, nearest, parse, require_ranges
@@ -161,6 +162,38 @@ class AdamSettings:
 
 
 @dataclass(frozen=True)
+class CalibrationSettings:
+    """Errors of the measurement that are found together with the cloud (own), each off unless asked for.
+
+    fit_air            air level of the views (see `lingo_mi.calibration.response.air`): 'off'; 'smooth', a cubic polynomial in
+                       time; or 'view', every view for itself
+    fit_gain           gain of the views, likewise
+    pose_motion        of the corrections that `rate_pose` asks for: 'view', every view for itself; or 'smooth', cubic
+                       polynomials in time, which views that are held out get, too
+
+    Time is told by the angles of the views, which must be in the order in which they were taken. A curve and scattered light,
+    which a cloud would explain away, are found before a fit: `lm.calibrate`.
+    """
+
+    fit_air: str = 'off'
+    fit_gain: str = 'off'
+    pose_motion: str = 'view'
+
+    def __post_init__(self):
+        for name in ('fit_air', 'fit_gain'):
+            value = getattr(self, name)
+            _require(value in VARIES, f'{name} is one of {", ".join(VARIES)}, not {shown(value)}')
+        _require(
+            self.pose_motion in ('view', 'smooth'), f"pose_motion is 'view' or 'smooth', not {shown(self.pose_motion)}"
+        )
+
+    @property
+    def responds(self) -> bool:
+        """Whether a response of the detector is fitted."""
+        return self.fit_air != 'off' or self.fit_gain != 'off'
+
+
+@dataclass(frozen=True)
 class DensificationSettings:
     """Adaptive density control (see `lingo_mi.fitting.densify`). Lengths are in the normalised frame; for `alpha`, `split_size`
     and `prune_size` are in units of the scene's radius.
@@ -232,7 +265,7 @@ class Settings:
     batch              views per step
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
-    start, model, loss, adam, densification, bounds
+    start, model, loss, adam, calibration, densification, bounds
                        the parts, each with its own documentation
 
     Raises InputError for a value out of its range, and for contradictory values.
@@ -247,6 +280,7 @@ class Settings:
     model: ModelSettings = field(default_factory=ModelSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     adam: AdamSettings = field(default_factory=AdamSettings)
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     densification: DensificationSettings = field(default_factory=DensificationSettings)
     bounds: ScaleBounds = field(default_factory=ScaleBounds)
 
@@ -265,6 +299,10 @@ class Settings:
             self.volumetric or self.model.normalise and self.loss.lambda_tv == 0 and self.model.effects == 'ignore',
             'render=alpha composites grey images and knows no densities: it needs normalise=true, lambda_tv=0 and '
             'effects=ignore, as in the method 3dgs',
+        )
+        _require(
+            self.volumetric or not self.calibration.responds,
+            'render=alpha composites grey images, which have no air level: leave fit_air and fit_gain off',
         )
         _require(
             not (self.volumetric and self.densification.reset_every),

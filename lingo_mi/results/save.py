@@ -148,11 +148,13 @@ def _write_views(folder: Path, rendered: np.ndarray):
 
 
 def _corrections(fitted: Fitted) -> dict:
-    """Corrections of the views' poses, if the fit has any: rotation vectors and shifts about the volume's centre."""
-    poses = fitted.poses
+    """What the fit has found of the measurement's errors: the response (levels, per cent), and corrections of the views' poses,
+    rotation vectors and shifts about the volume's centre."""
+    poses, response = fitted.poses, fitted.model.response
+    found = {} if response is None else dict(response=response.report())
     if poses is None:
-        return {}
-    return dict(
+        return found
+    return found | dict(
         pose_turns_degrees=np.degrees(poses.turn).tolist(),
         pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
     )
