@@ -13,6 +13,7 @@ from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.geometry import astra, matrices, rtk
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix, rotation
 from lingo_mi.scan import Dataset, Scan
 
@@ -404,10 +405,14 @@ def test_bad_matrices(tmp_path):
 def test_what_rtk_cannot_say(tmp_path):
     f, path = scan_of().rays(), tmp_path / 'g.xml'
     tilted = scan_of('parallel', rotDetector=(0.1, 0.0, 0.0)).rays()
+    # A source in the panel: the distance of 0 would say that the beam is parallel.
+    corner = np.array([[0.0, -SHAPE[1] / 2, SHAPE[0] / 2]])
+    within = Rays(np.zeros((1, 3)), corner, np.array([[0.0, 1, 0]]), np.array([[0.0, 0, -1]]), False)
     for bad, match in (
         (replace(f, u=f.u + 0.1 * f.v), 'right angles'),
         (replace(f, u=f.u * [[1], [1], [1.1]]), 'one pixel size'),
         (replace(f, u=-f.u), 'mirrored'),
+        (within, 'mirrored'),
         (tilted, 'askew'),
     ):
         with pytest.raises(InputError, match=match):

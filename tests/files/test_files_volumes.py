@@ -150,6 +150,16 @@ def test_nifti_header_and_place(tmp_path):
     np.testing.assert_allclose(nibabel.load(path).affine @ [1.5, 2, 2.5, 1], [0, 0, 0, 1], atol=1e-6)
 
 
+@pytest.mark.parametrize('name', ['v.hdr', 'v.img'])
+def test_a_header_beside_its_voxels(tmp_path, name):
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Pair(COUNTS, np.diag([*SPACING, 1])), tmp_path / 'v.img')
+    v = read_volume(tmp_path / name)
+    np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
+    assert v.spacing == SPACING
+
+
 @pytest.mark.parametrize('unit, mm', [('mm', 1), ('meter', 1000), ('micron', 1e-3), ('unknown', 1)])
 def test_foreign_nifti(tmp_path, unit, mm):
     import nibabel

@@ -175,6 +175,11 @@ def test_changed_keeps_the_rest():
         ('fdk_threshold', 1e6, 1.5e6),
         ('fdk_threshold', -1e6, -1.5e6),
         ('fdk_rescale', 1e6, 1.5e6),
+        ('scale_min', 1e-9, 0.9e-9),
+        ('scale_max', 1e3, 1.1e3),
+        ('rate_centre', (1e-12, 1e3), (0.9e-12, 1e3)),
+        ('rate_centre', (1e3, 1e-12), (1.1e3, 1e-12)),
+        ('iterations', 10**9, 10**9 + 1),
     ],
 )
 def test_limits(name, within, beyond):

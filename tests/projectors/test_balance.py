@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lingo_mi.projectors.balance import Sharing
+from lingo_mi.projectors.balance import Layout, Sharing, Work
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
 from lingo_mi.projectors.options import RenderOptions
@@ -85,3 +85,18 @@ def test_as_many_shares_as_asked():
     usual = Sharing().teams
     assert usual > 1 and Sharing().scaled(2).scaled(1.5).teams == 3 * usual
     assert Sharing().scaled(0.1 / usual).teams == 1
+
+
+@pytest.mark.parametrize('shares', [0.125, 1, 20])
+def test_every_block_belongs_to_the_team_in_whose_share_it_begins(shares):
+    """Items of no block and of many, blocks that cost 1 and more; a team's share is the total over the teams, up to a whole."""
+    blocks, costs, sharing = [3, 0, 2, 5, 0, 1, 40], [1, 1, 2, 3, 1, 1, 1], Sharing(shares=shares)
+    work = Work.of(mi.UInt32(blocks), mi.UInt32(costs), sharing)
+    share = work.shares(Layout(1, 1, 4))
+    first = np.concatenate([[0], np.cumsum(blocks)])
+    begin, end = (first[item.numpy()] + block.numpy() for item, block in (share.begin, share.end))
+    starts = np.concatenate([[0], np.cumsum(np.repeat(costs, blocks))])
+    owner = starts[:-1] // (starts[-1] // sharing.teams + 1)
+    assert len(begin) == sharing.teams
+    for team in range(sharing.teams):
+        assert list(range(begin[team], end[team])) == np.flatnonzero(owner == team).tolist()

@@ -374,3 +374,20 @@ def test_footprints_are_not_widened_unasked():
     for a, b in zip(plain.values, none.values):
         assert a[0] == b[0]
     assert some.values[1][0] < 0.99 * none.values[1][0]
+
+
+@pytest.mark.parametrize('shape', [(33, 33), (17, 33)])
+def test_the_mean_over_a_pixel_widens_a_footprint_by_its_variance(shape):
+    """That of a unit square, 1/12 along each axis: the peak of a round one of variances a, b falls by sqrt(a b)."""
+    frames, _ = scanner('parallel', shape=shape, size=(3.3, 3.3))
+    sigma = 0.15  # in pixels of the panel: the variances a and b
+    a, b = ((sigma / np.linalg.norm(step[0])) ** 2 for step in (frames.u, frames.v))
+    gaussians = mi.Point3f(0), mi.Vector3f(sigma), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    view = View.of(frames, 0, *shape)
+    centre, mean = (
+        line_integrals(*gaussians, view, RenderOptions(EXTENT, area=area)).numpy() for area in (False, True)
+    )
+    factor = np.sqrt(a * b / ((a + 1 / 12) * (b + 1 / 12)))
+    assert centre.max() == pytest.approx(np.sqrt(2 * np.pi) * sigma, rel=1e-5)
+    assert mean.max() == pytest.approx(factor * centre.max(), rel=1e-5)
+    assert mean.sum() == pytest.approx(centre.sum(), rel=1e-4)
