@@ -419,6 +419,27 @@ def test_a_tiff_whose_images_have_no_end(tmp_path, bigtiff, byteorder):
         refused(path, 'has no end')
 
 
+# By TIFF's numbers: bytes, deflate by its authors' word (at most 1032:1), and PackBits, whose longest run takes 2 bytes for 128.
+@pytest.mark.parametrize('compression, ratio', [(1, 1), (8, 1032), (32946, 1032), (32773, 64)])
+def test_what_a_tiff_file_may_claim(tmp_path, compression, ratio):
+    """As many bytes as its compression can make of the whole file, and not one more."""
+    tifffile = needs('tifffile')
+    path = tmp_path / 'v.tif'
+    tifffile.imwrite(path, np.zeros((1, 999), np.uint8), photometric='minisblack', rowsperstrip=1, metadata=None)
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        tags, order = file.pages[0].tags, file.byteorder
+        struct.pack_into(order + 'H', content, tags['Compression'].valueoffset, compression)
+        width = tags['ImageWidth']
+    assert width.dtype == tifffile.DATATYPE.LONG
+    for more in (0, 1):
+        struct.pack_into(order + 'I', content, width.valueoffset, len(content) * ratio + more)
+        path.write_bytes(content)
+        with pytest.raises(InputError) as caught:  # there are not that many bytes, but there could be
+            read_volume(path)
+        assert ('cannot hold' in str(caught.value)) == bool(more)
+
+
 def dicom_slice(path, z, pixels, **changes):
     pydicom = needs('pydicom')
     data = pydicom.Dataset()
