@@ -148,6 +148,7 @@ def test_nifti_header_and_place(tmp_path):
     np.testing.assert_allclose(image.affine @ [1.5, 2, 2.5, 1], [10, 20, 30, 1])
     write_volume(path, COUNTS, SPACING)
     np.testing.assert_allclose(nibabel.load(path).affine @ [1.5, 2, 2.5, 1], [0, 0, 0, 1], atol=1e-6)
+    assert read_volume(path).unit == 'normalised'
 
 
 @pytest.mark.parametrize('name', ['v.hdr', 'v.img'])
@@ -620,7 +621,8 @@ def test_memory_that_an_array_of_a_file_needs(tmp_path, monkeypatch, ratio, byte
 
 
 def test_what_follows_an_array_is_read_only_where_asked():
-    content = bytes(120 + 2 * voxels._CHUNK)
+    content = bytes(120 + voxels._CHUNK + 1)
     assert len(voxels.read_exactly(io.BytesIO(content), 'v', 0, 120)) == 120
+    assert len(voxels.read_exactly(io.BytesIO(content[:-1]), 'v', 0, 120, finish=True)) == 120
     with pytest.raises(InputError, match='more data follow'):
         voxels.read_exactly(io.BytesIO(content), 'v', 0, 120, finish=True)

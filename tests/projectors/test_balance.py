@@ -87,6 +87,25 @@ def test_as_many_shares_as_asked():
     assert Sharing().scaled(0.1 / usual).teams == 1
 
 
+@pytest.mark.parametrize('layout', [Layout(8, 1, 4), Layout(16, 2, 4), Layout(4, 8, 1)], ids=str)
+def test_packets_that_an_interval_covers(layout):
+    """All that hold one of its elements within the row, from the start of a step on, and none behind."""
+    width, rng = 27, np.random.default_rng(0)
+    low, column = rng.uniform(-12, 40, 500), rng.integers(-3, 4, 500)
+    high, offset = low + rng.uniform(-2, 9, 500), rng.uniform(-0.5, 0.5, 500)
+    arrays = [mi.Float(x.astype(np.float32)) for x in (low, high, offset)]
+    packets = layout.packets(width)
+    begin, end = layout.span(*arrays, mi.Int32(column), mi.Bool(np.arange(500) % 10 == 0), mi.Int32(packets))
+    size, step = layout.size, layout.step
+    for i, (first, last) in enumerate(zip(np.ceil(low + offset) + column, np.floor(high + offset) + column)):
+        within = [e for e in range(packets * size) if first <= e <= last] if i % 10 else []
+        found = range(begin.numpy()[i], end.numpy()[i])
+        if not within:
+            assert len(found) == 0
+        else:
+            assert found == range(within[0] // step * layout.columns, within[-1] // size + 1)
+
+
 @pytest.mark.parametrize('shares', [0.125, 1, 20])
 def test_every_block_belongs_to_the_team_in_whose_share_it_begins(shares):
     """Items of no block and of many, blocks that cost 1 and more; a team's share is the total over the teams, up to a whole."""

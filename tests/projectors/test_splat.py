@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.errors import AccuracyWarning
+from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
@@ -350,6 +350,29 @@ def test_needles_are_announced(aspect, warns):
             assert not require_usable(*gaussians, 'here')
     else:
         assert require_usable(*gaussians, 'here')
+
+
+@pytest.mark.parametrize(
+    'name, within, beyond',
+    [
+        ('centre', 1e12, 1.01e12),
+        ('scale', 1e12, 1.01e12),
+        ('scale', 1e-12, 0.99e-12),
+        ('density', 1e24, 1.01e24),
+        ('density', -1e24, -1.01e24),
+        ('rotation', 0.51e-15, 0.49e-15),
+    ],
+)
+def test_gaussians_within_the_limits_are_usable(name, within, beyond):
+    kinds = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
+    usual = dict(centre=0.0, scale=1.0, rotation=1.0, density=1.0)
+    for value, usable in ((within, True), (beyond, False)):
+        gaussians = [kind((usual | {name: value})[each]) for each, kind in kinds.items()]
+        if usable:
+            assert require_usable(*gaussians, 'here')
+        else:
+            with pytest.raises(InputError, match='Gaussian 0 of here is not usable'):
+                require_usable(*gaussians, 'here')
 
 
 def test_few_items_have_no_depth():
