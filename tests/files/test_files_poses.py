@@ -119,6 +119,18 @@ def test_matrices_by_hand():
     np.testing.assert_allclose(matrices.to_matrices(circle.rays())[0] * 450, P, atol=1e-9)
 
 
+@pytest.mark.parametrize('step', [0.01, 1.0, 100.0])
+def test_a_matrix_is_parallel_to_rounding(step):
+    """Its last row, by the other rows' largest entry: one per pixel's size."""
+    g = CircularGeometry(DSO=0.0, DSD=0.0, nDetector=SHAPE, dDetector=step, **GRID, angles=[0.0], mode='parallel')
+    P = matrices.to_matrices(g.rays())
+    P[0, 2, 0] = 0.5e-9 / step
+    same_poses(matrices.from_matrices(P, SHAPE, (step, step), True), g.rays(), 1e-7 * step)
+    P[0, 2, 0] = 2e-9 / step
+    with pytest.raises(InputError, match='no parallel beam'):
+        matrices.from_matrices(P, SHAPE, (step, step), True)
+
+
 # Written by RTK 2.7: AddProjection(1000, 1500, gantry, 4, -7, 5, 8, 2, 3) for 30 and 70 degrees, and a parallel beam. Its
 # matrices take RTK's (x, y, z, 1) to millimetres on the panel.
 RTK = """<?xml version="1.0"?>

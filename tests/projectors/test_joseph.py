@@ -77,6 +77,19 @@ def test_rays_along_all_faces_of_the_volume_are_alike():
     np.testing.assert_array_equal(back, back[:, ::-1, ::-1])
 
 
+def test_voxels_beside_a_ray_add_nothing_whatever_they_hold():
+    """Rays through voxel centres, and half a voxel beyond the outermost: the neighbours have no weight."""
+    geometry = CircularGeometry(
+        DSO=8.0, DSD=8.0, nDetector=(3, 3), dDetector=1.0, nVoxel=(3, 3, 3), dVoxel=1.0, angles=[0.0], mode='parallel'
+    )
+    for i in range(9):
+        row, column = i // 3, i % 3
+        volume = np.full((3, 3, 3), np.nan, np.float32)
+        volume[:, 2 - column, 2 - row] = 1
+        image = Joseph(geometry).forward(mi.Float(volume.ravel()), [0])[0].numpy().reshape(3, 3).T
+        assert (image == 3).sum() == 1 and np.isnan(image).sum() == 8
+
+
 def test_smooth_ball_against_the_exact_projector():
     """Joseph samples once a slice, which is nearly exact where the volume is smooth."""
     geometry = scan(n=6, nVoxel=(40, 44, 36), dVoxel=(2.0, 1.8, 2.2), nDetector=(30, 34), dDetector=(4.0, 4.0))

@@ -375,6 +375,14 @@ def test_gaussians_within_the_limits_are_usable(name, within, beyond):
                 require_usable(*gaussians, 'here')
 
 
+def test_depth_of_items_that_fill_a_cell():
+    """8192 in the 64 elements of one cell, 128 at each; as they lie at random, only one in 32 of the cell's counts."""
+    i = np.arange(8192)
+    places = [mi.Int32(p) for p in (i % 8, i // 8 % 8)]
+    assert deepest(places, dr.full(mi.Float, 1, 8192), (512, 512)).numpy() == 128
+    assert deepest(places, dr.full(mi.Float, 64, 8192), (512, 512)).numpy() == 8192 / 32
+
+
 def test_few_items_have_no_depth():
     zeros = dr.zeros(mi.Int32, 10)
     assert deepest((zeros, zeros), dr.full(mi.Float, 4, 10), (8, 8)).numpy() == 0
