@@ -1,5 +1,6 @@
 """Line integrals of clouds of Gaussians against the float64 oracle: images, gradients, tangents, hard places."""
 
+import warnings
 from dataclasses import replace
 
 import drjit as dr
@@ -381,6 +382,19 @@ def test_depth_of_items_that_fill_a_cell():
     places = [mi.Int32(p) for p in (i % 8, i // 8 % 8)]
     assert deepest(places, dr.full(mi.Float, 1, 8192), (512, 512)).numpy() == 128
     assert deepest(places, dr.full(mi.Float, 64, 8192), (512, 512)).numpy() == 8192 / 32
+
+
+@pytest.mark.parametrize('options', [dict(), dict(footprint='affine'), dict(area=True)], ids=str)
+@pytest.mark.parametrize('near', [False, True])
+def test_gaussians_at_the_source_are_announced_where_options_cannot_hold(options, near):
+    frames, shape = scanner()
+    centre = frames.source[0] * (0.99 if near else 0.1)
+    gaussians = mi.Point3f(*centre.tolist()), mi.Vector3f(0.1), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        dr.eval(line_integrals(*gaussians, View.of(frames, 0, *shape), RenderOptions(EXTENT, **options)))
+    said = [str(w.message) for w in caught if w.category is AccuracyWarning]
+    assert len(said) == (near and bool(options)) and all(text.startswith('1 Gaussians reach') for text in said)
 
 
 def test_few_items_have_no_depth():
