@@ -27,6 +27,14 @@ def test_images_do_not_depend_on_the_voxels_of_a_geometry(fitted):
         np.testing.assert_allclose(fitted.render(other), expected, atol=1e-5 * expected.max())
 
 
+def test_images_do_not_depend_on_where_the_panel_stands(fitted):
+    """Through the middle of the volume, or behind it with the same rays."""
+    g = fitted.geometry
+    middle = replace(g, DSD=g.DSO, dDetector=tuple(d * g.DSO / g.DSD for d in g.dDetector))
+    expected = fitted.render(g)
+    np.testing.assert_allclose(fitted.render(middle), expected, atol=1e-5 * expected.max())
+
+
 def test_progress_counts_the_views(fitted):
     seen = []
     fitted.render(fitted.geometry, progress=lambda done, of: seen.append((done, of)))

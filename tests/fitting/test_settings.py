@@ -177,6 +177,16 @@ def test_changed_keeps_the_rest():
         ('fdk_threshold', 1e6, 1.5e6),
         ('fdk_threshold', -1e6, -1.5e6),
         ('fdk_rescale', 1e6, 1.5e6),
+        ('scale_min', 1e-9, 0.9e-9),
+        ('scale_max', 1e3, 1.1e3),
+        ('rate_centre', (1e-12, 1e3), (0.9e-12, 1e3)),
+        ('rate_centre', (1e3, 1e-12), (1.1e3, 1e-12)),
+        ('iterations', 10**9, 10**9 + 1),
+        *((name, 0, -1) for name in ('decay_steps', 'densify_from', 'densify_until', 'reset_every')),
+        *((name, 1e6, 1.5e6) for name in ('low_factor', 'lambda_ssim', 'lambda_tv', 'tv_size', 'tv_stride')),
+        *((name, 1, 0) for name in ('tv_size', 'tv_stride', 'cuboid_step', 'n_points', 'occupancy_voxels')),
+        *((name, 10**8, 10**8 + 1) for name in ('n_points',)),
+        ('high_fraction', 1.0, 1.1),
     ],
 )
 def test_limits(name, within, beyond):

@@ -72,6 +72,21 @@ def test_options_are_fields(scan):
     assert SART(niter=3) == replace(SART(), niter=3) != SART()
 
 
+def test_defaults_are_tigres():
+    """As TIGRE 2 has them for Python; the order of views as for MATLAB."""
+    sweeps = dict(lmbda=1.0, lmbda_red=0.99, noneg=True)
+    descent = dict(tviter=20, alpha=0.002, alpha_red=0.95, rmax=0.95)
+    expected = {
+        'sart': sweeps | dict(OrderStrategy='random'),
+        'os-sart': sweeps | dict(blocksize=20, OrderStrategy='random'),
+        'sirt': sweeps,
+        'asd-pocs': sweeps | descent | dict(blocksize=1, OrderStrategy='random'),
+    }
+    for name, values in expected.items():
+        options = ALGORITHMS[name]().options
+        assert values == {option: options[option] for option in values}, name
+
+
 @pytest.mark.parametrize(
     'name, wrong, says',
     [
