@@ -122,8 +122,8 @@ class Best(Algorithm):
         found = self._apply(scan, plan[0].niter, plan[taken], count)
         chosen = plan[taken]
         assert chosen.volume is not None  # of its best pass
-        tried = _means(chosen.volume, chosen.finer)
-        volume = _means(found.volume, chosen.finer)
+        tried = means(chosen.volume, chosen.finer)
+        volume = means(found.volume, chosen.finer)
         if progress is not None:
             progress(self.steps(scan), self.steps(scan), found.residuals[-1])
         for trial in plan:
@@ -157,26 +157,16 @@ class Best(Algorithm):
         trial, grid = Trial(name, finer), Refined(finer=finer).grid
         score = Score(replace(held_out, geometry=grid(held_out.geometry)))
         niter = by if by and beat is None else self.niter
-        self._refine(kept, plain.volume, trial, niter, count, Watch(score, trial, beat, by))
+        assert plain.volume is not None  # of its best pass
+        refine(kept, plain.volume, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
         return trial
-
-    def _refine(self, scan: Scan, start, trial: Trial, niter: int, count, watch: Watch | None) -> Reconstruction:
-        """ASD-POCS with the weights of `Refined`, from a volume on the scan's own voxels, on the trial's voxels."""
-        fine = replace(scan, geometry=Refined(finer=trial.finer).grid(scan.geometry))
-        start = _parts(start, trial.finer)
-        refined = Refined(niter=niter, seed=self.seed)
-        if trial.name == SMOOTHED:
-            refined = replace(refined, alpha=SMOOTH)
-        return refined.on_measured().run(
-            fine, start=start, weights=structure(start), blur=excess_width(fine.geometry), progress=count, watch=watch
-        )
 
     def _apply(self, scan: Scan, start_niter: int, trial: Trial, count) -> Reconstruction:
         """The chosen setting on all views."""
         plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
         if trial.name == PLAIN:
             return plain
-        return self._refine(scan, plain.volume, trial, trial.niter, count, None)
+        return refine(scan, plain.volume, trial.niter, trial.finer, trial.name == SMOOTHED, self.seed, count)
 
     @staticmethod
     def _counter(progress: Progress | None, steps: int):
@@ -189,6 +179,30 @@ class Best(Algorithm):
             progress(next(done, steps - 1), steps, residual)
 
         return count
+
+
+def refine(
+    scan: Scan,
+    start: np.ndarray,
+    niter: int,
+    finer: int = 1,
+    smooth: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> Reconstruction:
+    """The passes of `Refined` over measured views, from a volume [x, y, z] on the scan's own voxels.
+
+    finer    parts along each side of a voxel; the volume that is returned has the smaller voxels
+    smooth   whether to take more total variation
+    """
+    fine = replace(scan, geometry=Refined(finer=finer).grid(scan.geometry))
+    start = _parts(start, finer)
+    algorithm = Refined(niter=niter, seed=seed)
+    if smooth:
+        algorithm = replace(algorithm, alpha=SMOOTH)
+    weights, blur = structure(start), excess_width(fine.geometry)
+    return algorithm.on_measured().run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
@@ -206,6 +220,6 @@ def _parts(volume: np.ndarray, finer: int) -> np.ndarray:
     return volume if finer == 1 else ndimage.zoom(volume, finer, order=1, mode='nearest', grid_mode=True)
 
 
-def _means(volume: np.ndarray, finer: int) -> np.ndarray:
+def means(volume: np.ndarray, finer: int) -> np.ndarray:
     """The means over `finer` voxels along each side."""
     return volume.reshape([n for count in volume.shape for n in (count // finer, finer)]).mean((1, 3, 5))
