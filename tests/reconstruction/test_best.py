@@ -61,7 +61,7 @@ def test_no_start():
 
 def test_the_score_is_the_error_of_the_volume_smooth_or_not():
     """Errors of a tenth of the truth's norm, from smooth ones to independent voxels. Plain residuals hide the latter, which
-    cancel along the rays. Trilinear interpolation between the voxels takes away a third to a half of an error of independent ones."""
+    cancel along the rays. Of an error of independent voxels, trilinear interpolation takes a third to a half away."""
     scan, truth = scanned(1)
     rng = np.random.default_rng(1)
     x, y, _ = np.indices(truth.shape) - 11.5
