@@ -54,6 +54,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
     'CGLS',
     'ASDPOCS',
     'Refined',
+    'Best',
     'project',
     'voxelize',
     'use_variant',
@@ -70,7 +71,7 @@ if TYPE_CHECKING:
     from lingo_mi.fitting.settings import Settings
     from lingo_mi.functional import project, voxelize
     from lingo_mi.geometry import Geometry, circular
-    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Reconstruction, Refined
+    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
     from lingo_mi.runtime import use_variant
     from lingo_mi.scan import Dataset, Scan
 
@@ -100,6 +101,7 @@ _PUBLIC = {
     'CGLS': 'lingo_mi.reconstruction',
     'ASDPOCS': 'lingo_mi.reconstruction',
     'Refined': 'lingo_mi.reconstruction',
+    'Best': 'lingo_mi.reconstruction',
     'project': 'lingo_mi.functional',
     'voxelize': 'lingo_mi.functional',
     'use_variant': 'lingo_mi.runtime',

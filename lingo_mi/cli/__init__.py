@@ -20,6 +20,7 @@ COMMANDS = {
     'phantom': 'make a test object and a scan of it',
     'gradcheck': "check the derivatives of a scene's image against differences",
     'recipes': 'compare recipes: quality against time',
+    'regret': 'measure how far the choice of best is behind the best fixed setting',
     'tables': "regenerate the paper's tables",
     'accuracy': 'measure what accuracy costs in time',
     'hard-cases': 'measure the hard cases: needles, grazing rays, coincident Gaussians',

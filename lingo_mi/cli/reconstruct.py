@@ -7,6 +7,7 @@
     lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot/result.xml --views 100
     lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot/result.xml
     lingo-mi reconstruct x3d_foot --projections large.npy --algorithm fdk --slab 64 --out large.ome.zarr
+    lingo-mi reconstruct x3d_foot --algorithm best --views 25
 
 The input is what `lingo-mi fit` takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
@@ -15,6 +16,8 @@ measured ones then; for objects finer than the voxels add -D finer=2. With --sta
 cloud was fitted to, by refined or an iterative algorithm, from the cloud's own volume; any scan will do. Poses that the fit
 has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
 its largest density for full scale, then with 1.
+best chooses its settings by measured views that it holds out, and needs no cloud. What it tried is printed, and written beside
+the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is least certain.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 
@@ -22,8 +25,10 @@ A volume larger than memory is made and written in slabs of --slab slices, by fd
 """
 
 import argparse
+import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +45,12 @@ from lingo_mi.cli.common import (
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import optional
+from lingo_mi.file_access import optional, write_text
 from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
 from lingo_mi.parsing import parse
 from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.results.measure import volume_quality
@@ -118,6 +124,12 @@ def output(path: Path, force: bool) -> Path:
     return writable_file(path, force)
 
 
+def beside(out: Path) -> tuple[Path, Path]:
+    """The files of `best` beside its volume: the plan and the map of errors."""
+    name = out.name.removesuffix('.gz').removesuffix('.nii')
+    return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{out.name.removeprefix(name)}')
+
+
 def check_arguments(args: argparse.Namespace) -> None:
     """Raises InputError where the arguments contradict each other."""
     check_input(args)
@@ -125,6 +137,10 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
     if args.slab is not None and (args.slab < 1 or args.algorithm not in ('fdk', 'voxelize')):
         raise InputError('--slab is a number of slices from 1 on, for --algorithm fdk and voxelize')
+    if args.algorithm == 'best' and (args.complete or args.start):
+        raise InputError(
+            '--algorithm best chooses by measured views, which a fitted cloud has seen already: leave out --complete and --start'
+        )
     if args.algorithm in FROM_CLOUD and not (args.complete or args.start and args.algorithm == 'refined'):
         raise InputError(
             f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete'
@@ -169,6 +185,9 @@ def main() -> None:
         chosen = dict(completed_niter='0') | chosen
     algorithm = algorithm_of(args.algorithm, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
+    if args.algorithm == 'best':
+        for path in beside(out):
+            writable_file(path, args.force)
     with writing_file(out):
         reconstruct_into(out, args, algorithm, effects, {k: v for k, v in defined.items() if k in own})
 
@@ -234,6 +253,11 @@ def reconstruct_into(
     if dataset.volume is not None:
         print(volume_quality(found.metrics(dataset.volume)))
     print(out)
+    if isinstance(found, Chosen):
+        print(found.report())
+        plan, error = beside(out)
+        write_text(plan, json.dumps(found.record(), indent=1) + '\n')
+        replace(found, volume=found.error).save(error, force=True)
 
 
 def write_in_slabs(out: Path, scan: Scan, slabs: Iterator[np.ndarray], args: argparse.Namespace) -> None:

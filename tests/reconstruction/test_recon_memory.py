@@ -33,7 +33,8 @@ def run(size, pixels, views):
     scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
     del project
     few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
-    options = {'fdk': {}, 'asd-pocs': dict(niter=1, tviter=2), 'refined': dict(niter=1, completed_niter=1, tviter=2)}
+    few_steps = dict(niter=1, tviter=2)
+    options = {'fdk': {}, 'asd-pocs': few_steps, 'refined': dict(completed_niter=1) | few_steps, 'best': dict(niter=1, finer=1)}
     algorithm = ALGORITHMS[sys.argv[1]](**options.get(sys.argv[1], dict(niter=1)))
     if sys.argv[1] == 'refined':
         algorithm.run(few, completed=scan, sample=lambda _: ramp)
