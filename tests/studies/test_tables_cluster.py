@@ -11,6 +11,7 @@ import pytest
 
 from helpers.dask_cluster import cluster, wait_until
 from helpers.script import FIT, run
+from lingo_mi.folder_lock import locked
 from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume
 
 pytest.importorskip('distributed')
@@ -25,7 +26,7 @@ ARGUMENTS = (
     5,
     6,
     '--iterations',
-    300,
+    150,
     '--methods',
     METHOD,
     '--algorithms',
@@ -83,11 +84,11 @@ def test_a_worker_is_killed(tmp_path):
             assert cells.get(cell)['psnr_3d_r2'] == pytest.approx(here.get(cell)['psnr_3d_r2'], rel=1e-4)
 
 
-def test_a_cell_that_fails(tmp_path):
-    """A folder in the place of one cell's file: the other cells are computed, and the line says which one failed."""
-    cells = Cells(tmp_path / 'out', TINY)
-    cells.path(Volume(Fit('foot', 4, 'none'), 'fdk')).mkdir(parents=True)
-    with cluster(tmp_path, workers=1) as (address, _):
+def test_a_series_that_fails(tmp_path):
+    """Another process has the folder of one series: the other cells are computed, and the line says which one failed."""
+    cells, fit = Cells(tmp_path / 'out', TINY), Fit('foot', 4, 'none')
+    with locked(cells.folder_of(fit)), cluster(tmp_path, workers=1) as (address, _):
         code, text, err = tables(tmp_path / 'out', '--cluster', address, '--iterations', 5)
-    assert code == 2 and '8 of 9 cells' in text
-    assert err.splitlines()[-1].startswith('error: 1 of 9 cells failed, the first one (foot, 4 views, none, fdk): ')
+    assert code == 2 and '8 of 9 cells' in text, err
+    last = err.splitlines()[-1]
+    assert last.startswith(f'error: 1 of 9 cells failed, the first one ({fit}, fdk): ') and 'is writing there' in last
