@@ -18,7 +18,7 @@ from lingo_mi.errors import InputError, brief
 from lingo_mi.file_access import optional
 from lingo_mi.gpu import visible_gpus
 from lingo_mi.jobs.job import Event, Job, Tell
-from lingo_mi.jobs.worker import TOPIC, describe_worker, require_fit, work
+from lingo_mi.jobs.worker import describe_worker, require_fit, work
 from lingo_mi.progress import Progress
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
@@ -76,24 +76,27 @@ class Cluster:
 
     def run(self, jobs: list[Job], tell: Tell) -> None:
         events: queue.SimpleQueue = queue.SimpleQueue()
-        token, by_name = secrets.token_hex(6), {job.name: job for job in jobs}
-        self.client.subscribe_topic(TOPIC, lambda event: events.put(event[1]))
+        topic, by_name = f'lingo_mi-{secrets.token_hex(6)}', {job.name: job for job in jobs}
         futures = {}
-        for i, job in enumerate(jobs):
-            key = f'lingo_mi-{token}-{i}'
-            future = self.client.submit(
-                work, job, key, self.folder, self.threads, self.variant, key=key, pure=False, priority=-i
-            )
-            futures[job.name] = future
-            future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
         try:
+            self.client.subscribe_topic(topic, lambda event: events.put(event[1]))
+            for i, job in enumerate(jobs):
+                key = f'{topic}-{i}'
+                arguments = job, key, topic, self.folder, self.threads, self.variant
+                future = self.client.submit(work, *arguments, key=key, pure=False, priority=-i)
+                futures[job.name] = future
+                future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
             with Progress('Jobs', sum(job.steps for job in jobs)) as bar:
                 _follow(by_name, events, tell, bar)
+            self.client.unsubscribe_topic(topic)
         except KeyboardInterrupt:
             self._stop(futures, events)
             raise
+        except _gone() as error:
+            raise InputError(
+                f'the scheduler has gone ({brief(error, 100)}); start one, and run the same command again'
+            ) from None
         finally:
-            self.client.unsubscribe_topic(TOPIC)
             for future in futures.values():
                 future.release()
 
@@ -123,15 +126,23 @@ class Cluster:
             require_fit(found, self.folder)
 
 
+def _gone() -> tuple[type[BaseException], ...]:
+    """What a client raises whose scheduler does not answer any more."""
+    from distributed.client import FutureCancelledError
+    from distributed.comm import CommClosedError
+
+    return CommClosedError, FutureCancelledError, TimeoutError
+
+
 def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress) -> None:
-    """Pass events on until every job has ended; those of other clients on the same scheduler are not ours."""
+    """Pass events on until every job has ended."""
     steps, running, left = dict.fromkeys(jobs, 0), set(), set(jobs)
     while left:
         try:
             name, kind, value = events.get(timeout=0.5)
         except queue.Empty:
             continue
-        if name not in left:
+        if name not in left:  # told before it ended, and come after
             continue
         if kind == 'ended':
             event = _end(name, value)

@@ -10,7 +10,6 @@ from typing import Any
 from lingo_mi.errors import InputError
 from lingo_mi.jobs.job import Event, Job, attempt
 
-TOPIC = 'lingo_mi'  # of the events that workers send
 PAUSE = 1.0  # seconds between two reports
 
 
@@ -39,24 +38,25 @@ def require_fit(found: dict, folder: str) -> None:
         )
 
 
-def work(job: Job, key: str, folder: str, threads: int, variant: str | None) -> Event:
+def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str | None) -> Event:
     """Run a job in a task of Dask; returns its last event.
 
     key       of the task
+    topic     of the events that it sends
     folder    that all workers share
     threads   of Dr.Jit on the CPU; 0: as many as it has
     """
     from distributed import get_worker
 
     worker = get_worker()
-    worker.log_event(TOPIC, Event(job.name, 'began', worker.address))
+    worker.log_event(topic, Event(job.name, 'began', worker.address))
     told = time.monotonic()
 
     def report(done, **_):
         nonlocal told
         if time.monotonic() - told > PAUSE:
             told = time.monotonic()
-            worker.log_event(TOPIC, Event(job.name, 'step', done))
+            worker.log_event(topic, Event(job.name, 'step', done))
             task = worker.state.tasks.get(key)
             if task is None or task.state == 'cancelled':  # nobody waits for it any more
                 raise KeyboardInterrupt
@@ -64,11 +64,11 @@ def work(job: Job, key: str, folder: str, threads: int, variant: str | None) -> 
     try:
         require_fit(describe_worker(folder, worker), folder)
         _prepare(threads, variant)
-        return attempt(job, report, lambda event: worker.log_event(TOPIC, event))
+        return attempt(job, report, lambda event: worker.log_event(topic, event))
     except InputError as error:
         return Event(job.name, 'failed', str(error))
     except KeyboardInterrupt:
-        worker.log_event(TOPIC, Event(job.name, 'stopped'))
+        worker.log_event(topic, Event(job.name, 'stopped'))
         return Event(job.name, 'stopped')
 
 
