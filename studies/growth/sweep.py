@@ -35,28 +35,38 @@ def sizes(axis: str, large: bool) -> list[int]:
     return list(SIZES[axis] if large else SIZES[axis][: SHORT[axis]])
 
 
-def sweep(large: bool, after_each: Callable[[str], object]) -> list[dict]:
+def planned(stage: str, large: bool) -> list[tuple[str, int]]:
+    """What is measured of a stage: pairs of an axis and a value of `SIZES`."""
+    return [(axis, value) for axis in DEPENDS[stage] for value in sizes(axis, large)]
+
+
+def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict]], object]) -> list[dict]:
     """Measurements: stage, axis, number, seconds of CPU time, peak in bytes.
+
+    stored       measurements of before; a stage that is whole there is not measured again
+    after_each   called with all measurements so far, after every stage
 
     Raises InputError where a stage fails.
     """
-    found = []
-    for stage, axes in DEPENDS.items():
-        planned = [(axis, value) for axis in axes for value in sizes(axis, large)]
-        words = [astuple(replace(BASE, **{FIELDS[axis]: value})) for axis, value in planned]
-        command = [sys.executable, '-m', 'lingo_mi.studies.growth.stages', stage]
-        command += [','.join(map(str, word)) for word in words]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            last = (done.stderr.strip().splitlines() or ['it was killed'])[-1]
-            raise InputError(f'{stage}: {brief(last, 200)}')
-        lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{')]
-        found += [
-            dict(stage=stage, axis=axis, number=number(axis, value)) | line
-            for (axis, value), line in zip(planned, lines)
-        ]
-        after_each(stage)
+    found: list[dict] = []
+    for stage in DEPENDS:
+        wanted = [(axis, number(axis, value)) for axis, value in planned(stage, large)]
+        kept = [row for row in stored if row['stage'] == stage and (row['axis'], row['number']) in wanted]
+        found += kept if len(kept) == len(wanted) else _measured(stage, planned(stage, large))
+        after_each(found)
     return found
+
+
+def _measured(stage: str, plan: list[tuple[str, int]]) -> list[dict]:
+    words = [astuple(replace(BASE, **{FIELDS[axis]: value})) for axis, value in plan]
+    command = [sys.executable, '-m', 'lingo_mi.studies.growth.stages', stage]
+    command += [','.join(map(str, word)) for word in words]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ['it was killed'])[-1]
+        raise InputError(f'{stage}: {brief(last, 200)}')
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{')]
+    return [dict(stage=stage, axis=axis, number=number(axis, value)) | line for (axis, value), line in zip(plan, lines)]
 
 
 def exponent(rows: list[dict], key: str) -> float:

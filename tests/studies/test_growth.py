@@ -11,6 +11,7 @@ from unittest import mock
 import pytest
 
 from helpers.script import FIT
+from lingo_mi.errors import InputError
 from lingo_mi.studies.growth import stages, sweep
 from lingo_mi.studies.growth.report import exponents, rows_of
 
@@ -50,11 +51,15 @@ def test_the_command(tmp_path, monkeypatch):
     ]
     assert all(row['seconds'] > 0 for row in found) and (tmp_path / 'growth.md').read_text() in text
     assert (tmp_path / 'growth.png').stat().st_size > 10_000 and (tmp_path / 'growth.provenance.json').exists()
-    monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('nothing',)})
-    monkeypatch.setattr(sweep, 'sizes', lambda *_: [0])
-    monkeypatch.setattr(sweep, 'FIELDS', dict(nothing='voxels'))
+    # What is stored is not measured again, and a stage that fails does not lose it.
+    monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('voxels', 'views'), 'voxelise': ('views',)})
+    monkeypatch.setattr(sweep, '_measured', mock.Mock(side_effect=InputError('voxelise: no')))
     code, _, err = run_growth(tmp_path)
-    assert code == 2 and err.splitlines()[-1].startswith('error: FDK: ')
+    assert code == 2 and err.splitlines()[-1] == 'error: voxelise: no' and sweep._measured.call_count == 1
+    assert json.loads((tmp_path / 'growth.json').read_text()) == found
+    (tmp_path / 'growth.json').write_text('{"mine": 1}')
+    code, _, err = run_growth(tmp_path)
+    assert code == 2 and 'growth.json: holds no measurements' in err and err.count('\n') == 1
 
 
 def run_growth(folder):
