@@ -27,7 +27,7 @@ from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
@@ -103,6 +103,7 @@ class Study:
 
     def _compute(self, case: Case, setting: str) -> dict:
         dataset = self.dataset(case)
+        assert dataset.volume is not None
         if setting in CLOUDS:
             self._cloud(case)  # not in this setting's time, but in its sum
         began, extra = time.process_time(), {}
@@ -111,7 +112,9 @@ class Study:
             volume = found.volume
             wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
             assert found.error is not None
-            extra = dict(plan=found.record(), error_map=float(spearmanr(found.error.ravel(), wrong.ravel())[0]))
+            extra = dict(
+                plan=found.record(), error_map=float(np.asarray(spearmanr(found.error.ravel(), wrong.ravel()))[0])
+            )
         else:
             volume = self._volume(case, dataset.train, setting)
         seconds = time.process_time() - began + (self._cloud(case)[1] if setting in CLOUDS else 0.0)
@@ -128,16 +131,20 @@ class Study:
             start = ASDPOCS(niter=START).run(scan).volume
             return means(refine(scan, start, Best.niter, finer).volume, finer)
         cloud = self._cloud(case)[0]
-        if setting == 'cloud':
-            found = cloud.volume()
+
+        def sample(geometry: Geometry) -> np.ndarray:
+            found = cloud.volume(geometry)
             assert found is not None  # fast has densities
             return found
+
+        if setting == 'cloud':
+            return sample(scan.geometry)
         if setting == 'cloud_finer':
-            return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=cloud.volume).volume
+            return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=sample).volume
         completed = insert_views(scan, max(COMPLETED, len(scan)), cloud.render)
         if setting == 'completed':
             return ASDPOCS(niter=10).run(completed).volume
-        return Refined().run(scan, sample=cloud.volume, completed=completed).volume
+        return Refined().run(scan, sample=sample, completed=completed).volume
 
     def _fitted(self, case: Case) -> tuple[Fitted, float]:
         began, scan = time.process_time(), self.dataset(case).train

@@ -217,7 +217,7 @@ def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
 
 def _parts(volume: np.ndarray, finer: int) -> np.ndarray:
     """A volume on `finer` times smaller voxels, interpolated linearly."""
-    return volume if finer == 1 else ndimage.zoom(volume, finer, order=1, mode='nearest', grid_mode=True)
+    return volume if finer == 1 else np.asarray(ndimage.zoom(volume, finer, order=1, mode='nearest', grid_mode=True))
 
 
 def means(volume: np.ndarray, finer: int) -> np.ndarray:
