@@ -20,7 +20,8 @@ def extensible(settings: Settings) -> bool:
 def require_same_fit(extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:
     """Raise InputError if a checkpoint, by its plain values, belongs to another fit."""
     now = settings.flat()
-    before = {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
+    # Settings that the checkpoint does not know are newer than it; what they stand at changes nothing.
+    before = Settings().flat() | {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
     if extensible(settings) and extra['iteration'] <= settings.iterations:
         free.add('iterations')
