@@ -40,8 +40,8 @@ def run(
                then have more iterations than the checkpoint's, if it is `resume.extensible`
     seed       for the views' order, the total variation's cubes and splits; of a neural field, parameters, rays and samples
     measure    called as measure(model, state) at a few iterations; returns numbers for the history
-    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps. The state is then
-               consistent: if it raises KeyboardInterrupt, a checkpoint is written
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps; gaussians is None for
+               a neural field. The state is then consistent: if it raises KeyboardInterrupt, a checkpoint is written
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is created
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
@@ -120,7 +120,7 @@ def run(
             measured = history[-1].items() if history else ()
             last = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
             try:
-                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
+                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state) or None, **last)
             except KeyboardInterrupt:
                 store()
                 raise

@@ -92,8 +92,7 @@ NAF = R2.changed(
 )
 
 METHODS = {'fast': FAST, 'lingo': LINGO, 'r2': R2, '3dgs': GS3D, 'xgaussian': XGAUSSIAN, 'naf': NAF}
-VOLUMETRIC = tuple(name for name, settings in METHODS.items() if settings.volumetric)  # those with a volume
-CLOUDS = tuple(name for name in VOLUMETRIC if METHODS[name].cloud)  # those with a volume, of Gaussians
+CLOUDS = tuple(name for name, s in METHODS.items() if s.cloud and s.volumetric)  # those of Gaussians with densities
 
 
 def settings_of(method: str, **values: Any) -> Settings:

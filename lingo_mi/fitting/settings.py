@@ -259,7 +259,9 @@ class Settings:
             checkpoint_seconds=(0, 1e9),
         )
         inits, init = INITS[self.model.render], self.start.init
-        _require(init in inits, f'init is {" or ".join(map(repr, inits))} with render={self.model.render}, not {init!r}')
+        _require(
+            init in inits, f'init is {" or ".join(map(repr, inits))} with render={self.model.render}, not {init!r}'
+        )
         _require(
             self.model.render != 'alpha'
             or self.model.normalise

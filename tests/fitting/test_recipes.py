@@ -3,12 +3,12 @@
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC, settings_of
+from lingo_mi.fitting.recipes import CLOUDS, METHODS, settings_of
 
 
 def test_names():
     assert tuple(METHODS) == ('fast', 'lingo', 'r2', '3dgs', 'xgaussian')
-    assert VOLUMETRIC == ('fast', 'lingo', 'r2')
+    assert CLOUDS == ('fast', 'lingo', 'r2')
 
 
 def test_settings_by_name_and_value():
