@@ -74,20 +74,23 @@ class Network:
         inputs = mi.TensorXf(dr.ravel(encoded, order='C'), (self.inputs, dr.width(points)))
         hidden, begin = inputs, 0
         for i, (n, m) in enumerate(self.layers):
-            matrix = _slice(values['network'], begin, (m, n))
-            bias = _slice(values['network'], begin + n * m, (m, 1))
-            begin += n * m + m
-            if i == self.skip:  # the product with both halves, so that they need not be joined
-                split = self.inputs
-                hidden = matrix[:, :split] @ inputs + matrix[:, split:] @ hidden + bias
+            bias = _block(values['network'], begin + n * m, 1, (m, 1))
+            if i == self.skip:  # the product with both halves of the matrix, so that the inputs need not be joined
+                k = self.inputs
+                left, right = (_block(values['network'], begin + a, n, (m, b)) for a, b in ((0, k), (k, n - k)))
+                hidden = left @ inputs + right @ hidden + bias
             else:
-                hidden = matrix @ hidden + bias
+                hidden = _block(values['network'], begin, n, (m, n)) @ hidden + bias
+            begin += n * m + m
             if i < len(self.layers) - 1:
                 hidden = dr.select(hidden > 0, hidden, hidden * SLOPE)
         return 1 / (1 + dr.exp(-hidden.array))
 
 
-def _slice(values: Any, begin: int, shape: tuple[int, int]) -> Any:
-    """A part of a Float as a matrix."""
-    index = dr.arange(mi.UInt32, shape[0] * shape[1]) + dr.opaque(mi.UInt32, begin)
-    return mi.TensorXf(dr.gather(mi.Float, values, index), shape)
+def _block(values: Any, begin: int, stride: int, shape: tuple[int, int]) -> Any:
+    """A block of a matrix that is stored in a Float row by row, `stride` numbers a row. (Slices of tensors lose derivatives.)"""
+    rows, columns = shape
+    index = dr.arange(mi.UInt32, rows * columns)
+    row = index // columns
+    place = row * stride + (index - row * columns) + dr.opaque(mi.UInt32, begin)
+    return mi.TensorXf(dr.gather(mi.Float, values, place, mode=dr.ReduceMode.Permute), shape)
