@@ -13,8 +13,8 @@ import numpy as np
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.field_model import FieldModel
+from lingo_mi.fitting.field.largest_density import largest_density
 from lingo_mi.fitting.field.rays import pixels_of
-from lingo_mi.fitting.measured import density_unit
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State
 from lingo_mi.lingo.initialise import InitialCloud
@@ -37,7 +37,8 @@ class FieldStepper:
     def __init__(self, scan: Scan, settings: Settings):
         """Raises InputError for an empty scan."""
         self.settings, self.scan = settings, scan
-        self.model = FieldModel(settings, scan.geometry, density_unit(scan, settings))
+        unit = largest_density(scan) if settings.model.normalise else 1.0
+        self.model = FieldModel(settings, scan.geometry, unit)
         self.rows = view_table(scan.geometry)
 
     def start(self, initial: InitialCloud, rng: np.random.Generator) -> State:

@@ -55,7 +55,7 @@ def integrals(
     ray = index // samples
 
     def of_ray(values: Any) -> Any:
-        return dr.gather(type(values), values, ray, mode=dr.ReduceMode.NoConflicts)
+        return dr.gather(type(values), values, ray)
 
     t = dr.fma(mi.Float(index - ray * samples) + within, of_ray(step), of_ray(begin))
     points = cube.of_grid(dr.fma(of_ray(walk.d), t, of_ray(walk.origin)))
