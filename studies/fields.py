@@ -95,9 +95,10 @@ def measured(dataset: Dataset, settings: Settings, test: int, label: str) -> dic
     def look(model, state):
         nonlocal spent, last
         spent += time.process_time() - last
-        history.append(dict(cpu_seconds=spent, psnr_3d_r2=metrics.psnr_3d_r2(model.volume(state), truth)))
+        found = dict(psnr_3d=metrics.psnr_3d_r2(model.volume(state), truth))
+        history.append(dict(cpu_seconds=spent, **found))
         last = time.process_time()
-        return {}
+        return found
 
     with Progress(label, settings.iterations) as bar:
         fitted = run(dataset.train, settings, initial_cloud(dataset.train, settings), 0, look, bar.update)

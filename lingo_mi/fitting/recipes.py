@@ -79,11 +79,12 @@ XGAUSSIAN = GS3D.changed(
 # Zha, Zhang and Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022, and its released
 # settings of the chest: 1500 passes over 50 views. The rates step down to a tenth in the paper; here they fall to it
 # log-linearly. Its lengths are metres, and Adam's epsilon is 1e-8. In the normalised frame of a volume of 256 mm the gradients
-# are (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density is this project's own.
+# are (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density and the start are our own.
 NAF = R2.changed(
     render='field',
     init='network',
     normalise=True,
+    field_start='mean',
     effects='ignore',
     iterations=75_000,
     decay_steps=0,

@@ -61,7 +61,7 @@ class ModelSettings:
     normalise          whether to fit densities in a unit that makes the largest line integral 1 (own). SSIM's constants
                        and the bounds then mean the same for any object. R2 expects volumes in [0, 1]. Of a neural field,
                        whose densities are below 1, the unit is a bound of the densities (see
-                       `lingo_mi.fitting.field.largest_density`); NAF expects volumes in [0, 1], too
+                       `lingo_mi.fitting.field.densities`); NAF expects volumes in [0, 1], too
     sh_degree          for `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0: the same radiance in
                        all directions (X-Gaussian)
     sh_every           for `alpha`: iterations between the starts of successive degrees (3DGS: 1000)

@@ -28,7 +28,7 @@ class FieldModel:
 
     settings   of the fit
     geometry   of its scan, as given; defines the cube of the field and the default grid of `volume`
-    unit       the fit's unit of density, 1/mm, which no density of the field exceeds (`largest_density`)
+    unit       the fit's unit of density, 1/mm, which no density of the field exceeds (see `densities.largest_density`)
     effects    none: the field fits line integrals
     """
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.field.densities import largest_density, mean_density
 from lingo_mi.fitting.field.field_model import FieldModel
-from lingo_mi.fitting.field.largest_density import largest_density
 from lingo_mi.fitting.field.rays import pixels_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State
@@ -43,7 +43,8 @@ class FieldStepper:
 
     def start(self, initial: InitialCloud, rng: np.random.Generator) -> State:
         """The state at the start of a fit: random parameters, no Gaussians."""
-        values = self.model.network.initial(rng)
+        mean = mean_density(self.scan) / self.model.unit if self.settings.neural.field_start == 'mean' else None
+        values = self.model.network.initial(rng, mean)
         first, second = ({k: np.zeros_like(v) for k, v in values.items()} for _ in range(2))
         none = np.zeros(0, np.float32)
         return State(values, first, second, none, none.copy(), np.zeros(0, bool))

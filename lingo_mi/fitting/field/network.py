@@ -14,9 +14,11 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
+from lingo_mi.fitting.activations import inverse_sigmoid
 from lingo_mi.fitting.field.settings import FieldSettings
 
 SLOPE = 0.01  # of the leaky ReLU below 0 (PyTorch's default)
+MEANS = 1e-4, 0.5  # densities that a field starts from: it hardly leaves lower ones
 FEATURE_RANGE = 1e-4  # features begin uniform within it (Müller et al., section 4)
 
 
@@ -53,16 +55,19 @@ class Network:
         """Shapes of the parameters by name, as columns."""
         return {'features': (self.encoding.n_params, 1), 'network': (self.count, 1)}
 
-    def initial(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    def initial(self, rng: np.random.Generator, mean: float | None = None) -> dict[str, np.ndarray]:
         """Random parameters, float32, of the shapes `shapes`.
 
-        Features are uniform in +-1e-4, matrices and biases in +-1 / sqrt(inputs of the layer), PyTorch's default.
+        Features are uniform in +-1e-4, matrices and biases in +-1 / sqrt(inputs of the layer), PyTorch's default. With a `mean`,
+        the last bias is such that the field is about as dense everywhere.
         """
         features = rng.random(self.encoding.n_params, np.float32) * np.float32(2 * FEATURE_RANGE) - np.float32(
             FEATURE_RANGE
         )
-        network = [rng.uniform(-1, 1, n * m + m) / np.sqrt(n) for n, m in self.layers]
-        return {'features': features[:, None], 'network': np.concatenate(network).astype(np.float32)[:, None]}
+        network = np.concatenate([rng.uniform(-1, 1, n * m + m) / np.sqrt(n) for n, m in self.layers])
+        if mean is not None:
+            network[-1] = inverse_sigmoid(np.clip(mean, *MEANS))
+        return {'features': features[:, None], 'network': network.astype(np.float32)[:, None]}
 
     def density(self, values: dict[str, Any], points: Sequence[Any]) -> Any:
         """The field at points, Float [N], in (0, 1). Differentiable by the parameters, which `values` has by name.

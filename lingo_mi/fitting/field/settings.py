@@ -24,6 +24,8 @@ class FieldSettings:
     field_layers       layers of the network (4)
     field_width        outputs of all layers but the last (32)
     field_skip         the layer, from 0, that is given the features again (2)
+    field_start        'random' (NAF), about half the largest density everywhere; 'mean' (own): about the scan's mean density.
+                       From half, a field of a small object falls to 0 first and takes a thousand steps to rise again
     field_samples      samples on a ray (192, for 128^3 voxels; 320 for 256^3)
     field_rays         rays of a view in a step (1024)
     """
@@ -37,6 +39,7 @@ class FieldSettings:
     field_layers: int = 4
     field_width: int = 32
     field_skip: int = 2
+    field_start: str = 'random'
     field_samples: int = 192
     field_rays: int = 1024
 
@@ -55,6 +58,8 @@ class FieldSettings:
             field_samples=(1, 1e5),
             field_rays=(1, 1e6),
         )
+        if self.field_start not in ('random', 'mean'):
+            raise InputError(f"field_start is 'random' or 'mean', not {self.field_start!r}")
         if self.field_features % 2:
             raise InputError(f'field_features is even, not {self.field_features}')
         if self.field_skip >= self.field_layers:

@@ -1,9 +1,10 @@
-"""A bound of the densities in a scan's volume: the unit of a neural field, whose values are below 1."""
+"""What a neural field is told of a scan's densities: a bound, which is its unit, and their mean, which it starts from."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from lingo_mi.projectors import grid
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.rectify import can_rectify
@@ -11,6 +12,7 @@ from lingo_mi.scan import Scan
 
 SHARE, ROOM = 0.9999, 1.5  # of the voxels of an FDK volume that are less dense; the bound, over the next
 THINNEST = 0.1  # way through the densest matter, in halves of the volume's longest side, where there is no FDK volume
+VIEWS = 8  # that a mean is taken over, at most
 
 
 def largest_density(scan: Scan) -> float:
@@ -27,3 +29,15 @@ def largest_density(scan: Scan) -> float:
     found = ROOM * float(np.quantile(FDK().run(scan).volume, SHARE))
     # Three digits, so that a fit that goes on has the same unit, whatever the rounding of a reconstruction made anew.
     return float(f'{found:.3g}') if found > 0 else rough
+
+
+def mean_density(scan: Scan) -> float:
+    """The mean of a scan's densities along its rays through the volume, 1/mm.
+
+    The sum of the line integrals over that of the ways: of a few evenly spaced views, and of their valid pixels. 0 where no ray
+    meets the volume.
+    """
+    few = scan.subset(np.arange(min(len(scan), VIEWS)) * len(scan) // min(len(scan), VIEWS))
+    ways = grid.project(np.ones(few.geometry.nVoxel, np.float32), few.geometry).astype(float)
+    inside = ways > 0 if few.valid is None else (ways > 0) & few.valid
+    return float(few.projections[inside].sum(dtype=float) / ways[inside].sum()) if inside.any() else 0.0
