@@ -142,12 +142,13 @@ def sections(data: Any) -> list[Section]:
             )
         out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width), caption))
     if any(len(series(data.history, 'iteration', y)[0]) for y in ('loss', 'psnr_2d', 'psnr_3d', 'gaussians')):
+        grows = len(series(data.history, 'iteration', 'gaussians')[0]) > 0
         out.append(
             Section(
                 'Convergence',
                 draw_curves,
                 lambda width: 5.2,
-                'Loss, quality and number of Gaussians against iterations (left) and against '
+                f'Loss{", quality and number of Gaussians" if grows else " and quality"} against iterations (left) and against '
                 'wall-clock seconds (right). PSNR in dB, more is better.',
             )
         )
