@@ -1,6 +1,7 @@
 """A neural field beside clouds of Gaussians, on the same scans: quality against CPU time.
 
     python -m lingo_mi.studies.fields --objects foot --views 5 10 25 --iterations 1000
+    python -m lingo_mi.studies.fields --methods naf -D rate_features=1e-2,1e-3 -D rate_network=3e-3,3e-4 -D epsilon=1e-10
     python -m lingo_mi.studies.fields --objects foot chest engine aneurism --scale paper --iterations 75000
 
 Objects, scans and the recipes' number of points are those of `lingo-mi tables`. A field takes --iterations steps, fast its own
@@ -51,6 +52,14 @@ def main() -> None:
     p.add_argument('--views', nargs='+', type=int, default=[5, 10, 25])
     p.add_argument('--methods', nargs='+', default=['fast', 'lingo', 'r2', 'naf'])
     p.add_argument('--iterations', type=int, default=1000, help='of a field')
+    p.add_argument(
+        '-D',
+        dest='define',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='a setting of the field (any number of these)',
+    )
     p.add_argument('--scale', choices=SCALES, default='small')
     p.add_argument('--test', type=int, default=5, help='held-out views to measure')
     p.add_argument('--out', type=Path, default=Path('out/fields'))
@@ -64,15 +73,21 @@ def main() -> None:
         for views in args.views:
             for method in args.methods:
                 settings = settings_of(method, n_points=cells.scale.n_points)
+                label = method
                 if not settings.cloud:
-                    settings = settings.changed(iterations=args.iterations)
+                    settings = settings.changed(
+                        iterations=args.iterations, **dict(d.split('=', 1) for d in args.define)
+                    )
+                    label = ' '.join([method, *args.define])
                 elif settings.decay_steps:
                     settings = settings.changed(iterations=STEPS)
-                path = args.out / f'{name}_{views}_{method.replace(":", "_")}_{settings.iterations}.json'
+                path = (
+                    args.out / f'{name}_{views}_{label.replace(":", "_").replace(" ", "_")}_{settings.iterations}.json'
+                )
                 if not path.exists():
                     dataset = choose_views(cells.dataset(name), views)
-                    found = dict(object=name, views=views, method=method, scale=args.scale, test=args.test)
-                    found |= measured(dataset, settings, args.test, f'{name}, {views} views, {method}')
+                    found = dict(object=name, views=views, method=label, scale=args.scale, test=args.test)
+                    found |= measured(dataset, settings, args.test, f'{name}, {views} views, {label}')
                     with replacing(path) as temporary:
                         temporary.write_text(json.dumps(found | dict(provenance=provenance()), indent=1) + '\n')
                 rows.append(json.loads(path.read_text(encoding='utf-8')))
