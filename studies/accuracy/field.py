@@ -1,4 +1,7 @@
-"""Line integrals of a neural field: error and time against the number of samples on a ray."""
+"""Line integrals of a neural field: error and time against the number of samples on a ray.
+
+python -m lingo_mi.studies.accuracy.field    # prints the table alone, in a minute
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,11 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors import grid
 from lingo_mi.projectors.upload import uploaded
+from lingo_mi.runtime import use_variant
 from lingo_mi.studies.accuracy.compare import deviation
-from lingo_mi.studies.accuracy.sizes import Sizes
+from lingo_mi.studies.accuracy.sizes import FULL, Sizes
+from lingo_mi.studies.accuracy.tables import FIELD as COLUMNS
+from lingo_mi.studies.markdown import table
 
 FINE = 16  # times as many samples as the most that are measured, as the truth
 # A cube that is the volume, and levels of 16 to 128 cells along its side: as fine as voxels of a fit.
@@ -93,3 +99,8 @@ def _timed(work):
 def _row(name: str, found: np.ndarray, expected: np.ndarray, seconds: float, **more: float) -> dict:
     l2, largest = deviation(found, expected)
     return dict(name=name, image=l2, image_max=largest, us_per_ray=1e6 * seconds / len(expected)) | more
+
+
+if __name__ == '__main__':
+    use_variant(None)
+    print(table(COLUMNS, samples(FULL)))

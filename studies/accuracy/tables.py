@@ -57,7 +57,7 @@ def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
     )
     tables['initialisations'] = table(_INITIAL, found['initialisations'])
     tables['fits'] = table(_FITS, found['fits'])
-    tables['field'] = table(_FIELD, found['field'])
+    tables['field'] = table(FIELD, found['field'])
     return {name: tables[name] for name in TITLES}
 
 
@@ -190,7 +190,7 @@ _FITS = [
     ('seconds', _number('seconds', '{:.1f}')),
     *_QUALITY,
 ]
-_FIELD = [
+FIELD = [
     ('samples on a ray', _number('name', '{}')),
     ('L2', _error('image')),
     ('max', _error('image_max')),
