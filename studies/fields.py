@@ -119,6 +119,7 @@ def measured(dataset: Dataset, settings: Settings, test: int, label: str) -> dic
         fitted = run(dataset.train, settings, initial_cloud(dataset.train, settings), 0, look, bar.update)
     spent += time.process_time() - last
     volume, rendered = fitted.volume(), fitted.render(held.geometry)
+    assert volume is not None  # as of every method but those of opacities
     return dict(
         iterations=settings.iterations,
         cpu_seconds=spent,

@@ -120,6 +120,8 @@ def _require_plain(extra: Any) -> Settings:
     _require(seen == extra['views'], f'views is {shown(extra["views"])}, but the scanner has {seen}')
     steps = [entry['iteration'] for entry in extra['history']]
     _require(extra['iteration'] <= settings.iterations, "iteration is beyond the settings' iterations")
+    least = 1 if settings.cloud else 0
+    _require(all(entry['gaussians'] >= least for entry in extra['history']), 'history has no Gaussians')
     _require(steps == sorted(set(steps)) and max(steps, default=0) <= extra['iteration'], 'history is out of order')
     return settings
 

@@ -41,7 +41,7 @@ def samples(sizes: Sizes) -> list[dict]:
         DSO=1000.0,
         DSD=1500.0,
         nDetector=(sizes.field_pixels, sizes.field_pixels),
-        dDetector=(512 / sizes.field_pixels,) * 2,
+        dDetector=(512 / sizes.field_pixels, 512 / sizes.field_pixels),
         nVoxel=(side,) * 3,
         dVoxel=(256 / side,) * 3,
         angles=circular(1, 360, start=20),

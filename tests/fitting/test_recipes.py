@@ -7,7 +7,7 @@ from lingo_mi.fitting.recipes import CLOUDS, METHODS, settings_of
 
 
 def test_names():
-    assert tuple(METHODS) == ('fast', 'lingo', 'r2', '3dgs', 'xgaussian')
+    assert tuple(METHODS) == ('fast', 'lingo', 'r2', '3dgs', 'xgaussian', 'naf')
     assert CLOUDS == ('fast', 'lingo', 'r2')
 
 
