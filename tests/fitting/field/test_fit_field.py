@@ -73,6 +73,13 @@ def test_the_published_start_is_half_the_largest_density(scan):
     assert begun.model.unit == 1
 
 
+def test_from_half_the_largest_density_the_field_is_lost_at_first(learnt):
+    """It falls to 0, where the sigmoid has no slope; from the scan's mean, as many steps suffice."""
+    scan, fitted = learnt
+    found = fit(scan, fitted.settings.changed(field_start='random'))
+    assert error_of(found, scan) > 5 * error_of(fitted, scan)
+
+
 def test_unit_and_start_follow_the_scan(scan):
     """A bound of the densities, and their mean along the rays."""
     stepper = FieldStepper(scan, SMALL)
