@@ -35,12 +35,13 @@ def fit(
     progress: bool = True,
     **settings: Any,
 ) -> Result:
-    """Fit a cloud of 3D Gaussians to a scan.
+    """Fit a cloud of 3D Gaussians, or a neural field, to a scan.
 
     scan         the views to fit; of a `Dataset` these are `train`, and quality on its held-out views and true volume is
                  measured on the way
     recipe       'fast' (this project's own), 'lingo' or 'r2' (the published ones), '3dgs' or 'xgaussian' (baselines that
-                 composite opacities: they make views, but no volume), with changes as in 'lingo:V_S=1'; or `Settings`
+                 composite opacities: they make views, but no volume) or 'naf' (a neural field), with changes as in
+                 'lingo:V_S=1'; or `Settings`
     seed         of every random choice
     checkpoint   a file (.npz) written every 30 s and at the end; what `resume` goes on from
     resume       go on from the checkpoint, as if it had never stopped; the scan and all settings must be the same

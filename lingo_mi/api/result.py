@@ -100,7 +100,7 @@ class Result:
     def gaussians(self) -> Gaussians:
         """The cloud, for `lm.project(*result.gaussians, geometry)`.
 
-        With `extent=result.settings.model.extent` images are those of `render`.
+        With `extent=result.settings.model.extent` images are those of `render`. Raises InputError for 'naf', a neural field.
         """
         return Gaussians(*self.fitted.world_gaussians())
 
@@ -202,7 +202,7 @@ class Result:
         views = 0 if measured.views is None else len(measured.views)
         with locked(folder), writing(folder):
             clear_leftovers(folder)
-            require_ours(folder, result_names(measured.volume is not None, views) | {CHECKPOINT})
+            require_ours(folder, result_names(self.settings, views) | {CHECKPOINT})
             with replacing(folder / CHECKPOINT) as temporary:
                 temporary.write_bytes(self._checkpoint)
                 begin(folder, [CHECKPOINT])
@@ -210,10 +210,9 @@ class Result:
         return folder
 
     def __repr__(self) -> str:
-        return (
-            f'Result({self.recipe}: {len(self):,} Gaussians after {self.settings.iterations} iterations, '
-            f'{self.seconds:.0f} s)'
-        )
+        size = sum(v.size for v in self.fitted.state.values.values())
+        what = f'{len(self):,} Gaussians' if self.settings.cloud else f'a field of {size:,} parameters'
+        return f'Result({self.recipe}: {what} after {self.settings.iterations} iterations, {self.seconds:.0f} s)'
 
     def _repr_html_(self) -> str:
         measured, geometry = self._measured, self.fitted.geometry

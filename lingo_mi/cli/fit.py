@@ -1,4 +1,4 @@
-"""Fit a cloud of 3D Gaussians to a CT scan, and make a volume and new views of it.
+"""Fit a cloud of 3D Gaussians, or a neural field, to a CT scan, and make a volume and new views of it.
 
     lingo-mi fit x3d_foot
     lingo-mi fit x3d_foot --method lingo --views 25 --iterations 5000
@@ -8,7 +8,7 @@
 The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
 measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a
 volume in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and
-metrics.json. The baselines 3dgs and xgaussian make neither volume nor scene.
+metrics.json. The baselines 3dgs and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
 """
 
 import argparse
@@ -42,15 +42,15 @@ def arguments() -> argparse.Namespace:
         choices=METHODS,
         default='fast',
         help='recipe: fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
-        'composite opacities and make views but no volume',
+        'composite opacities and make views but no volume, and naf, a neural field',
     )
     p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
     p.add_argument(
         '--init',
-        choices=('lingo', 'r2', 'random', 'cuboid'),
+        choices=('lingo', 'r2', 'random', 'cuboid', 'network'),
         help='initial cloud: Otsu masks (lingo) or an FDK '
-        'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid)',
+        'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid); of naf: network',
     )
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')

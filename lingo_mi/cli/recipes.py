@@ -17,7 +17,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.file_access import write_text
-from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
+from lingo_mi.fitting.recipes import CLOUDS, METHODS
 
 
 def arguments() -> argparse.Namespace:
@@ -26,9 +26,9 @@ def arguments() -> argparse.Namespace:
     p.add_argument(
         '--methods',
         nargs='+',
-        default=list(VOLUMETRIC),
+        default=list(CLOUDS),
         metavar='METHOD[:name=value,...]',
-        help=f'any of {", ".join(METHODS)} (default: {" ".join(VOLUMETRIC)})',
+        help=f'any of {", ".join(METHODS)} (default: {" ".join(CLOUDS)})',
     )
     p.add_argument('--views', type=int, default=25)
     p.add_argument('--iterations', type=int, default=5000)

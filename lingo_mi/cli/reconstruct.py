@@ -47,6 +47,7 @@ from lingo_mi.completion.prepare import prepare_completed, prepare_start, sample
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import optional, write_text
 from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
+from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
 from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
@@ -76,10 +77,12 @@ def arguments() -> argparse.Namespace:
         '--complete',
         metavar='F',
         help='result.xml of a fit, from which missing views of a circle are rendered; '
-        'checkpoint.npz of one by 3dgs or xgaussian',
+        'checkpoint.npz of one by naf, 3dgs or xgaussian',
     )
     p.add_argument(
-        '--start', metavar='F', help='result.xml of a fit, whose volume refined or an iterative algorithm starts from'
+        '--start',
+        metavar='F',
+        help='result.xml of a fit, or checkpoint.npz of one by naf, whose volume refined or an iterative algorithm starts from',
     )
     p.add_argument(
         '--out',
@@ -202,7 +205,8 @@ def reconstruct_into(
     """
     scene = load_scene(args.scene, parameters)
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
-    if (args.algorithm in FROM_CLOUD or args.start) and not hasattr(cloud, 'gaussians'):
+    opacities = isinstance(cloud, Fitted) and not cloud.settings.volumetric
+    if (args.algorithm in FROM_CLOUD or args.start) and opacities:
         raise InputError(
             f'{args.complete or args.start}: this recipe fits opacities, not densities, and has no volume; '
             + ('leave out --start' if args.start else 'take another --algorithm')

@@ -1,4 +1,4 @@
-"""Fitted clouds, loaded from a fit's files."""
+"""Fitted clouds, and fields, loaded from a fit's files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lingo_mi.projectors.objects import Ellipsoids, find_objects
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import render_objects
 
-WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by 3dgs or xgaussian'
+WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by naf, 3dgs or xgaussian'
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FittedCloud:
 
     @classmethod
     def of(cls, fitted: Fitted) -> FittedCloud | Fitted:
-        """The cloud of a fit; for alpha compositing the fit itself, since its Gaussians have no densities."""
+        """The cloud of a fit. For alpha compositing, whose Gaussians have no densities, and for a neural field the fit itself."""
         gaussians = fitted.cloud()
         if gaussians is None:
             return fitted
@@ -55,14 +55,14 @@ class FittedCloud:
 
 
 def load_cloud(path: Path | str) -> FittedCloud | Fitted:
-    """The cloud of a scene such as a fit's result.xml, or a fit by alpha compositing from its checkpoint (.npz).
+    """The cloud of a scene such as a fit's result.xml, or from its checkpoint (.npz) a fit by alpha compositing or of a field.
 
     Both have `geometry`, `corrected`, `effects`, `seed` and `render`. Raises InputError for any other file, and for one of a
     result whose files do not belong together.
     """
     require_together(Path(path).parent, [Path(path).name, CLOUD])
     if Path(path).suffix == '.npz':
-        return _composited(path)
+        return _from_checkpoint(path)
     loaded = load_scene(Path(path))
     objects = find_objects(loaded.scene)
     options = getattr(loaded.scene.integrator(), 'options', None)
@@ -106,10 +106,10 @@ def _as_given(geometry: Geometry, record: dict, path) -> Geometry:
     return poses.undone().corrected(geometry)
 
 
-def _composited(path) -> Fitted:
+def _from_checkpoint(path) -> Fitted:
     if not Path(path).exists():
         raise InputError(f'{path}: no such file; {WANTED}')
     fitted = Fitted.from_checkpoint(path)
-    if fitted.settings.volumetric:
-        raise InputError(f'{path}: is no checkpoint of a fit by alpha compositing; {WANTED}')
+    if fitted.settings.volumetric and fitted.settings.cloud:
+        raise InputError(f'{path}: is the checkpoint of a fit that has a result.xml; {WANTED}')
     return fitted

@@ -20,8 +20,10 @@ from lingo_mi.scene.truth import voxelize_cloud
 def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
     """A function of a geometry that returns the cloud's densities per mm at its voxel centres, float32 [x, y, z].
 
-    Raises InputError for a cloud of alpha compositing, which has no densities.
+    Of a neural field it returns the field's. Raises InputError for a cloud of alpha compositing, which has no densities.
     """
+    if isinstance(cloud, Fitted) and cloud.settings.volumetric:
+        return _of_field(cloud)
     if isinstance(cloud, Fitted):
         raise InputError(
             'this recipe fits opacities, not densities, and has no volume: use a cloud of fast, lingo or r2'
@@ -29,6 +31,15 @@ def sampled(cloud: FittedCloud | Fitted) -> Callable[[Geometry], np.ndarray]:
 
     def sample(geometry: Geometry) -> np.ndarray:
         return voxelize_cloud(cloud.gaussians, geometry, cloud.extent)
+
+    return sample
+
+
+def _of_field(field: Fitted) -> Callable[[Geometry], np.ndarray]:
+    def sample(geometry: Geometry) -> np.ndarray:
+        volume = field.volume(geometry)
+        assert volume is not None  # of a field
+        return volume
 
     return sample
 

@@ -79,7 +79,7 @@ def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.nda
 def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
     """Line integrals of measured views: `corrected`, with the cloud, for the effects that its fit has modelled. Without such
     effects, the scan itself."""
-    if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing models none
+    if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing and fields model none
         return scan
     return corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
 

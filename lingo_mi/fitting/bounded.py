@@ -7,11 +7,12 @@ import math
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.models import forward_model, parameter_shapes
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.memory import room
 from lingo_mi.scan import Scan
 
+FIELD_BYTES = 32  # for each parameter of a neural field: its moments, its derivatives and copies of these
 BYTES = 500  # that a fit needs at least for each Gaussian: 14 parameters, their moments and derivatives, and copies
 
 
@@ -20,14 +21,24 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
 
     The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
     no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. Settings in units of the
-    scene's radius are converted to lengths. Raises InputError if the source is inside the volume, for a step of more views than
-    the scan has, and for more Gaussians at the start than this process has memory for.
+    scene's radius are converted to lengths. Those of a neural field stay as they are.
+
+    Raises InputError if the source is inside the volume, for a step of more views than the scan has, and for more Gaussians at
+    the start, or a larger field, than this process has memory for.
     """
     g = scan.geometry
     if settings.batch > len(scan):
         raise InputError(
             f'batch is the number of views in a step: at most the {len(scan)} of the scan, not {settings.batch}'
         )
+    if not settings.cloud:
+        needed = FIELD_BYTES * sum(n for n, _ in parameter_shapes(settings, 0).values())
+        if needed > (has := room()):
+            raise InputError(
+                f'the field needs at least {needed / 2**30:,.1f} GiB of memory, but this process may take '
+                f'{has / 2**30:,.1f} GiB: lower field_entries'
+            )
+        return settings
     settings = forward_model(settings).with_lengths(g)
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:

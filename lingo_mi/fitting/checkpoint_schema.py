@@ -1,6 +1,7 @@
 """What a checkpoint holds, checked as a whole: names, types, shapes that agree with each other, ranges.
 
-values.*, first.*, second.*   float32 [N, size], the parameters of the forward model and Adam's moments
+values.*, first.*, second.*   float32 [N, size], the parameters of the forward model and Adam's moments; of a neural field, for
+                              which N and M are 0, float32 [parameters, 1]
 gradient, seen                float32 [N]
 born                          bool [N]
 array.initial                 float32 [M, 3]
@@ -22,7 +23,7 @@ import numpy as np
 
 from lingo_mi.calibration.response.part import SMOOTH
 from lingo_mi.errors import InputError, shown
-from lingo_mi.fitting.models import forward_model
+from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.scene.description import NAMES, read_scanner
@@ -55,7 +56,11 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
         raise InputError(f'{shown(name)} does not belong there')
     for name, array in arrays.items():
         _require_array(name, array, *allowed[name])
-    _require(len(arrays['born']) > 0 and len(arrays['array.initial']) > 0, 'it holds no Gaussian')
+    held = len(arrays['born']), len(arrays['array.initial'])
+    if settings.cloud:
+        _require(min(held) > 0, 'it holds no Gaussian')
+    else:
+        _require(held == (0, 0), 'it holds Gaussians, but it is of a neural field')
     order, steps = arrays['array.order'], arrays.get('array.poses.steps')
     _require(
         not len(order) or order.min() >= 0 and order.max() < extra['views'] and len(np.unique(order)) == len(order),
@@ -70,13 +75,13 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
 
 def _expected(settings: Settings, views: int, count: int) -> dict[str, tuple[str, tuple]]:
     """Type, as NumPy spells it, and shape of every array by name; None is any length."""
-    sizes = forward_model(settings).parameters
+    shapes = parameter_shapes(settings, count)
     found: dict[str, tuple[str, tuple]] = {'born': ('bool', (count,)), 'array.order': ('int', (None,))}
-    found |= {f'{g}.{k}': ('float32', (count, n)) for g in ('values', 'first', 'second') for k, n in sizes.items()}
+    found |= {f'{g}.{k}': ('float32', shape) for g in ('values', 'first', 'second') for k, shape in shapes.items()}
     found |= dict.fromkeys(('gradient', 'seen', 'array.share'), ('float32', (count,)))
     found |= {'array.initial': ('float32', (None, 3)), 'array.scattered': ('float64', (2, views, None, None))}
     if settings.adam.average > 0:
-        found |= {f'array.average.{k}': ('float32', (count, n)) for k, n in sizes.items()}
+        found |= {f'array.average.{k}': ('float32', shape) for k, shape in shapes.items()}
     if max(settings.adam.rate_pose) > 0:
         found |= {f'array.poses.{k}': ('float64', (views, 3)) for k in ('turn', 'shift')}
         found |= {f'array.poses.{k}': ('float64', (views, 6)) for k in ('first', 'second')}
@@ -120,6 +125,8 @@ def _require_plain(extra: Any) -> Settings:
     _require(seen == extra['views'], f'views is {shown(extra["views"])}, but the scanner has {seen}')
     steps = [entry['iteration'] for entry in extra['history']]
     _require(extra['iteration'] <= settings.iterations, "iteration is beyond the settings' iterations")
+    least = 1 if settings.cloud else 0
+    _require(all(entry['gaussians'] >= least for entry in extra['history']), 'history has no Gaussians')
     _require(steps == sorted(set(steps)) and max(steps, default=0) <= extra['iteration'], 'history is out of order')
     return settings
 
@@ -157,7 +164,7 @@ def _is_history(value: Any) -> bool:
         and _count(entry.get('iteration'), 1)
         and _number(entry.get('seconds'), 0)
         and _number(entry.get('loss'))
-        and _count(entry.get('gaussians'), 1)
+        and _count(entry.get('gaussians'))
         and all(x is None or isinstance(x, float) or _number(x) for x in entry.values())
         for entry in value
     )

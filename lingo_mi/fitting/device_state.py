@@ -23,6 +23,8 @@ def _types() -> dict[str, Any]:
         opacity=mi.Float,
         radiance=mi.Float,
         harmonics=mi.ArrayXf,
+        features=mi.Float,
+        network=mi.Float,
     )
 
 
@@ -54,8 +56,11 @@ class DeviceState:
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""
-        total: Any = sum(x if isinstance(x, mi.Float) else dr.sum(x) for x in self.values.values())
-        return bool(dr.all(dr.isfinite(total)))
+        totals: dict[int, Any] = {}  # by width: that of all Gaussians' parameters is the same
+        for x in self.values.values():
+            total = x if isinstance(x, mi.Float) else dr.sum(x)
+            totals[dr.width(total)] = totals.get(dr.width(total), 0) + total
+        return all(bool(dr.all(dr.isfinite(total))) for total in totals.values())
 
 
 def upload(columns: dict) -> dict:

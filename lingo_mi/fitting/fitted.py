@@ -1,4 +1,4 @@
-"""The result of a fit, from `loop.run` or from a checkpoint: a cloud that can be rendered and voxelized."""
+"""The result of a fit, from `loop.run` or from a checkpoint: a cloud, or a neural field, to be rendered and voxelized."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import average, checkpoint
 from lingo_mi.fitting.checkpoint_schema import geometry_of, settings_of
-from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.kinds import Model, model_of
 from lingo_mi.fitting.poses import Poses
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State, activate
@@ -24,11 +24,11 @@ from lingo_mi.projectors.objects import Ellipsoids
 
 @dataclass
 class Fitted:
-    """A fitted cloud.
+    """A fitted cloud, or a fitted neural field.
 
     model       forward model of the fit: settings as used, geometry of the scan as given, unit of density, modelled effects
     state       the final state (host)
-    initial     centres the fit started from, float32 [N, 3], normalised frame
+    initial     centres the fit started from, float32 [N, 3], normalised frame; of a neural field none
     poses       corrections of the views; None if the fit has not corrected them
     seed        of the fit
     history     measurements over time: iteration, seconds, loss, gaussians, and the results of the fit's `measure`
@@ -43,7 +43,7 @@ class Fitted:
         Fitted.from_checkpoint('out/foot/checkpoint.npz').volume()
     """
 
-    model: CloudModel
+    model: Model
     state: State
     initial: np.ndarray
     poses: Poses | None = None
@@ -96,7 +96,7 @@ class Fitted:
         return self.model.volume(DeviceState(self.state), geometry)
 
     def cloud(self) -> Ellipsoids | None:
-        """The Gaussians in mm, densities in 1/mm; None for alpha compositing."""
+        """The Gaussians in mm, densities in 1/mm; None for alpha compositing and for a neural field."""
         return self.model.cloud(DeviceState(self.state))
 
     def shares(self) -> np.ndarray | None:
@@ -106,7 +106,9 @@ class Fitted:
 
     def world_gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Centres and standard deviations in mm, quaternions (x, y, z, w), and densities in 1/mm (alpha compositing:
-        opacities): float64 [N, 3], [N, 3], [N, 4], [N]."""
+        opacities): float64 [N, 3], [N, 3], [N, 4], [N]. Raises InputError for a neural field."""
+        if not self.settings.cloud:
+            raise InputError('a neural field has no Gaussians: take its volume or its views')
         centre, scale, rotation, amount = activate(self.state, self.settings)
         size, unit = self.geometry.scale, self.unit if self.settings.volumetric else 1
         return centre / size + self.geometry.offOrigin, scale / size, rotation, amount * unit
@@ -133,7 +135,7 @@ class Fitted:
             poses = Poses(len(geometry), smooth=settings.calibration.pose_motion == 'smooth')
             poses.restore(arrays)
         state.values |= average.values_of(arrays)
-        model = CloudModel(settings, geometry, extra['unit'], effects)
+        model = model_of(settings, geometry, extra['unit'], effects)
         if model.response is not None:
             model.response.restore(arrays)
         history = [current_names(entry) for entry in extra['history']]

@@ -23,7 +23,8 @@ from lingo_mi.scan import Scan
 
 
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
-    """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume.
+    """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume; of a
+    neural field a cloud of no points.
 
     `info['seconds']` is the whole time, including an FDK reconstruction or renderings. Raises InputError if the scan
     gives no cloud.
@@ -34,7 +35,9 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
     scan = linearised(scan, settings)
     g, unit = scan.geometry, density_unit(scan, settings)
     start = settings.start
-    if start.init == 'random':
+    if start.init == 'network':
+        cloud = InitialCloud(np.zeros((0, 3)), None, np.zeros(0))
+    elif start.init == 'random':
         cloud = random_points(g.half, g.nVoxel[2] == 1, start.n_points, rng)
     elif start.init == 'cuboid':
         cloud = cuboid(g.nVoxel, g.half, start.cuboid_step)

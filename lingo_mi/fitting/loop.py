@@ -13,14 +13,11 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.average import Average
 from lingo_mi.fitting.bounded import bounded
-from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.densify import densify, reset_opacity
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.kinds import Model, stepper_of
 from lingo_mi.fitting.resume import require_same_fit
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.fitting.state import start
-from lingo_mi.fitting.step import Stepper
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.metrics import current_names
 from lingo_mi.scan import Scan
@@ -32,19 +29,19 @@ def run(
     settings: Settings,
     initial: InitialCloud | None,
     seed: int = 0,
-    measure: Callable[[CloudModel, DeviceState], dict] | None = None,
+    measure: Callable[[Model, DeviceState], dict] | None = None,
     progress: Callable[..., None] | None = None,
     path: Path | None = None,
 ) -> Fitted:
-    """Fit a cloud to a scan.
+    """Fit a cloud, or a neural field, to a scan.
 
     scan       the views to fit
     initial    the initial cloud; None: continue from `path`, with the same steps as without the interruption. The fit may
                then have more iterations than the checkpoint's, if it is `resume.extensible`
-    seed       for the views' order, the total variation's cubes and splits
+    seed       for the views' order, the total variation's cubes and splits; of a neural field, parameters, rays and samples
     measure    called as measure(model, state) at a few iterations; returns numbers for the history
-    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps. The state is then
-               consistent: if it raises KeyboardInterrupt, a checkpoint is written
+    progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps; gaussians is None for
+               a neural field. The state is then consistent: if it raises KeyboardInterrupt, a checkpoint is written
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is created
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
@@ -55,7 +52,7 @@ def run(
     if begin is None:
         raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
     settings = bounded(settings, scan)
-    stepper = Stepper(scan, settings)
+    stepper = stepper_of(scan, settings)
     rng = np.random.default_rng(seed)
     average = Average(settings.adam.average)
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
@@ -72,8 +69,7 @@ def run(
     else:
         points, order = begin.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0.0, [], dict(begin.info)
-        density = None if begin.density is None else begin.density / stepper.model.unit
-        state = DeviceState(start(points, begin.spacing, density, settings))
+        state = DeviceState(stepper.start(begin, rng))
     marks = set(measure_at(settings.iterations))
     clock = saved = time.perf_counter()
 
@@ -100,9 +96,7 @@ def run(
 
     while iteration < settings.iterations:
         # Before a step, so never after the last one. A longer fit that continues from there does it first.
-        if iteration < settings.densification.densify_until and (
-            renewed := _renewed(state, stepper, settings, iteration, rng)
-        ):
+        if renewed := stepper.renewed(state, iteration, rng):
             state = renewed
             average.restart()
         while len(order) < settings.batch:  # every view once before any view twice
@@ -126,7 +120,7 @@ def run(
             measured = history[-1].items() if history else ()
             last = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
             try:
-                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state), **last)
+                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state) or None, **last)
             except KeyboardInterrupt:
                 store()
                 raise
@@ -138,22 +132,6 @@ def run(
     store()
     seconds += time.perf_counter() - clock
     return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info)
-
-
-def _renewed(state, stepper, settings, iteration, rng):
-    """The state after densification and reset of opacities, whichever is due at this iteration; None if neither is."""
-    s = settings.densification
-    densifying = iteration > s.densify_from and iteration % s.densify_every == 0
-    resetting = s.reset_every and iteration > 0 and iteration % s.reset_every == 0
-    if not (densifying or resetting):
-        return None
-    host = state.host()
-    if densifying:
-        largest = s.prune_size if 0 < s.reset_every < iteration else np.inf
-        host = densify(host, settings, stepper.half, rng, stepper.flat, largest)
-        if len(host) == 0:
-            raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
-    return DeviceState(reset_opacity(host) if resetting else host)
 
 
 def measure_at(iterations: int) -> list[int]:

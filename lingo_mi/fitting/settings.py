@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 
 from lingo_mi.calibration.response.part import VARIES
 from lingo_mi.errors import InputError, shown
+from lingo_mi.fitting.field.settings import FieldSettings
 from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
 
-INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid')}  # by the setting `render`
+INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid'), 'field': ('network',)}  # by the setting `render`
 # Ranges end where float32 or the time of a fit does, far beyond what is of use.
 MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
 
@@ -25,7 +26,8 @@ class StartSettings(LingoSettings):
     """The start of a fit: `LingoSettings` (all starts use its `n_points`), and
 
     init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume); for alpha compositing 'random' (points in
-                       the volume; 3DGS without given points) or 'cuboid' (X-Gaussian's regular grid)
+                       the volume; 3DGS without given points) or 'cuboid' (X-Gaussian's regular grid); for a neural field
+                       'network' (random parameters)
     cuboid_step        for `cuboid`: voxels between points (X-Gaussian: 8)
     fdk_threshold, fdk_rescale
                        for `r2`: see `lingo_mi.fitting.r2_start` (R2: 0.05 and 0.15)
@@ -55,9 +57,12 @@ class ModelSettings:
 
     render             'integral': pixels are line integrals; 'alpha': grey images (projections divided by their maximum),
                        composited front to back from opacities and radiances (3DGS, see `lingo_mi.projectors.alpha`),
-                       without a volume
+                       without a volume; 'field': line integrals of a neural attenuation field, by samples on the rays (NAF,
+                       see `lingo_mi.fitting.field`)
     normalise          whether to fit densities in a unit that makes the largest line integral 1 (own). SSIM's constants
-                       and the bounds then mean the same for any object. R2 expects volumes in [0, 1]
+                       and the bounds then mean the same for any object. R2 expects volumes in [0, 1]. Of a neural field,
+                       whose densities are below 1, the unit is a bound of the densities (see
+                       `lingo_mi.fitting.field.densities`); NAF expects volumes in [0, 1], too
     sh_degree          for `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0: the same radiance in
                        all directions (X-Gaussian)
     sh_every           for `alpha`: iterations between the starts of successive degrees (3DGS: 1000)
@@ -75,13 +80,13 @@ class ModelSettings:
 
     def __post_init__(self):
         require_ranges(self, sh_degree=(0, 3), sh_every=(1, MOST_STEPS), extent=(1, 20))
-        _require(self.render in INITS, f"render is 'integral' or 'alpha', not {self.render!r}")
+        _require(self.render in INITS, f"render is 'integral', 'alpha' or 'field', not {self.render!r}")
         _require(self.effects in ('model', 'ignore'), f"effects is 'model' or 'ignore', not {self.effects!r}")
 
 
 @dataclass(frozen=True)
 class LossSettings:
-    """The loss (paper, section III-C).
+    """The loss (paper, section III-C). That of a neural field is the mean squared error of its rays (NAF).
 
     lambda_l1          weight of the mean absolute error (1)
     lambda_ssim        weight of 1 - SSIM (0.25)
@@ -126,6 +131,8 @@ class AdamSettings:
                        (R2: the defaults); for `alpha`, `rate_centre` is in units of the scene's radius (see `models.alpha`)
     rate_opacity, rate_radiance, rate_harmonics
                        for `alpha`, instead of `rate_density` (3DGS: 0.05, 0.0025 and a twentieth of that, all constant)
+    rate_features, rate_network
+                       of a neural field, instead of all the others (NAF: 0.001, later 0.0001)
     rate_pose          for corrections of the views' poses (own): radians, and units of half the volume's longest side;
                        0, 0: no corrections (see `lingo_mi.fitting.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
@@ -140,6 +147,8 @@ class AdamSettings:
     rate_opacity: tuple[float, float] = (5e-2, 5e-2)
     rate_radiance: tuple[float, float] = (2.5e-3, 2.5e-3)
     rate_harmonics: tuple[float, float] = (1.25e-4, 1.25e-4)
+    rate_features: tuple[float, float] = (1e-3, 1e-4)
+    rate_network: tuple[float, float] = (1e-3, 1e-4)
     rate_pose: tuple[float, float] = (0.0, 0.0)
     beta1: float = 0.9
     beta2: float = 0.999
@@ -265,7 +274,7 @@ class Settings:
     batch              views per step
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
-    start, model, loss, adam, calibration, densification, bounds
+    start, model, neural, loss, adam, calibration, densification, bounds
                        the parts, each with its own documentation
 
     Raises InputError for a value out of its range, and for contradictory values.
@@ -278,6 +287,7 @@ class Settings:
     checkpoint_seconds: float = 30.0
     start: StartSettings = field(default_factory=StartSettings)
     model: ModelSettings = field(default_factory=ModelSettings)
+    neural: FieldSettings = field(default_factory=FieldSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     adam: AdamSettings = field(default_factory=AdamSettings)
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
@@ -294,15 +304,30 @@ class Settings:
             checkpoint_seconds=(0, 1e9),
         )
         inits, init = INITS[self.model.render], self.start.init
-        _require(init in inits, f'init is {inits[0]!r} or {inits[1]!r} with render={self.model.render}, not {init!r}')
         _require(
-            self.volumetric or self.model.normalise and self.loss.lambda_tv == 0 and self.model.effects == 'ignore',
+            init in inits, f'init is {" or ".join(map(repr, inits))} with render={self.model.render}, not {init!r}'
+        )
+        _require(
+            self.model.render != 'alpha'
+            or self.model.normalise
+            and self.loss.lambda_tv == 0
+            and self.model.effects == 'ignore',
             'render=alpha composites grey images and knows no densities: it needs normalise=true, lambda_tv=0 and '
             'effects=ignore, as in the method 3dgs',
         )
         _require(
             self.volumetric or not self.calibration.responds,
             'render=alpha composites grey images, which have no air level: leave fit_air and fit_gain off',
+        )
+        _require(
+            self.model.render != 'field'
+            or self.loss == LossSettings(lambda_ssim=0.0, lambda_tv=0.0, tv_size=self.loss.tv_size)
+            and self.model.effects == 'ignore'
+            and self.coarse_share == 0
+            and self.adam.rate_pose == (0, 0)
+            and not self.calibration.responds,
+            'render=field fits line integrals on single rays: it needs lambda_ssim=0, lambda_tv=0, effects=ignore, equal '
+            'weights and no loss_scale, coarse_share, rate_pose, fit_air or fit_gain, as in the method naf',
         )
         _require(
             not (self.volumetric and self.densification.reset_every),
@@ -312,7 +337,12 @@ class Settings:
     @property
     def volumetric(self) -> bool:
         """Whether a fit finds densities and so a volume. Only alpha compositing does not."""
-        return self.model.render == 'integral'
+        return self.model.render != 'alpha'
+
+    @property
+    def cloud(self) -> bool:
+        """Whether a fit is one of Gaussians. Only that of a neural field is not."""
+        return self.model.render != 'field'
 
     def rate(self, name: str, iteration: int) -> float:
         """Adam's step size for a parameter (see `lingo_mi.fitting.models`) or 'pose' at an iteration, counted from 0."""

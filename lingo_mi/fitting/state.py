@@ -13,9 +13,10 @@ from lingo_mi.fitting.settings import Settings
 
 @dataclass
 class State:
-    """N Gaussians under optimisation, on the host: NumPy arrays, float32 but for `born`.
+    """N Gaussians under optimisation, on the host: NumPy arrays, float32 but for `born`. Of a neural field N is 0.
 
-    values             raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`
+    values             raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`. Those of a neural field
+                       have their own lengths, see `lingo_mi.fitting.field.network`
     first, second      Adam's moments, like `values`
     gradient, visits   densification statistic [N]: sum of the norms of the projected centre's gradient, and number of views in
                        which the Gaussian was visible

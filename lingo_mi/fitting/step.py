@@ -10,8 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.errors import InputError
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.cloud_model import CloudModel
+from lingo_mi.fitting.densify import densify, reset_opacity
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, modelled_effects, trusted, weights_of
 from lingo_mi.fitting.models import forward_model
@@ -19,9 +21,11 @@ from lingo_mi.fitting.poses import Poses, gathered, place
 from lingo_mi.fitting.scattered_light import RENEWED as LIGHT_RENEWED
 from lingo_mi.fitting.scattered_light import light_at_pixels
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.state import State, start
 from lingo_mi.fitting.total_variation import random_cube_variation
 from lingo_mi.fitting.view_loss import Target, differentiate, differentiate_replayed
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.scan import Scan
@@ -65,6 +69,29 @@ class Stepper:
         self.flat = scan.geometry.nVoxel[2] == 1
         smooth = settings.calibration.pose_motion == 'smooth'
         self.poses = Poses(len(scan), self.flat, smooth) if max(settings.adam.rate_pose) > 0 else None
+
+    def start(self, initial: InitialCloud, rng: np.random.Generator) -> State:
+        """The state at the start of a fit. `rng` is not used."""
+        density = None if initial.density is None else initial.density / self.model.unit
+        return start(initial.points.astype(np.float32), initial.spacing, density, self.settings)
+
+    def renewed(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> DeviceState | None:
+        """The state after densification and reset of opacities, whichever is due at this iteration; None if neither is.
+
+        Raises InputError if no Gaussian is left.
+        """
+        s = self.settings.densification
+        densifying = iteration > s.densify_from and iteration % s.densify_every == 0
+        resetting = s.reset_every and iteration > 0 and iteration % s.reset_every == 0
+        if iteration >= s.densify_until or not (densifying or resetting):
+            return None
+        host = state.host()
+        if densifying:
+            largest = s.prune_size if 0 < s.reset_every < iteration else np.inf
+            host = densify(host, self.settings, self.half, rng, self.flat, largest)
+            if len(host) == 0:
+                raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+        return DeviceState(reset_opacity(host) if resetting else host)
 
     def step(self, state: DeviceState, views: Sequence[int], iteration: int, rng: np.random.Generator) -> Any:
         """Advance the state by one Adam step on the given views. Returns the loss, Float [1], not yet evaluated.

@@ -39,7 +39,7 @@ def fit_into(
 
     Raises InputError where the fit or the folder does not work out.
     """
-    require_ours(folder, result_names(settings.volumetric, 0 if dataset.test is None else len(dataset.test)))
+    require_ours(folder, result_names(settings, 0 if dataset.test is None else len(dataset.test)))
     cloud = None if resume else initial_cloud(dataset.train, settings, seed)
     with between_steps() as check:
 

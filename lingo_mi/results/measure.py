@@ -56,7 +56,6 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
     test    held-out views
     truth   the true density in 1/mm, [x, y, z], on the grid of the fit's geometry
     """
-    born = fitted.state.values['centre'][fitted.state.born]
     test = test if test is not None and len(test) else None
     volume, views = fitted.volume(), None if test is None else fitted.expected(test.geometry)
     expected = None if test is None else test.projections
@@ -74,10 +73,8 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         ssim_3d=of(metrics.ssim_3d, volume, truth),
         psnr_3d_r2=of(metrics.psnr_3d_r2, volume, truth),
         ssim_3d_r2=of(metrics.ssim_3d_r2, volume, truth),
-        ipsd=_number(ipsd(fitted.initial, born)),
-        ipsd_targets=len(born),
-        ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
-        gaussians=len(fitted.state),
+        **_of_gaussians(fitted),
+        parameters=sum(v.size for v in fitted.state.values.values()),
         iterations=fitted.settings.iterations,
         seconds_init=fitted.info.get('seconds', 0.0),
         seconds_fit=fitted.seconds,
@@ -87,17 +84,37 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
     return Measured(numbers, volume, truth, test, views)
 
 
+def _of_gaussians(fitted: Fitted) -> dict:
+    """The numbers of a cloud; a neural field has none."""
+    if not fitted.settings.cloud:
+        return dict(ipsd=None, ipsd_targets=0, ipsd_reverse=None, gaussians=0)
+    born = fitted.state.values['centre'][fitted.state.born]
+    return dict(
+        ipsd=_number(ipsd(fitted.initial, born)),
+        ipsd_targets=len(born),
+        ipsd_reverse=_number(reverse_distance(fitted.initial, born)),
+        gaussians=len(fitted.state),
+    )
+
+
 def summary(result: dict) -> str:
     """The main numbers of a result, one line each."""
     return '\n'.join(
         [
             f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}',
             volume_quality(result),
-            f'cloud           {result["gaussians"]:,} Gaussians after {result["iterations"]} iterations of '
+            f'{fitted_to(result)} after {result["iterations"]} iterations of '
             f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
             f'{result["seconds_fit"]:.0f} s to fit',
         ]
     )
+
+
+def fitted_to(result: dict) -> str:
+    """What was fitted, of what size: the first words of its line."""
+    if result['gaussians']:
+        return f'cloud           {result["gaussians"]:,} Gaussians'
+    return f'neural field    {result["parameters"]:,} parameters'
 
 
 def volume_quality(result: dict) -> str:

@@ -1,4 +1,4 @@
-"""The files of a fit: volume, cloud, scene, views, measurements, report."""
+"""The files of a fit: volume, cloud or field, scene, views, measurements, report."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.models.alpha import harmonics
+from lingo_mi.fitting.settings import Settings
 from lingo_mi.output_folder import (
     CHECKPOINT,
     CLOUD,
@@ -61,21 +62,23 @@ def save(
     command    the command line that reproduces the result, for the same
     request    what was asked for, if metrics.json is to say so
 
-    For alpha compositing there is no volume, and no scene, because no integrator renders it.
+    For alpha compositing there is no volume, and no scene, because no integrator renders it. For a neural field there is no
+    cloud: the scene is of its volume, and the field itself is in the checkpoint.
     Raises InputError if a file cannot be written.
     """
-    geometry, cloud = fitted.geometry, fitted.world_gaussians()
-    names = result_names(measured.volume is not None, 0 if measured.views is None else len(measured.views))
+    geometry, settings = fitted.geometry, fitted.settings
+    names = result_names(settings, 0 if measured.views is None else len(measured.views))
     begin(folder, names)
     if (folder / CHECKPOINT).exists():
         names |= {CHECKPOINT}
     remove_others(folder, names)
     if measured.volume is None:
-        write_radiance_ply(folder / CLOUD, *cloud, *harmonics(fitted.state.values))
+        write_radiance_ply(folder / CLOUD, *fitted.world_gaussians(), *harmonics(fitted.state.values))
     else:
         write_volume(folder / VOLUME, measured.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
-        write_ply(folder / CLOUD, *cloud, fitted.shares())
-        write_scene(folder / SCENE, fitted.corrected, fitted.settings.model.extent, fitted.effects)
+        if settings.cloud:
+            write_ply(folder / CLOUD, *fitted.world_gaussians(), fitted.shares())
+        write_scene(folder / SCENE, fitted.corrected, settings.model.extent if settings.cloud else None, fitted.effects)
     if measured.views is not None:
         _write_views(folder, measured.views)
     numbers = measured.numbers | dict(
@@ -105,37 +108,37 @@ def save(
     return complete(folder, names - {METRICS}, numbers, default=np.generic.item)
 
 
-def result_names(volume: bool, views: int) -> frozenset[str]:
-    """The files that `save` writes: with a volume or without, and of so many held-out views."""
-    names = {CLOUD, PICTURE, PAGE, METRICS, *map(view_name, range(views))}
-    return frozenset(names | {VOLUME, SCENE} if volume else names)
+def result_names(settings: Settings, views: int) -> frozenset[str]:
+    """The files that `save` writes of a fit with these settings and so many held-out views."""
+    names = {PICTURE, PAGE, METRICS, *map(view_name, range(views))}
+    return frozenset(
+        names | ({CLOUD} if settings.cloud else set()) | ({VOLUME, SCENE} if settings.volumetric else set())
+    )
 
 
 def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
     """The contents of a measured fit's report."""
     geometry, test = fitted.geometry, measured.test
-    held_out = {}
+    more: dict = {}
     if test is not None:
         angles = np.degrees(test.geometry.angles)
-        held_out = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
-    centres, scales, quaternions, density = fitted.world_gaussians()
+        more = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
+    if fitted.settings.cloud:
+        centres, scales, quaternions, density = fitted.world_gaussians()
+        more |= dict(cloud_centres=centres, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions)
     return ReportData(
         title=title,
-        metrics=measured.numbers,
+        metrics=measured.numbers if fitted.settings.cloud else _without_gaussians(measured.numbers),
         volume=measured.volume,
         truth=None if measured.volume is None else measured.truth,
         shape=geometry.nVoxel,
         spacing=geometry.dVoxel,
         centre=geometry.offOrigin,
         pixel=geometry.dDetector,
-        cloud_centres=centres,
-        cloud_density=density,
-        cloud_scales=scales,
-        cloud_quaternions=quaternions,
         scanner=fitted.corrected,
         cloud_unit='opacity' if measured.volume is None else 'density at the centre [1/mm]',
         command=measured.numbers.get('command', ''),
-        **held_out,
+        **more,
     )
 
 
@@ -145,6 +148,13 @@ def _write_views(folder: Path, rendered: np.ndarray):
         (folder / VIEWS).mkdir(exist_ok=True)
     for i, image in enumerate(rendered):
         write_exr(folder / view_name(i), image)
+
+
+def _without_gaussians(numbers: dict) -> dict:
+    """Numbers of a neural field without those that only a cloud has, as a report shows them."""
+    of_clouds = {'ipsd', 'ipsd_targets', 'ipsd_reverse', 'gaussians'}
+    history = [{k: v for k, v in entry.items() if k not in of_clouds} for entry in numbers['history']]
+    return {k: v for k, v in numbers.items() if k not in of_clouds} | dict(history=history)
 
 
 def _corrections(fitted: Fitted) -> dict:

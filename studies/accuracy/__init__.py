@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.cutoff import PRESETS
-from lingo_mi.studies.accuracy import fits, images, scaling
+from lingo_mi.studies.accuracy import field, fits, images, scaling
 from lingo_mi.studies.accuracy.sizes import FULL, QUICK, Sizes
 from lingo_mi.studies.accuracy.workload import Workload
 from lingo_mi.studies.provenance import machine
@@ -38,6 +38,7 @@ def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> di
         scaling=lambda: scaling.sweeps(sizes),
         initialisations=lambda: fits.initialisations(sizes),
         fits=lambda: fits.curves(sizes),
+        field=lambda: field.samples(sizes),
     )
     out: dict = dict(conditions=_conditions(sizes))
     for name, part in parts.items():

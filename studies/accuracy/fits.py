@@ -12,7 +12,7 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.measured import density_unit
-from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
+from lingo_mi.fitting.recipes import CLOUDS, METHODS
 from lingo_mi.fitting.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
@@ -79,7 +79,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
 def curves(sizes: Sizes) -> list[dict]:
     """Quality against seconds: recipes, iterations, cut-off, Gaussians, size of the phantom and of the panel."""
     small, middle = sizes.phantoms[0], sizes.iterations[-2]
-    plans: list[dict[str, Any]] = [dict(name=name, iterations=n) for name in VOLUMETRIC for n in sizes.iterations]
+    plans: list[dict[str, Any]] = [dict(name=name, iterations=n) for name in CLOUDS for n in sizes.iterations]
     plans += [dict(extent=e) for e in (2.0, 4.0, EXTENT)]
     plans += [dict(points=p) for p in sizes.points if p != sizes.points[1]]
     plans += [dict(values_per_gaussian=v) for v in (3.5, 56.0)]

@@ -19,6 +19,8 @@ class Sizes:
     points                   Gaussians a fit starts with
     iterations               of a fit
     views                    of a fit, and as many held out
+    samples                  on a ray of a neural field
+    field_pixels             along a side of its panel
     """
 
     gaussians: int = 20_000
@@ -36,6 +38,8 @@ class Sizes:
     points: tuple = (1_000, 4_000, 16_000)
     iterations: tuple = (150, 400, 1_000)
     views: int = 25
+    samples: tuple = (24, 48, 96, 192, 384, 768)
+    field_pixels: int = 32
 
 
 FULL = Sizes()
@@ -54,4 +58,6 @@ QUICK = Sizes(
     points=(1_000, 4_000),
     iterations=(50, 150),
     views=16,
+    samples=(24, 48, 96, 192),
+    field_pixels=16,
 )

@@ -27,6 +27,7 @@ TITLES = dict(
     scaling='Scaling',
     initialisations='Initial clouds',
     fits='Fits',
+    field='Neural fields',
 )
 
 
@@ -56,6 +57,7 @@ def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
     )
     tables['initialisations'] = table(_INITIAL, found['initialisations'])
     tables['fits'] = table(_FITS, found['fits'])
+    tables['field'] = table(FIELD, found['field'])
     return {name: tables[name] for name in TITLES}
 
 
@@ -187,4 +189,12 @@ _FITS = [
     ('cut-off, σ', _number('extent', '{:g}')),
     ('seconds', _number('seconds', '{:.1f}')),
     *_QUALITY,
+]
+FIELD = [
+    ('samples on a ray', _number('name', '{}')),
+    ('L2', _error('image')),
+    ('max', _error('image_max')),
+    ('L2, at random', _error('random')),
+    ('µs of CPU a ray', _number('us_per_ray', '{:.3g}')),
+    ('ms of CPU to sample the volume', _number('sampling', '{:.0f}')),
 ]

@@ -19,7 +19,7 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.recipes import METHODS, VOLUMETRIC
+from lingo_mi.fitting.recipes import CLOUDS, METHODS
 from lingo_mi.fitting.state import activate
 from lingo_mi.fitting.state import start as start_state
 from lingo_mi.fitting.total_variation import random_cube_variation
@@ -143,7 +143,7 @@ def test_same_seed_same_fit(scan, whole, sums_in_order):
     assert len(other) != len(whole.state) or not np.array_equal(other.values['centre'], whole.state.values['centre'])
 
 
-@pytest.mark.parametrize('method', VOLUMETRIC)
+@pytest.mark.parametrize('method', CLOUDS)
 def test_each_method(method, scan):
     settings = METHODS[method].changed(
         iterations=8, n_points=200, densify_from=2, densify_every=3, tv_size=8, fdk_threshold=1e-3

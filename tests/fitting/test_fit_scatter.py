@@ -14,7 +14,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.files.ply import write_ply
-from lingo_mi.fitting import loop
+from lingo_mi.fitting import kinds
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.scattered_light import RENEWED, ScatteredLight
@@ -104,13 +104,13 @@ def test_when_it_is_estimated(monkeypatch):
         seen.append(dr.width(cloud.density))
         return estimate(self, cloud, g)
 
-    class Kept(loop.Stepper):
+    class Kept(kinds.Stepper):
         def __init__(self, *args):
             super().__init__(*args)
             steppers.append(self)
 
     monkeypatch.setattr(ScatteredLight, 'estimate', counted)
-    monkeypatch.setattr(loop, 'Stepper', Kept)
+    monkeypatch.setattr(kinds, 'Stepper', Kept)
     fitted = run(scan, SHORT.changed(iterations=32, coarse_share=0.5), some_points(scan.geometry), seed=3)
     assert len(seen) == len(RENEWED) and seen[0] == 60 and len(fitted.state) > 60
     [stepper] = steppers

@@ -157,7 +157,8 @@ def test_flat_names(method):
     """Every value has one, no two share one, and they are all that a set of settings is."""
     settings = METHODS[method]
     flat = settings.flat()
-    parts = [settings.start, settings.model, settings.loss, settings.adam, settings.densification, settings.bounds]
+    names = 'start', 'model', 'neural', 'loss', 'adam', 'densification', 'bounds'
+    parts = [getattr(settings, name) for name in names]
     assert len(flat) == 5 + sum(len(vars(part)) for part in parts)
     assert Settings().changed(**flat) == settings
     assert flat['lambda_tv'] == settings.loss.lambda_tv and flat['scale_min'] == settings.bounds.scale_min

@@ -38,6 +38,8 @@ TINY = Sizes(
     points=(50, 100),
     iterations=(3, 6),
     views=4,
+    samples=(8, 16),
+    field_pixels=4,
 )
 
 

@@ -1,0 +1,88 @@
+"""Line integrals and volumes of a field, against the grid projector and against its own densities."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.fields import SMALL, random_state
+from helpers.fits import geometry
+from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.field.field_model import FieldModel
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors import grid
+from lingo_mi.studies.benchmarks.field import NumpyField
+
+# Features of two coarse levels, so that voxels of a 96th resolve the field.
+SMOOTH = SMALL.changed(field_levels=2, field_base=3, field_growth=1.5, field_samples=192)
+BOXES = [{}, dict(nVoxel=(32, 24, 16), offOrigin=(10.0, -6.0, 4.0)), dict(mode='parallel')]
+
+
+def views(**changes):
+    return geometry(2, **{**dict(nDetector=(12, 14), dDetector=(25.0, 24.0)), **changes})
+
+
+def rendered(settings, g, state=None, unit=1.0):
+    return FieldModel(settings, g, unit).render(DeviceState(state or random_state(settings, amplitude=3)), g)
+
+
+@pytest.mark.parametrize('changes', BOXES)
+def test_integrals_are_those_of_the_sampled_field(changes):
+    """The exact projector of the field on fine voxels; what is left is their error, which the samples do not have."""
+    g = views(**changes)
+    state = random_state(SMOOTH, amplitude=3)
+    fine = replace(g, nVoxel=tuple(3 * n for n in g.nVoxel), dVoxel=tuple(d / 3 for d in g.dVoxel))
+    volume = FieldModel(SMOOTH, g, 1.0).volume(DeviceState(state), fine)
+    expected, found = grid.project(volume, fine), rendered(SMOOTH, g, state)
+    assert volume.std() > 0.01 and (expected > 0).mean() > 0.3
+    np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+
+
+def test_error_falls_with_the_number_of_samples():
+    """To a quarter with twice the samples, as the midpoint rule's on smooth functions; the cells' faces cost a little."""
+    g, state = views(), random_state(SMOOTH, amplitude=3)
+    expected = rendered(SMOOTH.changed(field_samples=1536), g, state)
+    errors = [
+        np.linalg.norm(rendered(SMOOTH.changed(field_samples=n), g, state) - expected) / np.linalg.norm(expected)
+        for n in (12, 24, 48, 96)
+    ]
+    assert errors[0] < 2e-2
+    assert all(b < 0.45 * a for a, b in zip(errors, errors[1:]))
+
+
+def test_volume_is_the_field_at_the_voxel_centres():
+    g, unit = views(nVoxel=(5, 4, 3), dVoxel=(8.0, 9.0, 10.0), offOrigin=(3.0, -2.0, 1.0)), 0.25
+    state = random_state(SMALL)
+    found = FieldModel(SMALL, g, unit).volume(DeviceState(state))
+    side = SMALL.neural.field_cube * 40  # of the cube, mm
+    axes = [(np.arange(n) + 0.5 - n / 2) * d / side + 0.5 for n, d in zip(g.nVoxel, g.dVoxel)]
+    points = np.stack(np.meshgrid(*axes, indexing='ij'), -1).reshape(-1, 3)
+    expected = unit * NumpyField(SMALL.neural, state, np.float64).density(points).reshape(g.nVoxel)
+    np.testing.assert_allclose(found, expected, rtol=2e-5)
+
+
+def test_volume_on_another_grid_is_of_the_same_field_and_empty_outside():
+    g, state = views(), DeviceState(random_state(SMALL))
+    model = FieldModel(SMALL, g, 1.0)
+    own = model.volume(state)
+    larger = replace(
+        g, nVoxel=(40, 40, 40), offOrigin=(8.0, 0.0, -8.0)
+    )  # voxels of the same size, shifted by whole ones
+    found = model.volume(state, larger)
+    inside = np.zeros(larger.nVoxel, bool)
+    inside[3:35, 4:36, 5:37] = True
+    np.testing.assert_allclose(found[3:35, 4:36, 5:37], own, rtol=1e-5)
+    assert not found[~inside].any()
+
+
+def test_views_do_not_depend_on_the_voxels_of_their_geometry():
+    g, state = views(), DeviceState(random_state(SMALL))
+    other = replace(g, nVoxel=(8, 8, 8), dVoxel=(8.0, 8.0, 8.0), angles=circular(2, 180, start=10))
+    model = FieldModel(SMALL, g, 1.0)
+    np.testing.assert_array_equal(model.render(state, other), model.render(state, g))
+
+
+def test_a_ray_that_misses_the_volume_has_the_integral_0():
+    g = views(nDetector=(1, 40), dDetector=(10.0, 40.0))
+    image = rendered(SMALL, g)
+    assert not image[:, 0, :8].any() and not image[:, 0, -8:].any() and (image[:, 0, 18:22] > 0).all()
