@@ -43,7 +43,10 @@ def _numbers(data: ReportData) -> str:
     settings = [(n.label, as_text(key, metrics[key]), n.meaning) for key, n in SETTINGS.items() if key in metrics]
     size = ' x '.join(str(n) for n in data.shape or ())
     voxels = f'{size} voxels of {" x ".join(f"{s:.4g}" for s in data.spacing)} mm'
-    settings.append(('Volume', voxels, 'The grid that the density is given on.'))
+    grid = 'The grid that the density is given on.'
+    if data.volume is None:
+        grid = 'Opacities and radiances are no attenuation: this cloud makes no volume, and no scene renders it.'
+    settings.append(('Volume', voxels, grid))
     others = [
         (key, as_text(key, value), '')
         for key, value in metrics.items()

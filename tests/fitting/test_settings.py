@@ -157,7 +157,7 @@ def test_flat_names(method):
     """Every value has one, no two share one, and they are all that a set of settings is."""
     settings = METHODS[method]
     flat = settings.flat()
-    names = 'start', 'model', 'neural', 'loss', 'adam', 'densification', 'bounds'
+    names = 'start', 'model', 'neural', 'loss', 'adam', 'calibration', 'densification', 'bounds'
     parts = [getattr(settings, name) for name in names]
     assert len(flat) == 5 + sum(len(vars(part)) for part in parts)
     assert Settings().changed(**flat) == settings
