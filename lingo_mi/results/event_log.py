@@ -40,17 +40,17 @@ class EventLog:
         self._at = entry['iteration']
 
     def look(self, snapshot: Snapshot) -> None:
-        """See `watch.Watcher`."""
-        if snapshot.measured is not None:  # of a volume that was not needed otherwise there are no pictures
-            volume, truth = snapshot.measured
-            window = window_of(truth)
+        """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth where there is one."""
+        volume = snapshot.volume
+        if volume is not None:
+            shown = [volume] if snapshot.measured is None else [volume, snapshot.measured[1]]
+            window = window_of(shown[-1])
             for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
-                index = richest(truth, axis)
-                pair = [plane(v, axis, index)[::-1] for v in (volume, truth)]
-                self._picture(f'slices/{name}: reconstruction, truth', pair, window)
+                index = richest(shown[-1], axis)
+                self._picture(f'slices/{name}', [plane(v, axis, index)[::-1] for v in shown], window)
         if snapshot.test is not None and snapshot.views is not None:
             pair = [snapshot.views[0], snapshot.test.projections[0]]
-            self._picture('views/rendered, measured', pair, window_of(pair[1]))
+            self._picture('views/rendered_measured', pair, window_of(pair[1]))
 
     def close(self, finished: bool) -> None:
         """See `watch.Watcher`."""

@@ -45,7 +45,8 @@ def test_numbers_and_pictures(data, tmp_path):
         for name in ('loss', 'gaussians', 'psnr_2d', 'psnr_3d'):
             assert scalars[name][entry['iteration']] == pytest.approx(entry[name], rel=1e-5)
     assert len(images) == 4 and all(i.encoded_image_string.startswith(b'\x89PNG') for i in images.values())
-    assert (images['views/rendered, measured'].height, images['views/rendered, measured'].width) == (20, 40)
+    assert (images['views/rendered_measured'].height, images['views/rendered_measured'].width) == (20, 40)
+    assert (images['slices/axial'].height, images['slices/axial'].width) == (16, 32)
 
 
 def test_a_place_that_cannot_be_written(data, tmp_path):
