@@ -86,9 +86,9 @@ class Progress:
             return
         elapsed = now - self._began
         share = self._done / self.total if self.total else 1.0
-        parts = [f'{self._done}/{self.total} ({share:.0%})', *shown, f'{_clock(elapsed)} elapsed']
+        parts = [f'{self._done}/{self.total} ({share:.0%})', *shown, f'{clock(elapsed)} elapsed']
         if self.start < self._done < self.total:
-            parts.append(f'{_clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
+            parts.append(f'{clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
         print(f'{self.description}: {", ".join(parts)}', file=self._file, flush=True)
 
 
@@ -127,7 +127,8 @@ def _text(name, value):
     return LABELS[name].format(value) if name in LABELS else f'{name} {value:.4g}'
 
 
-def _clock(seconds):
+def clock(seconds: float) -> str:
+    """A time as minutes and seconds, 1:05, with hours where there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f'{hours}:{minutes:02d}:{seconds:02d}' if hours else f'{minutes}:{seconds:02d}'

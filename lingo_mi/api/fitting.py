@@ -21,6 +21,8 @@ from lingo_mi.output_folder import CHECKPOINT
 from lingo_mi.parsing import whole
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure
+from lingo_mi.results.watch import watched
+from lingo_mi.results.watchers import watchers_of
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
 
@@ -33,6 +35,8 @@ def fit(
     checkpoint: str | PathLike | None = None,
     resume: bool = False,
     progress: bool = True,
+    live: bool = False,
+    log_dir: str | PathLike | None = None,
     **settings: Any,
 ) -> Result:
     """Fit a cloud of 3D Gaussians, or a neural field, to a scan.
@@ -46,6 +50,9 @@ def fit(
     checkpoint   a file (.npz) written every 30 s and at the end; what `resume` goes on from
     resume       go on from the checkpoint, as if it had never stopped; the scan and all settings must be the same
     progress     whether to show a progress bar on standard error
+    live         whether to serve a page that grows while the fit runs, to this machine alone; its address is printed, and in a
+                 notebook the page is shown below the cell
+    log_dir      a folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard')
     settings     any setting of the fit by name, such as iterations=800, n_points=20_000 or lambda_tv=0.1 (see `Settings`)
 
     Returns a `Result`. Ctrl-C stops between two steps and leaves a checkpoint, where one is named. Raises InputError for an
@@ -79,13 +86,16 @@ def fit(
         cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
         # Kept even where nobody names a file: `Result.save` writes it.
         file = Path(folder) / CHECKPOINT if path is None else path
-        with Progress('Fit', chosen.iterations, shown=progress) as bar:
+        watchers = watchers_of(dataset.train.geometry, live, log_dir, name)
+        with watched(watchers, chosen.iterations) as watch, Progress('Fit', chosen.iterations, shown=progress) as bar:
 
             def report(iteration, **fields):
                 bar.update(iteration, **fields)
+                watch.step(iteration, fields['loss'], fields['gaussians'])
                 check()
 
-            fitted = run(dataset.train, chosen, cloud, seed, quick_measure(dataset), report, file)
+            measure = quick_measure(dataset, look=watch.look if watch.watchers else None)
+            fitted = run(dataset.train, chosen, cloud, seed, measure, report, file)
         return Result(fitted, name, file.read_bytes(), dataset)
 
 

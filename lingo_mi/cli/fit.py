@@ -53,6 +53,15 @@ def arguments() -> argparse.Namespace:
         'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid); of naf: network',
     )
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')
+    p.add_argument(
+        '--live', action='store_true', help='serve a page that grows while the fit runs, to this machine alone'
+    )
+    p.add_argument(
+        '--log-dir',
+        type=Path,
+        metavar='D',
+        help="write TensorBoard's events: numbers, slices, views (extra: tensorboard)",
+    )
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
     p.add_argument('--force', action='store_true', help='replace an earlier result')
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
@@ -105,10 +114,13 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
     from lingo_mi.progress import Progress
     from lingo_mi.results.fit_into import fit_into
     from lingo_mi.results.measure import summary
+    from lingo_mi.results.watchers import watchers_of
     from lingo_mi.scene.load import load_scene
 
     scene = load_scene(args.scene, parameters)
     scan = read_input(args, scene, args.views, args.seed)
+    title = Path(args.volume or args.projections or scene.name).name
+    watchers = watchers_of(scan.train.geometry, args.live, args.log_dir, title)
     with Progress('Fit', settings.iterations) as bar:
         try:
             result = fit_into(
@@ -118,9 +130,10 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
                 args.seed,
                 bar.update,
                 resume=args.resume,
-                title=Path(args.volume or args.projections or scene.name).name,
+                title=title,
                 method=args.method,
                 command=command_line(),
+                watchers=watchers,
             )
         except KeyboardInterrupt:
             again = command_line('--resume', without=('--resume', '--force'))

@@ -19,8 +19,11 @@ SURFACE_VOXELS, MOST_VERTICES = 112, 60_000
 Arrays = dict[str, Packed]
 
 
-def payload(data: ReportData) -> tuple[dict, Arrays]:
-    """What the scripts know of a report, and its arrays by name."""
+def payload(data: ReportData, surfaces: bool = True) -> tuple[dict, Arrays]:
+    """What the scripts know of a report, and its arrays by name.
+
+    surfaces   whether surfaces of the volume are among them, which take a second
+    """
     arrays: Arrays = {}
     known: dict[str, Any] = dict(colours=colour_maps(), history=[_finite(entry) for entry in data.history])
     if data.volume is not None:
@@ -36,7 +39,7 @@ def payload(data: ReportData) -> tuple[dict, Arrays]:
             images['Measured'] = data.views_truth
         reference = 'Measured' if len(images) == 2 else None
         known['views'] = views(images, data.views_angles, data.pixel, arrays, reference)
-    known['space'] = _space(data, arrays)
+    known['space'] = _space(data, arrays, surfaces)
     return known, arrays
 
 
@@ -153,7 +156,7 @@ def scanner(geometry: Geometry, most: int = 400) -> dict:
     return dict(sources=sources.round(3).tolist(), panels=panels.round(3).tolist(), parallel=bool(rays.parallel))
 
 
-def _space(data: ReportData, arrays: Arrays) -> dict:
+def _space(data: ReportData, arrays: Arrays, surfaces: bool) -> dict:
     half = np.asarray(data.shape) * np.asarray(data.spacing) / 2
     low, high = np.asarray(data.centre) - half, np.asarray(data.centre) + half
     out: dict[str, Any] = dict(low=low.tolist(), high=high.tolist())
@@ -161,7 +164,7 @@ def _space(data: ReportData, arrays: Arrays) -> dict:
         out['scanner'] = scanner(data.scanner)
     if data.cloud_centres is not None and len(data.cloud_centres):
         out['cloud'] = _cloud(data, arrays)
-    if data.volume is not None and min(data.volume.shape) > 3:
+    if surfaces and data.volume is not None and min(data.volume.shape) > 3:
         out['surfaces'] = _surfaces(data, arrays)
     return out
 

@@ -94,7 +94,7 @@ def _tables(names: list[str], results: list[Stored]) -> str:
     if quality := rows({key: number.label for key, number in QUALITY.items()}):
         out.append(template.table('Quality and cost', quality, 'numbers', head))
     done = rows({key: number.label for key, number in SETTINGS.items()})
-    settings = [m.get('settings') if isinstance(m.get('settings'), dict) else {} for m in metrics]
+    settings: list[dict] = [m['settings'] if isinstance(m.get('settings'), dict) else {} for m in metrics]
     changed = [
         (key, *(as_text('', s.get(key)) for s in settings))
         for key in dict.fromkeys(k for s in settings for k in s)

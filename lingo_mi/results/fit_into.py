@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lingo_mi.fitting.initial import initial_cloud
@@ -12,6 +12,7 @@ from lingo_mi.interrupts import between_steps
 from lingo_mi.output_folder import CHECKPOINT, require_ours
 from lingo_mi.results.measure import measure, quick_measure
 from lingo_mi.results.save import result_names, save
+from lingo_mi.results.watch import Watcher, watched
 from lingo_mi.scan import Dataset
 
 
@@ -27,6 +28,7 @@ def fit_into(
     method: str,
     command: str = '',
     request: dict | None = None,
+    watchers: Sequence[Watcher] = (),
 ) -> dict:
     """Fit a scan, measure the fit, and write all files of the result; returns its metrics.
 
@@ -34,6 +36,7 @@ def fit_into(
     progress   called between steps, as of `fitting.loop.run`. After its KeyboardInterrupt, or Ctrl-C, `resume` goes on
     resume     from the checkpoint in the folder
     request    what was asked for, kept in metrics.json
+    watchers   of the fit, such as a live page
 
     title, method, command   as of `save`
 
@@ -41,12 +44,14 @@ def fit_into(
     """
     require_ours(folder, result_names(settings, 0 if dataset.test is None else len(dataset.test)))
     cloud = None if resume else initial_cloud(dataset.train, settings, seed)
-    with between_steps() as check:
+    with watched(watchers, settings.iterations) as watch, between_steps() as check:
 
         def report(iteration, **fields):
             progress(iteration, **fields)
+            watch.step(iteration, fields['loss'], fields['gaussians'])
             check()
 
-        fit = run(dataset.train, settings, cloud, seed, quick_measure(dataset), report, folder / CHECKPOINT)
+        look = quick_measure(dataset, look=watch.look if watchers else None)
+        fit = run(dataset.train, settings, cloud, seed, look, report, folder / CHECKPOINT)
     measured = measure(fit, dataset.test, dataset.volume)
     return save(folder, fit, measured, title=title, method=method, command=command, request=request)

@@ -10,23 +10,32 @@ import numpy as np
 from lingo_mi import metrics
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.lingo.ipsd import ipsd, reverse_distance
+from lingo_mi.results.watch import Snapshot
 from lingo_mi.scan import Dataset, Scan
 
 
-def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
-    """A function for `fitting.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where there is a truth."""
+def quick_measure(
+    dataset: Dataset, most: int = 4, look: Callable[[Snapshot], None] | None = None
+) -> Callable[..., dict]:
+    """A function for `fitting.loop.run` that gives 2D PSNR on up to `most` held-out views, and 3D PSNR where there is a truth.
+
+    look   is shown the state, with what was rendered to measure it
+    """
     test = dataset.test
     if test is not None and len(test) > most:
         test = test.subset(np.arange(most) * len(test) // most)
 
     def measure(model, state):
-        out = {}
+        out, rendered, pair = {}, None, None
         if test is not None and len(test):
             rendered = comparable(model.expected(state, test.geometry), test)
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None and (volume := model.volume(state)) is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
             out['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(volume, dataset.volume))
+            pair = volume, dataset.volume
+        if look is not None:
+            look(Snapshot(model, state, test, rendered, pair, dict(out)))
         return out
 
     return measure

@@ -7,17 +7,15 @@ async function follow(live, maps) {
   let failures = 0;
   while (failures < 5) {
     try {
-      const answer = await fetch(`state?token=${live.token}&seen=${seen}`, { cache: 'no-store' });
+      const answer = await fetch(`state${location.search}&seen=${seen}`, { cache: 'no-store' });
       if (!answer.ok) throw new Error(answer.statusText);
       const state = await answer.json();
       failures = 0;
+      const arrays = {};
+      for (const [name, head] of Object.entries(state.known?.arrays || {})) arrays[name] = await decode(head, state.texts[name]);
+      show({ ...state.known, history: state.history }, arrays, maps);
+      seen = state.number;
       line.textContent = state.line;
-      if (state.number > seen) {
-        seen = state.number;
-        const arrays = {};
-        for (const [name, head] of Object.entries(state.known.arrays)) arrays[name] = await decode(head, state.texts[name]);
-        show(state.known, arrays, maps);
-      }
       if (state.done) return;
     } catch {
       failures += 1;

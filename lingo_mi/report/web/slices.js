@@ -22,10 +22,18 @@ class Slices {
     new ResizeObserver(this.draw).observe(this.grid);
   }
 
+  // New volumes on the same grid; a window that was changed stays.
   replace(known, arrays) {
     this.volumes = known.volumes.map((v) => ({ name: v.name, array: arrays[v.array] }));
-    this.window = [...known.window];
+    if (this.window.every((edge, i) => edge === this.known.window[i])) this.window = [...known.window];
+    this.known = known;
     this.colours = null;
+    const [low, high] = this.range();
+    for (const one of [this.levelSlider, this.widthSlider]) {
+      const input = one.querySelector('input');
+      Object.assign(input, one === this.levelSlider ? { min: low, max: high } : { max: high - low });
+      input.step = (high - low) / 500;
+    }
     this.draw();
   }
 

@@ -1,0 +1,61 @@
+"""A fit as TensorBoard's events: numbers, slices, views (needs the extra `tensorboard`)."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import as_path, optional, writing
+from lingo_mi.notebook import window_of
+from lingo_mi.report.planes import plane, richest
+from lingo_mi.results.watch import Snapshot
+
+
+class EventLog:
+    """A watcher (see `watch.Watcher`) that writes events into a folder, for `tensorboard --logdir FOLDER`.
+
+    Raises InputError where tensorboardX is missing, or the folder cannot be written.
+    """
+
+    def __init__(self, folder: PathLike | str):
+        """folder: is created if missing; a run's events are a file there, beside those of earlier runs."""
+        library = optional('tensorboardX', 'tensorboard')
+        path: Path = as_path('log_dir', folder)
+        with writing(path):
+            path.mkdir(parents=True, exist_ok=True)
+            if not path.is_dir():
+                raise InputError(f'{path}: is a file; give a folder')
+            self._writer: Any = library.SummaryWriter(str(path), flush_secs=5)
+        self._at = 0
+
+    def step(self, entry: dict, total: int) -> None:
+        """See `watch.Watcher`."""
+        for name, value in entry.items():
+            if name not in ('iteration', 'seconds') and value is not None:
+                self._writer.add_scalar(name, value, entry['iteration'])
+        self._at = entry['iteration']
+
+    def look(self, snapshot: Snapshot) -> None:
+        """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth where there is one."""
+        volume = snapshot.volume
+        if volume is not None:
+            shown = [volume] if snapshot.measured is None else [volume, snapshot.measured[1]]
+            window = window_of(shown[-1])
+            for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
+                index = richest(shown[-1], axis)
+                self._picture(f'slices/{name}', [plane(v, axis, index)[::-1] for v in shown], window)
+        if snapshot.test is not None and snapshot.views is not None:
+            pair = [snapshot.views[0], snapshot.test.projections[0]]
+            self._picture('views/rendered_measured', pair, window_of(pair[1]))
+
+    def close(self, finished: bool) -> None:
+        """See `watch.Watcher`."""
+        self._writer.close()
+
+    def _picture(self, name: str, images: list[np.ndarray], window: tuple[float, float]) -> None:
+        row = (np.concatenate(images, 1) - window[0]) / (window[1] - window[0])
+        self._writer.add_image(name, (np.clip(row, 0, 1) * 255).astype(np.uint8), self._at + 1, dataformats='HW')

@@ -1,0 +1,239 @@
+"""A fit as a page that grows while it runs, served to this machine alone.
+
+The server listens on 127.0.0.1, on a port that the system chooses. It answers only requests that name it so and carry the token
+of its address. Arrays are made into text in the server's threads, when a page asks for them: without one it costs next to
+nothing.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from lingo_mi.errors import brief
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.progress import clock
+from lingo_mi.report import template
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.packing import preview
+from lingo_mi.report.payload import colour_maps, payload
+from lingo_mi.results.watch import Snapshot
+
+SHARE = 0.02  # of the time, that looking may take
+MOST_VOXELS = 128**3  # of a volume in the page
+MILLISECONDS = 1000  # between two questions of the page
+PATIENCE = 10.0  # seconds after which a page that has not asked is gone; a finished fit waits no longer for it
+
+
+class Live:
+    """A watcher (see `watch.Watcher`) that serves a page. `address` is where.
+
+    geometry   of the scan
+    title      of the page: any text
+    """
+
+    def __init__(self, geometry: Geometry, title: str = ''):
+        self.geometry, self.title = geometry, brief(title or 'fit', 120)
+        self._token = secrets.token_urlsafe(24)
+        self._lock = threading.Lock()
+        self._history: list[dict] = []
+        self._line, self._number, self._done, self._end_seen = 'The fit begins.', 0, False, threading.Event()
+        self._data: ReportData | None = None
+        self._skipped: Snapshot | None = None
+        self._packed: tuple[int, dict] = (0, {})
+        self._began, self._spent, self._asked = time.perf_counter(), 0.0, -np.inf
+        self._server = ThreadingHTTPServer(('127.0.0.1', 0), _handler(self))
+        self._server.daemon_threads = True
+        self._port = self._server.server_address[1]
+        threading.Thread(target=self._server.serve_forever, kwargs=dict(poll_interval=0.2), daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        """Of the page, with its token."""
+        return f'http://127.0.0.1:{self._port}/?token={self._token}'
+
+    def announce(self) -> None:
+        """Say the address on standard error; in a notebook, show the page."""
+        if 'ipykernel' in sys.modules:
+            from IPython.display import IFrame, display  # pyright: ignore[reportMissingImports]
+
+            display(IFrame(self.address, '100%', 900))
+        else:
+            print(f'live: {self.address}', file=sys.stderr, flush=True)
+
+    # ---- of the fit ----
+
+    def step(self, entry: dict, total: int) -> None:
+        """See `watch.Watcher`."""
+        known = {k: v for k, v in entry.items() if v is not None}
+        first = self._history[0] if self._history else dict(iteration=0, seconds=0.0)  # a resumed fit begins later
+        steps, seconds = entry['iteration'] - first['iteration'], entry['seconds'] - first['seconds']
+        left = seconds * (total - entry['iteration']) / max(1, steps)
+        parts = [
+            f'Step {entry["iteration"]:,} of {total:,}',
+            f'loss {entry["loss"]:.4g}',
+            f'{entry["gaussians"]:,} Gaussians',
+        ]
+        parts.append(f'{clock(left)} left' if entry['iteration'] < total else f'done in {clock(entry["seconds"])}')
+        with self._lock:
+            self._history.append(known)
+            if len(self._history) > 2000:  # every second one of the earlier half, but for what was measured
+                half = self._history[:1000]
+                self._history[:1000] = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
+            self._line = ', '.join(parts) + '.'
+
+    def look(self, snapshot: Snapshot) -> None:
+        """See `watch.Watcher`. The first look is for everybody, the others are for pages that still ask, within `SHARE`."""
+        now = time.perf_counter()
+        watching = now - self._asked < PATIENCE or self._number == 0
+        if not watching or self._spent > SHARE * (now - self._began) and self._number > 0:
+            self._skipped = snapshot
+            return
+        self._show(snapshot)
+
+    def _show(self, snapshot: Snapshot) -> None:
+        now, self._skipped = time.perf_counter(), None
+        data = self._contents(snapshot)
+        with self._lock:
+            self._data, self._number = data, self._number + 1
+        self._spent += time.perf_counter() - now
+
+    def close(self, finished: bool) -> None:
+        """See `watch.Watcher`. Waits a moment for a page that is open, so that it sees the end."""
+        if finished and self._skipped is not None and time.perf_counter() - self._asked < PATIENCE:
+            self._show(self._skipped)
+        with self._lock:
+            self._done = True
+            self._line += ' The fit is finished.' if finished else ' The fit was stopped.'
+        if time.perf_counter() - self._asked < PATIENCE:
+            self._end_seen.wait(PATIENCE)
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _contents(self, snapshot: Snapshot) -> ReportData:
+        geometry, held_out = self.geometry, {}
+        if snapshot.test is not None and snapshot.views is not None:
+            held_out = dict(
+                views=snapshot.views,
+                views_truth=snapshot.test.projections,
+                views_angles=np.degrees(snapshot.test.geometry.angles),
+            )
+        volume = snapshot.volume
+        truth, spacing = None, np.asarray(geometry.dVoxel)
+        if volume is not None:
+            small, _ = preview(volume, MOST_VOXELS)
+            if snapshot.measured is not None:
+                truth, _ = preview(snapshot.measured[1], MOST_VOXELS)
+            spacing = np.asarray(geometry.sVoxel) / small.shape
+            volume = small
+        centres, scales, quaternions, density = snapshot.gaussians
+        return ReportData(
+            title=self.title,
+            metrics={},
+            volume=volume,
+            truth=truth,
+            shape=geometry.nVoxel,
+            spacing=tuple(spacing),
+            centre=geometry.offOrigin,
+            pixel=geometry.dDetector,
+            cloud_centres=centres,
+            cloud_density=density,
+            cloud_scales=scales,
+            cloud_quaternions=quaternions,
+            cloud_unit='opacity' if volume is None else 'density at the centre [1/mm]',
+            scanner=geometry,
+            **held_out,
+        )
+
+    # ---- of the server's threads ----
+
+    def allowed(self, host: str, token: str) -> bool:
+        """Whether a request is for this server by its own name, and knows its token."""
+        names = {f'127.0.0.1:{self._port}', f'localhost:{self._port}'}
+        return host in names and hmac.compare_digest(token.encode(), self._token.encode())
+
+    def page(self) -> str:
+        """The page, still without anything to show."""
+        known = dict(colours=colour_maps(), history=[], live=dict(milliseconds=MILLISECONDS))
+        return template.page(self.title, 'a fit that is running', '', '', known, {}, live=True)
+
+    def state(self, seen: int) -> dict:
+        """What a page that has seen so many states does not know yet."""
+        with self._lock:
+            self._asked = time.perf_counter()
+            data, number = self._data, self._number
+            out: dict[str, Any] = dict(number=number, line=self._line, done=self._done, history=[*self._history])
+        if data is not None and number != seen:
+            out |= self._texts(number, data)
+        return out
+
+    def sent(self, state: dict) -> None:
+        """A page has this state now."""
+        if state['done']:
+            self._end_seen.set()
+
+    def _texts(self, number: int, data: ReportData) -> dict:
+        with self._lock:
+            made, texts = self._packed
+        if made != number:
+            began = time.thread_time()
+            known, arrays = payload(data, surfaces=False)
+            del known['history'], known['colours']
+            known['arrays'] = {name: packed.head() for name, packed in arrays.items()}
+            texts = dict(known=known, texts={name: packed.text for name, packed in arrays.items()})
+            with self._lock:
+                self._packed = number, texts
+                self._spent += time.thread_time() - began
+        return texts
+
+
+def _handler(live: Live) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        timeout = 10
+
+        def do_GET(self):
+            address = urlsplit(self.path)
+            asked = parse_qs(address.query)
+            if not live.allowed(self.headers.get('Host', ''), asked.get('token', [''])[0]):
+                return self._answer(
+                    403, 'text/plain', 'the address of this page has a token, which is missing or wrong\n'
+                )
+            if address.path == '/':
+                return self._answer(200, 'text/html', live.page())
+            if address.path != '/state':
+                return self._answer(404, 'text/plain', 'there is nothing here\n')
+            seen = asked.get('seen', ['0'])[0]
+            state = live.state(int(seen) if seen.isdecimal() and len(seen) < 10 else 0)
+            self._answer(200, 'application/json', json.dumps(state))
+            live.sent(state)
+
+        def _answer(self, code, kind, text):
+            body = text.encode('utf-8', 'backslashreplace')
+            try:
+                self.send_response(code)
+                for name, value in (
+                    ('Content-Type', f'{kind}; charset=utf-8'),
+                    ('Content-Length', str(len(body))),
+                    ('Cache-Control', 'no-store'),
+                    ('Referrer-Policy', 'no-referrer'),
+                    ('X-Content-Type-Options', 'nosniff'),
+                ):
+                    self.send_header(name, value)
+                self.end_headers()
+                self.wfile.write(body)
+            except OSError:  # the page has gone
+                self.close_connection = True
+
+        def log_message(self, format, *args):
+            pass
+
+    return Handler
