@@ -41,7 +41,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
     if address.startswith('local') and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
         raise InputError(f'--cluster {address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
     with ExitStack() as stack:
-        import dask
+        import dask.config
 
         # No more than one job a worker is given away: the others wait for whoever is free.
         stack.enter_context(dask.config.set({'distributed.scheduler.worker-saturation': 1.0}))
@@ -129,7 +129,7 @@ class Cluster:
 def _gone() -> tuple[type[BaseException], ...]:
     """What a client raises whose scheduler does not answer any more."""
     from distributed.client import FutureCancelledError
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
     return CommClosedError, FutureCancelledError, TimeoutError
 
