@@ -20,6 +20,8 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import reading, require_writable, write_text
 from lingo_mi.folder_lock import locked
 
+KEYS = 'stage', 'axis', 'number', 'seconds', 'peak'
+
 
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -36,12 +38,7 @@ def read(path: Path) -> list[dict]:
     with reading(path):
         text = path.read_text(encoding='utf-8', errors='replace')
     try:
-        found = json.loads(text)
-        return [
-            dict(row)
-            for row in found
-            if row['stage'] and row['axis'] and row['number'] and row['seconds'] and row['peak']
-        ]
+        return [{key: row[key] for key in KEYS} for row in json.loads(text)]
     except (ValueError, TypeError, KeyError):
         raise InputError(f'{path}: holds no measurements of this command; remove it, or choose another --out') from None
 

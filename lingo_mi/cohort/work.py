@@ -54,6 +54,8 @@ def read_row(row: Row) -> Dataset:
     if scene is not None:
         volume = None if row.path is None else read_volume(row.path, row.mu_water)
         return take_scan(load_scene(scene, row.parameters), row.views or 0, volume, row.seed)
+    if row.path is None:
+        raise InputError(f'{row.name}: has no file')
     geometry = Path(row.folder) / row.geometry if row.geometry else None
     dataset = choose_views(read_scan(row.path, geometry), row.views or 0)
     check_memory(dataset.train.geometry)

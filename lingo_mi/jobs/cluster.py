@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import queue
@@ -23,6 +24,7 @@ from lingo_mi.progress import Progress
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
 MOST_LOCAL = 1024
+TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 
 
 @contextmanager
@@ -41,7 +43,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
     if address.startswith('local') and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
         raise InputError(f'--cluster {address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
     with ExitStack() as stack:
-        import dask
+        import dask.config
 
         # No more than one job a worker is given away: the others wait for whoever is free.
         stack.enter_context(dask.config.set({'distributed.scheduler.worker-saturation': 1.0}))
@@ -57,7 +59,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
             where = dict(address=address)
         try:
             client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
-        except (OSError, ValueError) as error:  # TimeoutError is an OSError; ValueError: no address
+        except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
             raise InputError(f'--cluster {address}: no scheduler answers ({brief(error, 120)}); check it') from None
         yield Cluster(client, Path(folder).resolve(), threads, variant)
 
@@ -118,7 +120,7 @@ class Cluster:
     def _require_workers(self) -> None:
         try:
             self.client.wait_for_workers(1, timeout=PATIENCE)
-        except TimeoutError:
+        except TIMED_OUT:
             raise InputError(
                 f'--cluster: no worker came within {PATIENCE:.0f} s; start some, with --nthreads 1'
             ) from None
@@ -129,9 +131,9 @@ class Cluster:
 def _gone() -> tuple[type[BaseException], ...]:
     """What a client raises whose scheduler does not answer any more."""
     from distributed.client import FutureCancelledError
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
-    return CommClosedError, FutureCancelledError, TimeoutError
+    return CommClosedError, FutureCancelledError, *TIMED_OUT
 
 
 def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress) -> None:

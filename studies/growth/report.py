@@ -16,12 +16,12 @@ def rows_of(found: list[dict], stage: str, axis: str) -> list[dict]:
 
 
 def exponents(found: list[dict]) -> str:
-    """Markdown: the exponent of CPU time, and of peak memory in brackets, by stage and axis; – where nothing depends."""
+    """Markdown: the exponent of CPU time by stage and axis; – where nothing depends."""
 
     def cell(axis):
         def text(row):
             rows = rows_of(found, row['stage'], axis)
-            return f'{exponent(rows, "seconds"):.2f} ({exponent(rows, "peak"):.2f})' if len(rows) > 1 else '–'
+            return f'{exponent(rows, "seconds"):.2f}' if len(rows) > 1 else '–'
 
         return text
 
@@ -42,13 +42,15 @@ def draw(found: list[dict], path: Path) -> None:
                 continue
             numbers = [row['number'] for row in rows]
             for line, (key, unit) in enumerate((('seconds', 1), ('peak', 1e9))):
-                values = [max(row[key] / unit, 1e-4) for row in rows]
-                label = f'{stage}: {exponent(rows, key):.2f}'
+                values = [max(row[key] / unit, 1e-3) for row in rows]
+                # Small arrays hide in what a process has at hand: their memory follows no law.
+                label = f'{stage}: {exponent(rows, key):.2f}' if key == 'seconds' else stage
                 axes[line, column].loglog(numbers, values, 'o-', color=f'C{i}', label=label, markersize=4)
         axes[1, column].set_xlabel(axis)
         for line in range(2):
             axes[line, column].grid(alpha=0.3)
-            axes[line, column].legend(fontsize=7, title='exponent of the last factor of ten', title_fontsize=7)
+            title = None if line else 'exponent of the last factor of ten'
+            axes[line, column].legend(fontsize=7, title=title, title_fontsize=7)
     axes[0, 0].set_ylabel('CPU time of a call [s]')
     axes[1, 0].set_ylabel('peak memory [GB]')
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,16 +13,16 @@ from lingo_mi.errors import InputError, brief
 from lingo_mi.studies.growth.stages import DEPENDS, Size
 
 BASE = Size(voxels=64, pixels=128, views=20, gaussians=10_000)
-FIELDS = dict(zip(('voxels', 'pixels', 'views', 'Gaussians'), ('voxels', 'pixels', 'views', 'gaussians')))
-SIDES = dict(voxels=3, pixels=2)  # axes that sizes give by a side, and the sides that multiply
+FIELDS: dict[str, str] = dict(voxels='voxels', pixels='pixels', views='views', Gaussians='gaussians')
+SIDES: dict[str, int] = dict(voxels=3, pixels=2)  # axes that sizes give by a side, and the sides that multiply
 # Each about ten times the one before, in numbers of voxels, pixels, views and Gaussians.
-SIZES = dict(
+SIZES: dict[str, tuple[int, ...]] = dict(
     voxels=(32, 69, 149, 320),
     pixels=(64, 202, 640, 2024),
     views=(4, 40, 400),
     Gaussians=(1000, 10_000, 100_000, 1_000_000),
 )
-SHORT = dict(voxels=3, pixels=3, views=3, Gaussians=3)  # of these sizes, unless all are wanted
+SHORT: dict[str, int] = dict(voxels=3, pixels=3, views=3, Gaussians=3)  # of these sizes, unless all are wanted
 
 
 def number(axis: str, value: int) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import leftovers
 from lingo_mi.folder_lock import locked
 from lingo_mi.jobs.job import Event, Job, Runner, run_all
 from lingo_mi.studies.provenance import command
@@ -58,7 +59,11 @@ def compute_series(
     others."""
     cells, done, failed = _cells(folder, scale, seed, command), 0, []
     first = series[0].fit if isinstance(series[0], Volume) else series[0]
-    with locked(cells.folder_of(first)):
+    home = cells.folder_of(first)
+    with locked(home):
+        for inside in (home, *(path for path in home.rglob('*') if path.is_dir())):
+            for leftover, _ in leftovers(inside):  # of a worker that was killed
+                leftover.unlink(missing_ok=True)
         for cell in series:
             if cells.get(cell) is None:
                 try:
