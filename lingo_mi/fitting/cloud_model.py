@@ -24,9 +24,8 @@ from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
-AT_ONCE = (
-    2**25
-)  # voxels that are sampled at once: a larger volume is made in slabs, since sampling takes several times its memory
+# Voxels that are sampled at once: a larger volume is made in slabs, since sampling takes several times its memory.
+AT_ONCE = 2**25
 
 
 class CloudModel:

@@ -34,7 +34,7 @@ class Network:
 
     def __init__(self, settings: FieldSettings):
         s = settings
-        self.encoding = nn.HashGridEncoding(
+        self.encoding: Any = nn.HashGridEncoding(
             mi.Float,
             3,
             n_levels=s.field_levels,
