@@ -156,7 +156,7 @@ class Best(Algorithm):
     def _try(self, kept, held_out, plain: Trial, name: str, finer: int, count, beat=None, by=0) -> Trial:
         trial, grid = Trial(name, finer), Refined(finer=finer).grid
         score = Score(replace(held_out, geometry=grid(held_out.geometry)))
-        niter = by if by and beat is None else self.niter
+        niter = min(by, self.niter) if by and beat is None else self.niter
         assert plain.volume is not None  # of its best pass
         refine(kept, plain.volume, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
         return trial
