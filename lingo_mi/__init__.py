@@ -34,6 +34,8 @@ __all__ = [  # noqa: RUF022 - in the order of their use
     'load',
     'load_raw',
     'phantom',
+    'calibrate',
+    'Calibration',
     'Geometry',
     'circular',
     'Scan',
@@ -52,6 +54,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
     'CGLS',
     'ASDPOCS',
     'Refined',
+    'Best',
     'project',
     'voxelize',
     'use_variant',
@@ -59,6 +62,7 @@ __all__ = [  # noqa: RUF022 - in the order of their use
 ]
 
 if TYPE_CHECKING:
+    from lingo_mi.api.calibration import Calibration, calibrate
     from lingo_mi.api.data import load, load_raw, phantom, simulate
     from lingo_mi.api.fitting import fit
     from lingo_mi.api.result import Gaussians, Result, load_result
@@ -67,7 +71,7 @@ if TYPE_CHECKING:
     from lingo_mi.fitting.settings import Settings
     from lingo_mi.functional import project, voxelize
     from lingo_mi.geometry import Geometry, circular
-    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Reconstruction, Refined
+    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
     from lingo_mi.runtime import use_variant
     from lingo_mi.scan import Dataset, Scan
 
@@ -77,6 +81,8 @@ _PUBLIC = {
     'load': 'lingo_mi.api.data',
     'load_raw': 'lingo_mi.api.data',
     'phantom': 'lingo_mi.api.data',
+    'calibrate': 'lingo_mi.api.calibration',
+    'Calibration': 'lingo_mi.api.calibration',
     'Geometry': 'lingo_mi.geometry',
     'circular': 'lingo_mi.geometry',
     'Scan': 'lingo_mi.scan',
@@ -95,6 +101,7 @@ _PUBLIC = {
     'CGLS': 'lingo_mi.reconstruction',
     'ASDPOCS': 'lingo_mi.reconstruction',
     'Refined': 'lingo_mi.reconstruction',
+    'Best': 'lingo_mi.reconstruction',
     'project': 'lingo_mi.functional',
     'voxelize': 'lingo_mi.functional',
     'use_variant': 'lingo_mi.runtime',

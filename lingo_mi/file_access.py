@@ -126,10 +126,14 @@ def replacing(path: PathLike | str) -> Iterator[Path]:
         yield temporary
 
 
-def leftovers(folder: Path) -> list[tuple[Path, str]]:
-    """Files in a folder that a killed process of ours has left behind, and the names that they were to get (their ends)."""
+def leftovers(folder: Path, folders: bool = False) -> list[tuple[Path, str]]:
+    """Files in a folder that a killed process of ours has left behind, and the names that they were to get (their ends).
+
+    folders   its folders instead
+    """
     found = [(path, _LEFTOVER.fullmatch(path.name)) for path in folder.iterdir()]
-    return [(path, match[1]) for path, match in found if match and path.is_file() and not path.is_symlink()]
+    kind = Path.is_dir if folders else Path.is_file
+    return [(path, match[1]) for path, match in found if match and kind(path) and not path.is_symlink()]
 
 
 def write_text(path: PathLike | str, text: str) -> None:

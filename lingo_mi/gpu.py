@@ -40,8 +40,7 @@ class GPU:
 @cache
 def gpu() -> GPU:
     """The GPU in use. Raises OSError where there is no CUDA driver, or no device."""
-    usual = 'nvcuda.dll' if sys.platform == 'win32' else 'libcuda.so.1'
-    driver = ctypes.CDLL(os.environ.get('DRJIT_LIBCUDA_PATH') or usual)  # as Dr.Jit loads it
+    driver = ctypes.CDLL(_driver())
 
     def ask(name, *arguments):
         code = getattr(driver, name)(*arguments)
@@ -74,3 +73,22 @@ def gpu() -> GPU:
 def resident_warps() -> int:
     """The warps that the GPU holds at once, at most."""
     return gpu().multiprocessors * gpu().warps
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; none where there is no driver."""
+    named = os.environ.get('CUDA_VISIBLE_DEVICES')
+    if named is not None:
+        return [name for name in named.split(',') if name.strip()]
+    count = ctypes.c_int()
+    try:
+        driver = ctypes.CDLL(_driver())
+        known = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+    except OSError:
+        return []
+    return [str(i) for i in range(count.value)] if known else []
+
+
+def _driver() -> str:
+    """The library of the CUDA driver, as Dr.Jit loads it."""
+    return os.environ.get('DRJIT_LIBCUDA_PATH') or ('nvcuda.dll' if sys.platform == 'win32' else 'libcuda.so.1')

@@ -1,4 +1,4 @@
-"""Image quality in 2D (projections) and 3D (volumes). Pure NumPy and SciPy, float64 throughout.
+"""Image quality in 2D (projections) and 3D (volumes). Pure NumPy and SciPy, in float64, a view or a slab at a time.
 
 Each measure comes in two forms. The plain name is the absolute one, and `_r2` is R2-Gaussian's:
 
@@ -21,7 +21,7 @@ from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,9 @@ from lingo_mi.errors import InputError
 WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
+SLAB = (
+    2**23
+)  # values that are made float64 at once: the whole of a large volume, with its temporaries, takes ten times itself
 
 
 def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
@@ -72,7 +75,8 @@ def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     peak = _peak(truth, peak)
-    return _mean(ssim_map(a / peak, b / peak).mean() for a, b in zip(images, truth)) if peak > 0 else np.nan
+    views = ((a.astype(float) / peak, b.astype(float) / peak) for a, b in zip(images, truth))
+    return _mean(ssim_map(a, b).mean() for a, b in views) if peak > 0 else np.nan
 
 
 def psnr_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
@@ -97,7 +101,7 @@ def ssim_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
             # One slice at a time: its few temporaries stay in the cache.
             means.append(
                 _mean(
-                    ssim_map(np.ascontiguousarray(x), np.ascontiguousarray(y)).mean()
+                    ssim_map(np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)).mean()
                     for x, y in zip(a, b)
                     if y.max() > 0
                 )
@@ -125,7 +129,15 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     volume, truth = _pair(volume, truth, 'volumes', '[x, y, z]')
     peak = _peak(truth, peak)
     axes = [axis for axis in range(3) if truth.shape[axis] > 1]
-    return float(ssim_map(volume / peak, truth / peak, axes).mean()) if peak > 0 else np.nan
+    if peak <= 0:
+        return np.nan
+    total, reach = 0.0, len(WINDOW) // 2
+    for slab in _slabs(truth):
+        low = max(slab.start - reach, 0)
+        near = slice(low, slab.stop + reach)  # the window of the slab's voxels reaches that far
+        found = ssim_map(volume[near].astype(float) / peak, truth[near].astype(float) / peak, axes)
+        total += found[slab.start - low : slab.stop - low].sum()
+    return float(total / truth.size)
 
 
 def compared(volume: ArrayLike, truth: ArrayLike) -> dict[str, float | None]:
@@ -171,15 +183,25 @@ def current_names(numbers: dict) -> dict:
 
 
 def _pair(a, b, what, axes):
-    """Both arrays as float64, checked."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    """Both arrays, checked."""
+    a, b = (np.asarray(x) for x in (a, b))
+    a, b = (x if x.dtype.kind in 'fiub' else x.astype(float) for x in (a, b))
     if a.shape != b.shape or a.ndim != 3 or a.size == 0:
         raise InputError(f'the {what} have the shapes {a.shape} and {b.shape}: both must be the same {axes}')
     for x, name in ((a, 'result'), (b, 'truth')):
-        if not np.isfinite(x).all():
-            at = tuple(int(i) for i in np.argwhere(~np.isfinite(x))[0])
-            raise InputError(f'the {what} of the {name} contain NaN or infinity, first at {axes} = {list(at)}')
+        for slab in _slabs(x):
+            if not (finite := np.isfinite(x[slab])).all():
+                first, *rest = (int(i) for i in np.argwhere(~finite)[0])
+                at = [slab.start + first, *rest]
+                raise InputError(f'the {what} of the {name} contain NaN or infinity, first at {axes} = {at}')
     return a, b
+
+
+def _slabs(array: np.ndarray) -> Iterator[slice]:
+    """Slices of the first axis, of at most `SLAB` values each, or one long."""
+    thickness = max(1, SLAB // max(1, array[0].size))
+    for start in range(0, len(array), thickness):
+        yield slice(start, min(start + thickness, len(array)))
 
 
 def _peak(truth, peak):
@@ -192,12 +214,13 @@ def _peak(truth, peak):
 
 def _own_maximum(images, truth):
     for a, b in zip(images, truth):
+        a, b = a.astype(float), b.astype(float)
         if b.max() > 0:
             yield a / (a.max() if a.max() > 0 else 1.0), b / b.max()
 
 
 def _psnr(a, b, peak):
-    error = float(np.mean((a - b) ** 2))
+    error = float(sum(np.sum((a[s].astype(float) - b[s]) ** 2) for s in _slabs(a)) / a.size)
     return float(10 * np.log10(peak**2 / error)) if error > 0 else np.inf
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi import notebook
 from lingo_mi.arrays import as_numpy, short_repr
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
@@ -36,6 +37,17 @@ class Scan:
 
     __repr__ = short_repr
     effects: Any = None  # `Effects` is in a package above this one
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the projections with a slider, and the scanner."""
+        return (
+            notebook.box(f'Scan of {len(self)} views', self._views('Projections, ln(I0/I)'))
+            + self.geometry._repr_html_()
+        )
+
+    def _views(self, title: str) -> str:
+        labels = [f'view {i}, at {angle:.1f}°' for i, angle in enumerate(np.degrees(self.geometry.angles))]
+        return notebook.frames(self.projections, labels, title)
 
     def __post_init__(self):
         require_type('geometry', self.geometry, Geometry, 'write Scan(geometry, projections)')
@@ -124,3 +136,13 @@ class Dataset:
             require_type('test', self.test, Scan)
         if self.volume is not None:
             object.__setattr__(self, 'volume', as_numpy(self.volume, 'the volume'))
+
+    def _repr_html_(self) -> str:
+        """For a notebook: views to fit and held out, the true volume, the scanner."""
+        geometry = self.train.geometry
+        parts = [self.train._views(f'To fit: {len(self.train)} views')]
+        if self.test is not None and len(self.test):
+            parts.append(self.test._views(f'Held out: {len(self.test)} views'))
+        if self.volume is not None and self.volume.ndim == 3:
+            parts.append('<br>' + notebook.slices(self.volume, geometry.dVoxel, geometry.offOrigin))
+        return notebook.box('Dataset', *parts) + geometry._repr_html_()

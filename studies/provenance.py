@@ -17,17 +17,24 @@ from lingo_mi.results.save import versions
 ROOT = Path(str(resources.files('lingo_mi'))).resolve().parent  # of the checkout, or site-packages
 
 
-def provenance() -> dict:
+def command() -> str:
+    """This process's command line."""
+    return ' '.join([sys.argv[0], *map(shlex.quote, sys.argv[1:])])
+
+
+def provenance(of: str | None = None) -> dict:
     """How what is measured now is made.
 
-    command    this process's command line
+    of   the command line, where it is another process's
+
+    command    the command line
     commit     the commit of the checkout that `lingo_mi` runs from; None where it is installed
     date       now, UTC, ISO 8601
     machine    the processor's name
     versions   of Python and of the packages that numbers depend on
     """
     return dict(
-        command=' '.join([sys.argv[0], *map(shlex.quote, sys.argv[1:])]),
+        command=of or command(),
         commit=commit(),
         date=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec='seconds'),
         machine=machine(),

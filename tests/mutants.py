@@ -244,14 +244,21 @@ def measure_lines(checkouts: Queue[Checkout], known: dict, keep: Callable[[dict]
 
 
 def tests_of(mutant: Mutant, lines: dict) -> list[tuple[str, float]]:
-    """Test files that execute a mutant's line, with their seconds: its own first, then those that name it, then the shortest."""
+    """Test files that execute a mutant's line, with their seconds: its own first, then those that import from its module, then
+    those that name it, then the shortest.
+
+    A constant over several lines counts as executed on its first alone: the last line before it that is executed stands for it.
+    """
     own = Path(mutant.file).stem
-    found = [(f, x['seconds']) for f, x in lines.items() if mutant.line in x['lines'].get(mutant.file, ())]
+    executed = {f: set(x['lines'].get(mutant.file, ())) for f, x in lines.items()}
+    line = max((n for n in set().union(*executed.values()) if n <= mutant.line), default=0)
+    found = [(f, lines[f]['seconds']) for f, x in executed.items() if line in x]
 
-    def names(file):
-        return bool(re.search(rf'\b{own}\b', (ROOT / file).read_text(encoding='utf-8')))
+    def distance(file):
+        text = (ROOT / file).read_text(encoding='utf-8')
+        return not re.search(rf'\.{own} import\b', text), not re.search(rf'\b{own}\b', text)
 
-    return sorted(found, key=lambda x: (own not in x[0], not names(x[0]), x[1]))
+    return sorted(found, key=lambda x: (own not in x[0], *distance(x[0]), x[1]))
 
 
 def accepted() -> set[tuple[str, str, str]]:

@@ -13,8 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lingo_mi import notebook
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, replacing, writing
+from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
@@ -31,8 +33,11 @@ from lingo_mi.output_folder import (
     require_ours,
     require_together,
 )
+from lingo_mi.parsing import whole
 from lingo_mi.report.figures import overview
-from lingo_mi.report.page import headline
+from lingo_mi.report.numbers import headline
+from lingo_mi.report.page import report_page
+from lingo_mi.report.view import Page
 from lingo_mi.results.measure import Measured, measure
 from lingo_mi.results.save import report_data, result_names, save
 from lingo_mi.runtime import ensure_variant
@@ -120,6 +125,29 @@ class Result:
             )
         return volume
 
+    def save_volume(
+        self, path: str | PathLike, geometry: Geometry | None = None, *, slab: int = THICKNESS, force: bool = False
+    ) -> Path:
+        """Write `volume` slab by slab, so that it need not fit into memory; returns the path.
+
+        path       .nii, .nii.gz, or a new .ome.zarr; its folder is made
+        geometry   whose grid (default: the scan's); `scan.geometry.with_volume(nVoxel, dVoxel)` has a finer one
+        slab       slices that are in memory at once
+        force      replace an earlier file
+
+        Raises InputError as `volume`, and where the file is there already or cannot be written.
+
+            result.save_volume('foot.ome.zarr', scan.geometry.with_volume(2048, 0.125))
+        """
+        path, slab = as_path('path', path), whole('slab', slab, 1)
+        with writing(path):
+            if path.exists() and not force:
+                raise InputError(f'{path}: exists already; give force=True to replace it')
+            path.parent.mkdir(parents=True, exist_ok=True)
+        grid = self.fitted.geometry if geometry is None else geometry
+        write_slabs(path, grid, (self.volume(grid.slab(*part)) for part in grid.slabs(slab)))
+        return path
+
     def render(self, geometry: Geometry | None = None) -> np.ndarray:
         """Line integrals in the views of any geometry (default: the scan's), float32 [view, v, u], density times mm.
 
@@ -187,9 +215,34 @@ class Result:
         return f'Result({self.recipe}: {what} after {self.settings.iterations} iterations, {self.seconds:.0f} s)'
 
     def _repr_html_(self) -> str:
-        picture = overview(report_data(self.fitted, self._measured, self.recipe), headline(self.metrics()))
+        measured, geometry = self._measured, self.fitted.geometry
+        parts = []
+        if measured.volume is not None:
+            parts += [notebook.slices(measured.volume, geometry.dVoxel, geometry.offOrigin), '<br>']
+        if measured.views is not None and measured.test is not None:
+            angles = [
+                f'held-out view {i}, at {a:.1f}°' for i, a in enumerate(np.degrees(measured.test.geometry.angles))
+            ]
+            for title, images in (('Rendered', measured.views), ('Measured', measured.test.projections)):
+                parts.append(notebook.frames(images, angles, title))
+        picture = overview(report_data(self.fitted, measured, self.recipe), headline(self.metrics()))
         embedded = base64.b64encode(picture).decode('ascii')
-        return f'<img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{embedded}">'
+        parts.append(
+            f'<br><img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{embedded}">'
+        )
+        return notebook.box(f'{self!r}:  {headline(self.metrics())}', *parts)
+
+    def view(self, *, title: str = '') -> Page:
+        """The interactive page of the result: linked slices, held-out views, curves, the cloud in 3D, all numbers.
+
+        title   of the page (default: the recipe's name)
+
+        Returns a `Page`: as the last line of a notebook's cell it shows itself there; elsewhere `page.open()` opens it in the
+        browser, and `page.save('foot.html')` writes it. It is the report.html of `save`, 1 to 30 MB.
+
+            result.view().open()
+        """
+        return Page(report_page(report_data(self.fitted, self._measured, title or self.recipe)))
 
 
 def load_result(path: str | PathLike) -> Result:

@@ -34,12 +34,13 @@ def reconstruct(
 
     scan        projections and geometry; of a `Dataset` its `train`. Effects of a detector that it knows (beam
                 hardening, scatter, blur) are taken out first
-    algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, with its parameters
+    algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, `Best`, with its parameters
     start       the `Result` of a fit to this scan, or a volume [x, y, z] in 1/mm, to start from; `Refined` needs a result
     views       with a result: how many views to reconstruct from. Those that were not measured are rendered from the cloud (the
                 two stages of the paper), and the algorithm starts from nothing. The scan must be one on a circle
     progress    whether to show a progress bar on standard error
 
+    `Best` chooses its settings by measured views that it holds out, and takes neither `start` nor `views`.
     `Refined` meets the completed views first where `views` is given, and the measured ones alone where it is not.
 
     Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|; `seconds`. It can be

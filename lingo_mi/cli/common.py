@@ -6,6 +6,7 @@ import argparse
 import io
 import os
 import shlex
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -123,12 +124,13 @@ def check_seed(seed: int) -> None:
         raise InputError(f'--seed must not be negative, nor above {MOST_SEED}, but is {shown(seed)}')
 
 
-def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0) -> Any:
+def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0, slab: int = 0) -> Any:
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
     scene   the `LoadedScene` of args.scene
     views   how many evenly spaced views to use (None: all)
     seed    of the noise, where the scene's detector has any
+    slab    slices of the volume that are in memory at once (0: all)
     """
     from lingo_mi.files.scans import read_scan
     from lingo_mi.files.volumes import read_volume
@@ -137,11 +139,52 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
 
     if args.projections:
         dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
-        check_memory(dataset.train.geometry)
+        geometry = dataset.train.geometry
+        check_memory(geometry.slab(0, min(slab, geometry.nVoxel[2])) if slab else geometry)
         warn_if_truncated(dataset.train.geometry)
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
     return take_scan(scene, views or 0, volume, seed)
+
+
+def cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --cluster and --threads; see `runner_of`."""
+    parser.add_argument(
+        '--cluster',
+        metavar='ADDRESS|local:N',
+        help="work on a Dask cluster: its scheduler's address or file, or N processes of this machine (default: in this process)",
+    )
+    parser.add_argument(
+        '--threads',
+        type=int,
+        default=0,
+        metavar='N',
+        help='of a worker on the CPU (default: all that it has; of local:N, its share)',
+    )
+
+
+@contextmanager
+def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
+    """What runs jobs, by the arguments that `cluster_arguments` added: this process, or a cluster, which is open in the block.
+
+    folder   that all workers must see; it exists
+
+    Raises InputError where --cluster leads nowhere.
+    """
+    from lingo_mi.jobs.in_process import InProcess
+
+    if args.threads < 0:
+        raise InputError(f'--threads must be at least 1, not {args.threads}')
+    if args.cluster is None:
+        if args.threads:
+            raise InputError('--threads goes with --cluster')
+        yield InProcess()
+        return
+    from lingo_mi.jobs.cluster import opened
+
+    with opened(args.cluster, folder, args.threads, args.variant) as cluster:
+        print(f'dashboard: {cluster.dashboard}', file=sys.stderr)
+        yield cluster
 
 
 def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str) -> None:
@@ -189,6 +232,9 @@ def writing_file(path: Path) -> Iterator[None]:
         for leftover, target in leftovers(path.parent):
             if target == path.name[-40:]:
                 leftover.unlink(missing_ok=True)
+        for leftover, target in leftovers(path.parent, folders=True):
+            if target == path.name[-40:]:
+                shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 

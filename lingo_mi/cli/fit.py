@@ -28,8 +28,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
-from lingo_mi.interrupts import between_steps
-from lingo_mi.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers, require_ours
+from lingo_mi.output_folder import CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
 from lingo_mi.parsing import nearest
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
@@ -95,44 +94,37 @@ def main() -> None:
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume)
     with locked(folder):
         clear_leftovers(folder)
-        fit_into(folder, args, settings, {k: v for k, v in defined.items() if k in own})
+        fit_scene(folder, args, settings, {k: v for k, v in defined.items() if k in own})
 
 
-def fit_into(folder: Path, args: argparse.Namespace, settings: Settings, parameters: dict[str, str]) -> None:
+def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parameters: dict[str, str]) -> None:
     """Fit, and write the result into a folder that no other process writes to.
 
     parameters   of the scene file
     """
-    from lingo_mi.fitting.initial import initial_cloud
-    from lingo_mi.fitting.loop import run
     from lingo_mi.progress import Progress
-    from lingo_mi.results.measure import measure, quick_measure, summary
-    from lingo_mi.results.save import result_names, save
+    from lingo_mi.results.fit_into import fit_into
+    from lingo_mi.results.measure import summary
     from lingo_mi.scene.load import load_scene
 
     scene = load_scene(args.scene, parameters)
     scan = read_input(args, scene, args.views, args.seed)
-    require_ours(folder, result_names(settings, 0 if scan.test is None else len(scan.test)))
-    cloud = None if args.resume else initial_cloud(scan.train, settings, args.seed)
-    with Progress('Fit', settings.iterations) as bar, between_steps() as check:
-
-        def progress(iteration, **fields):
-            bar.update(iteration, **fields)
-            check()
-
+    with Progress('Fit', settings.iterations) as bar:
         try:
-            fit = run(scan.train, settings, cloud, args.seed, quick_measure(scan), progress, folder / CHECKPOINT)
+            result = fit_into(
+                folder,
+                scan,
+                settings,
+                args.seed,
+                bar.update,
+                resume=args.resume,
+                title=Path(args.volume or args.projections or scene.name).name,
+                method=args.method,
+                command=command_line(),
+            )
         except KeyboardInterrupt:
             again = command_line('--resume', without=('--resume', '--force'))
             raise KeyboardInterrupt(f'go on with  {again}') from None
-    result = save(
-        folder,
-        fit,
-        measure(fit, scan.test, scan.volume),
-        title=Path(args.volume or args.projections or scene.name).name,
-        method=args.method,
-        command=command_line(),
-    )
     print(summary(result))
     written = [name for name in (PAGE, VOLUME, CLOUD, SCENE, METRICS) if (folder / name).exists()]
     print(f'{folder}/: {", ".join(written)}')

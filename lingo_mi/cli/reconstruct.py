@@ -6,6 +6,8 @@
     lingo-mi reconstruct x3d_foot --algorithm voxelize --complete out/x3d_foot/result.xml
     lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot/result.xml --views 100
     lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot/result.xml
+    lingo-mi reconstruct x3d_foot --projections large.npy --algorithm fdk --slab 64 --out large.ome.zarr
+    lingo-mi reconstruct x3d_foot --algorithm best --views 25
 
 The input is what `lingo-mi fit` takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
@@ -14,13 +16,22 @@ measured ones then; for objects finer than the voxels add -D finer=2. With --sta
 cloud was fitted to, by refined or an iterative algorithm, from the cloud's own volume; any scan will do. Poses that the fit
 has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
 its largest density for full scale, then with 1.
+best chooses its settings by measured views that it holds out, and needs no cloud. What it tried is printed, and written beside
+the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is least certain.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
+
+A volume larger than memory is made and written in slabs of --slab slices, by fdk and voxelize.
 """
 
 import argparse
+import json
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from lingo_mi.cli.common import (
     Parser,
@@ -34,13 +45,18 @@ from lingo_mi.cli.common import (
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import optional, write_text
+from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
-from lingo_mi.reconstruction import ALGORITHMS, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
+from lingo_mi.progress import Progress
+from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.results.measure import volume_quality
 from lingo_mi.runtime import use_variant
+from lingo_mi.scan import Scan
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
 
@@ -68,7 +84,18 @@ def arguments() -> argparse.Namespace:
         metavar='F',
         help='result.xml of a fit, or checkpoint.npz of one by naf, whose volume refined or an iterative algorithm starts from',
     )
-    p.add_argument('--out', type=Path, metavar='F', help='the volume, NIfTI (default: out/<scene>-<algorithm>.nii.gz)')
+    p.add_argument(
+        '--out',
+        type=Path,
+        metavar='F',
+        help='the volume: NIfTI, .nii or .nii.gz, or OME-Zarr, .ome.zarr (default: out/<scene>-<algorithm>.nii.gz)',
+    )
+    p.add_argument(
+        '--slab',
+        type=int,
+        metavar='N',
+        help='hold N slices of the volume in memory at once (fdk and voxelize; default: all)',
+    )
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument(
         '--seed',
@@ -91,9 +118,19 @@ def arguments() -> argparse.Namespace:
 
 def output(path: Path, force: bool) -> Path:
     """The output file, if it can be written without spoiling one."""
-    if not path.name.endswith(('.nii', '.nii.gz')):
-        raise InputError(f'{path}: volumes are written as NIfTI; give an --out that ends in .nii or .nii.gz')
+    if not path.name.endswith((*NIFTI, *ZARR)):
+        raise InputError(
+            f'{path}: volumes are written as NIfTI or OME-Zarr; give an --out that ends in .nii, .nii.gz or .ome.zarr'
+        )
+    if path.name.endswith(ZARR):
+        optional('zarr', 'ome-zarr')
     return writable_file(path, force)
+
+
+def beside(out: Path) -> tuple[Path, Path]:
+    """The files of `best` beside its volume: the plan and the map of errors."""
+    name = out.name.removesuffix('.gz').removesuffix('.nii')
+    return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{out.name.removeprefix(name)}')
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -101,6 +138,12 @@ def check_arguments(args: argparse.Namespace) -> None:
     check_input(args)
     if args.seed is not None and args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if args.slab is not None and (args.slab < 1 or args.algorithm not in ('fdk', 'voxelize')):
+        raise InputError('--slab is a number of slices from 1 on, for --algorithm fdk and voxelize')
+    if args.algorithm == 'best' and (args.complete or args.start):
+        raise InputError(
+            '--algorithm best chooses by measured views, which a fitted cloud has seen already: leave out --complete and --start'
+        )
     if args.algorithm in FROM_CLOUD and not (args.complete or args.start and args.algorithm == 'refined'):
         raise InputError(
             f'--algorithm {args.algorithm} needs a fitted cloud: name its result.xml with --complete'
@@ -145,6 +188,9 @@ def main() -> None:
         chosen = dict(completed_niter='0') | chosen
     algorithm = algorithm_of(args.algorithm, chosen)
     out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
+    if args.algorithm == 'best':
+        for path in beside(out):
+            writable_file(path, args.force)
     with writing_file(out):
         reconstruct_into(out, args, algorithm, effects, {k: v for k, v in defined.items() if k in own})
 
@@ -169,11 +215,16 @@ def reconstruct_into(
     views = len(cloud.geometry) if cloud else args.views
     if not (args.projections or args.volume):  # their geometry is not known before they are read
         check_scan(scene.scanner.geometry, algorithm, views)
-    dataset = read_input(args, scene, None if cloud else args.views, seed or 0)
+    dataset = read_input(args, scene, None if cloud else args.views, seed or 0, args.slab or 0)
     scan, inputs = dataset.train, {}
-    check_scan(scan.geometry, algorithm, views)
+    parts = scan.geometry.slabs(args.slab or scan.geometry.nVoxel[2])
+    check_scan(scan.geometry.slab(*parts[0]), algorithm, views)
     if algorithm is None:
         assert cloud is not None  # as `check_arguments` has made sure
+        if args.slab:
+            sample = sampled(cloud)
+            write_in_slabs(out, scan, (sample(scan.geometry.slab(*part)) for part in parts), args)
+            return
         began = time.perf_counter()
         volume = sampled(cloud)(scan.geometry)
         found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
@@ -186,6 +237,11 @@ def reconstruct_into(
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
+        if args.slab and isinstance(algorithm, FDK):
+            with Progress('fdk', len(scan) * len(parts)) as bar:
+                slabs = algorithm.slabs(scan, args.slab, progress=lambda done, *_: bar.update(done))
+                write_in_slabs(out, scan, slabs, args)
+            return
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress, **inputs)
         of = len(scan)
@@ -201,3 +257,19 @@ def reconstruct_into(
     if dataset.volume is not None:
         print(volume_quality(found.metrics(dataset.volume)))
     print(out)
+    if isinstance(found, Chosen):
+        print(found.report())
+        plan, error = beside(out)
+        write_text(plan, json.dumps(found.record(), indent=1) + '\n')
+        replace(found, volume=found.error).save(error, force=True)
+
+
+def write_in_slabs(out: Path, scan: Scan, slabs: Iterator[np.ndarray], args: argparse.Namespace) -> None:
+    """Write a volume, slab by slab as it is made."""
+    began = time.perf_counter()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_slabs(out, scan.geometry, slabs)
+    shape = ' x '.join(map(str, scan.geometry.nVoxel))
+    print(
+        f'{args.algorithm}, {shape} voxels in slabs of {args.slab} slices: {time.perf_counter() - began:.1f} s\n{out}'
+    )

@@ -14,7 +14,7 @@ and 30,000 iterations, and all objects; it is meant for a GPU.
 
 Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
 tables use what is there. The table, as Markdown and JSON, is renewed after every one of them, with TABLE.provenance.json beside
-it, which says how.
+it, which says how. With --cluster, cells are computed side by side on the workers of a Dask cluster.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, cluster_arguments, runner_of
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, require_writable
 from lingo_mi.fitting.recipes import METHODS, settings_of
@@ -72,6 +72,7 @@ def arguments() -> argparse.Namespace:
     )
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
     p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<scale>)')
+    cluster_arguments(p)
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
@@ -121,7 +122,18 @@ def compute(args: argparse.Namespace, cells: Any, rows: list, objects: list[str]
         for leftover, _ in leftovers(inside):  # the lock is ours, so nobody is writing them
             leftover.unlink(missing_ok=True)
     planned = plan(rows, objects)
-    failed = cells.compute_missing(planned, lambda: write(args.table, rows, objects, cells, args.scale))
+
+    def renew():
+        write(args.table, rows, objects, cells, args.scale)
+
+    if args.cluster is None:
+        failed: dict[Any, Any] = cells.compute_missing(planned, renew)
+    else:
+        from lingo_mi.studies.tables.series import compute_missing
+
+        cells.folder.mkdir(parents=True, exist_ok=True)
+        with runner_of(args, cells.folder) as runner:
+            failed = compute_missing(cells, planned, runner, renew)
     print(write(args.table, rows, objects, cells, args.scale))
     print(f'{cells.folder}/: {args.table}.md, {args.table}.json, {args.table}.provenance.json')
     if failed:

@@ -12,7 +12,7 @@ from lingo_mi.completion.views import as_corrected, complete, fitted_views, with
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.geometry.base import CircularGeometry, Geometry
-from lingo_mi.reconstruction import FDK, Algorithm, Refined, check_scan
+from lingo_mi.reconstruction import FDK, Algorithm, Best, Refined, check_scan
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.truth import voxelize_cloud
 
@@ -58,6 +58,7 @@ def prepare_completed(
     the completed views. Raises InputError as `fitted_views`, `check_scan` and `complete` do, and for FDK if the fit has
     corrected the poses.
     """
+    _refuse_best(algorithm)
     measured = fitted_views(dataset, cloud.geometry)
     on_circle = [isinstance(g, CircularGeometry) for g in (measured.geometry, cloud.corrected)]
     if isinstance(algorithm, FDK) and on_circle == [True, False]:
@@ -83,6 +84,12 @@ def prepare_start(dataset: Dataset, cloud: FittedCloud | Fitted, algorithm: Algo
     `Refined` gets a function that samples the cloud's densities; its completed_niter must be 0. Raises InputError as
     `fitted_views` and `sampled` do.
     """
+    _refuse_best(algorithm)
     scan = without_effects(as_corrected(fitted_views(dataset, cloud.geometry), cloud), cloud)
     sample = sampled(cloud)
     return scan, dict(sample=sample) if isinstance(algorithm, Refined) else dict(start=sample(scan.geometry))
+
+
+def _refuse_best(algorithm: Algorithm) -> None:
+    if isinstance(algorithm, Best):
+        raise InputError('best chooses by measured views, which a fitted cloud has seen already: leave the cloud out')

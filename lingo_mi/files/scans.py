@@ -41,6 +41,8 @@ Public measured scans as .npz: see `lingo_mi.files.public_scans`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -210,12 +212,18 @@ def _dump_yaml(path, geometry, test=None, **more):
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
 
+def _geometry_of(path, geometry):
+    """The geometry file of an .npy: the one that is named, else one beside it."""
+    if geometry is not None:
+        return geometry
+    beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
+    found = next((p for p in beside if p.exists()), None)
+    if found is None:
+        raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
+    return found
+
+
 def _read_npy(path, geometry):
-    if geometry is None:
-        beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
-        geometry = next((p for p in beside if p.exists()), None)
-        if geometry is None:
-            raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
     values = load_yaml(geometry)
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
@@ -320,26 +328,31 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
     None where the format has none. Raises InputError if a file is missing, damaged, unknown, or contradicts
     its geometry.
     """
+    return reader_of(path, geometry, name)()
+
+
+def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Callable[[], Dataset]:
+    """What reads a scan when it is called. Raises InputError for what can be seen without that; arguments as of `read_scan`."""
     path = Path(path)
     suffix = path.suffix.lower()
     if geometry is not None and suffix != '.npy':
         raise InputError(f'{path}: carries its own geometry; a geometry file goes with .npy projections only')
     if path.is_dir():
         if (path / r2.META).exists():
-            return r2.read(path)
+            return partial(r2.read, path)
         if (path / 'geometry.yml').exists():
-            return _read_exr_folder(path)
+            return partial(_read_exr_folder, path)
         raise InputError(
             f'{path}: has neither {r2.META} (R2-Gaussian) nor geometry.yml (EXR views); give a folder of a scan'
         )
     with reading(path):
         open(path, 'rb').close()
     if suffix in ('.pickle', '.pkl'):
-        return naf.read(path)
+        return partial(naf.read, path)
     if suffix == '.npy':
-        return _read_npy(path, geometry)
+        return partial(_read_npy, path, _geometry_of(path, geometry))
     if suffix == '.npz':
-        return public_scans.read(path, name)
+        return partial(public_scans.read, path, name)
     raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
 
 

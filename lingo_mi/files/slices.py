@@ -19,7 +19,7 @@ from lingo_mi.memory import require_room
 _KINDS = {'imagej', 'shaped', 'uniform', 'volumetric', 'bigtiff'}  # of TIFF files, in tifffile's words
 _DEFLATED_DICOM = '1.2.840.10008.1.2.1.99'
 # What a byte may stand for in the compressions that bound it, by TIFF's numbers: none, LZW, deflate twice, PackBits.
-_RATIO = {1: 1, 5: 4096, 8: 1032, 32946: 1032, 32773: 128}
+_RATIO = {1: 1, 5: 4096, 8: 1032, 32946: 1032, 32773: 64}
 
 
 def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None]:

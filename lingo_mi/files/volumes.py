@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi import notebook
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import reading, replacing
@@ -59,6 +60,11 @@ class Volume:
     unit: str
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """For a notebook: slices, each with a slider."""
+        centre = self.affine[:3, :3] @ ((np.array(self.data.shape) - 1) / 2) + self.affine[:3, 3]
+        return notebook.box(repr(self), notebook.slices(self.data, self.spacing, centre, self.unit))
 
 
 def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:
@@ -258,17 +264,46 @@ def write_volume(
     if not path.name.endswith(('.nii', '.nii.gz')):
         raise InputError(f'{path}: volumes are written as NIfTI; give a name that ends in .nii or .nii.gz')
     data = numeric(np.asarray(data), path, 3)
-    spacing = np.broadcast_to(np.asarray(spacing, float), 3)
-    if not (np.isfinite(spacing).all() and spacing.min() > 0):
-        raise InputError(f'{path}: the voxel size must be positive, not {tuple(spacing)}')
-    affine = centred_affine(data.shape, spacing)
-    if origin is not None:
-        affine[:3, 3] = origin
-    text = (_OURS + description).encode('utf-8')
-    if len(text) > 79:
-        raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room for 79')
+    affine, text = _placed(path, data.shape, spacing, origin, description)
     image = nibabel.Nifti1Image(np.asarray(data, np.float32), affine)
     image.header.set_xyzt_units('mm')
     image.header['descrip'] = text
     with replacing(path) as temporary:
         nibabel.save(image, temporary)
+
+
+def volume_header(
+    path: PathLike | str, shape: Sequence[int], spacing: ArrayLike, origin: ArrayLike | None, description: str
+) -> bytes:
+    """What stands before the voxels in the file that `write_volume` writes; these follow as little-endian float32, x fastest.
+
+    shape   of the volume; the other arguments as of `write_volume`, as are the errors
+    """
+    import nibabel
+
+    affine, text = _placed(Path(path), shape, spacing, origin, description)
+    header: Any = nibabel.Nifti1Header(endianness='<')
+    if max(shape) > np.iinfo(np.int16).max:
+        raise InputError(f'{path}: NIfTI has room for {np.iinfo(np.int16).max} voxels along a side; write .ome.zarr')
+    header.set_data_dtype(np.float32)
+    header.set_data_shape(shape)
+    header.set_qform(affine, 'unknown')
+    header.set_sform(affine, 'aligned')
+    header.set_xyzt_units('mm')
+    header['descrip'], header['magic'], header['vox_offset'] = text, b'n+1', len(header.binaryblock) + 4
+    header.set_slope_inter(1, 0)
+    return header.binaryblock + bytes(4)  # no extensions
+
+
+def _placed(path, shape, spacing, origin, description):
+    """The affine [4, 4] and the description of a NIfTI file, checked."""
+    spacing = np.broadcast_to(np.asarray(spacing, float), 3)
+    if not (np.isfinite(spacing).all() and spacing.min() > 0):
+        raise InputError(f'{path}: the voxel size must be positive, not {tuple(spacing)}')
+    affine = centred_affine(shape, spacing)
+    if origin is not None:
+        affine[:3, 3] = origin
+    text = (_OURS + description).encode('utf-8')
+    if len(text) > 79:
+        raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room for 79')
+    return affine, text

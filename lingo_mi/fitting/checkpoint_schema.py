@@ -8,6 +8,7 @@ array.initial                 float32 [M, 3]
 array.order                   whole numbers [K], views that come next
 array.average.*               like values.*, where the fit averages
 array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], where the fit corrects poses
+array.response.*              float64 [rows, numbers], where the fit finds a response: air, gain
 array.share                   float32 [N], where the fit models two materials
 array.scattered               float64 [2, views, rows, columns], where it models scatter
 extra                         text: plain values as JSON, named in `_PLAIN`
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi.calibration.response.part import SMOOTH
 from lingo_mi.errors import InputError, shown
 from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import Settings
@@ -84,6 +86,9 @@ def _expected(settings: Settings, views: int, count: int) -> dict[str, tuple[str
         found |= {f'array.poses.{k}': ('float64', (views, 3)) for k in ('turn', 'shift')}
         found |= {f'array.poses.{k}': ('float64', (views, 6)) for k in ('first', 'second')}
         found |= {'array.poses.steps': ('int', (views,))}
+    varies = dict(air=settings.calibration.fit_air, gain=settings.calibration.fit_gain)
+    rows = dict(view=views, smooth=min(SMOOTH, views - 1) + 1)
+    found |= {f'array.response.{k}': ('float64', (rows[x], 1)) for k, x in varies.items() if x != 'off'}
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -10,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.calibration.response.response import Response
 from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.expected_signal import ExpectedSignal
@@ -22,6 +24,10 @@ from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
+AT_ONCE = (
+    2**25
+)  # voxels that are sampled at once: a larger volume is made in slabs, since sampling takes several times its memory
+
 
 class CloudModel:
     """Renders and voxelizes the states of a fit.
@@ -31,12 +37,19 @@ class CloudModel:
     unit       the fit's unit of density, 1/mm (`measured.density_unit`)
     effects    of the scan, if the fit models them (`measured.modelled_effects`); None: line integrals
     signal     `ExpectedSignal` of these effects; None without effects
+    response   what else the detector makes of line integrals, as far as it was found with the cloud; None if that is not fitted
     """
 
     def __init__(self, settings: Settings, geometry: Geometry, unit: float, effects: Effects | None = None):
         """Raises InputError for effects that a fit cannot model."""
         self.settings, self.geometry, self.unit, self.effects = settings, geometry, unit, effects
         self.signal = None if effects is None else ExpectedSignal(effects, geometry, unit)
+        self.response = Response.of(geometry, air=settings.calibration.fit_air, gain=settings.calibration.fit_gain)
+
+    def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
+        """What the scan's detector is expected to measure in the views of a geometry: `render` with the response found so far."""
+        rendered = self.render(state, geometry)
+        return rendered if self.response is None else self.response.applied(rendered, geometry)
 
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
@@ -78,16 +91,27 @@ class CloudModel:
         """
         if not self.settings.volumetric:
             return None
-        own = self.geometry
-        if geometry is None:
-            grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+        own, gaussians = self.geometry, state.gaussians(self.settings)
+        extent, wanted = self.settings.model.extent, geometry or own
+
+        def values(part):
+            if part is None:
+                grid = Grid(vector64(-own.half), vector64(2 * own.half / own.nVoxel), own.nVoxel)
+            else:
+                low = np.array(part.offOrigin) - np.array(part.sVoxel) / 2 - own.offOrigin
+                step = np.array(part.dVoxel)
+                grid = Grid(vector64(low * own.scale), vector64(step * own.scale), part.nVoxel)
+            return grid.volume(voxelize(*gaussians, grid=grid, extent=extent, deep=True))
+
+        if math.prod(wanted.nVoxel) <= AT_ONCE:
+            out = values(geometry)
         else:
-            low = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 - own.offOrigin
-            step = np.array(geometry.dVoxel)
-            grid = Grid(vector64(low * own.scale), vector64(step * own.scale), geometry.nVoxel)
-        gaussians, extent = state.gaussians(self.settings), self.settings.model.extent
-        values = voxelize(*gaussians, grid=grid, extent=extent, deep=True)
-        return grid.volume(values) * np.float32(self.unit)
+            nx, ny, _ = wanted.nVoxel
+            out = np.empty(wanted.nVoxel, np.float32)
+            for begin, end in wanted.slabs(max(1, AT_ONCE // (4 * nx * ny))):
+                out[:, :, begin:end] = values(wanted.slab(begin, end))
+        out *= np.float32(self.unit)
+        return out
 
     def shares(self, state: DeviceState) -> Any:
         """The second material's share in every Gaussian's density, Float [N]; None for one material."""

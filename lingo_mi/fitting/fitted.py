@@ -81,6 +81,16 @@ class Fitted:
         """Projections in the views of a geometry, float32 [view, v, u]; see `CloudModel.render`."""
         return self.model.render(DeviceState(self.state), geometry, progress)
 
+    def expected(self, geometry: Geometry) -> np.ndarray:
+        """What the scan's detector is expected to measure in views that were taken among those of the scan, float32 [view, v, u].
+
+        That is `render`, but with the response and with smooth corrections of the poses that the fit has found, in the views for
+        their time.
+        """
+        if self.poses is not None:
+            geometry = self.poses.between(self.geometry, geometry)
+        return self.model.expected(DeviceState(self.state), geometry)
+
     def volume(self, geometry: Geometry | None = None) -> np.ndarray | None:
         """Density in 1/mm on a geometry's grid (default: the scan's), float32 [x, y, z]; None for alpha compositing."""
         return self.model.volume(DeviceState(self.state), geometry)
@@ -122,10 +132,12 @@ class Fitted:
             )
         poses = None
         if max(settings.adam.rate_pose) > 0:
-            poses = Poses(len(geometry))
+            poses = Poses(len(geometry), smooth=settings.calibration.pose_motion == 'smooth')
             poses.restore(arrays)
         state.values |= average.values_of(arrays)
         model = model_of(settings, geometry, extra['unit'], effects)
+        if model.response is not None:
+            model.response.restore(arrays)
         history = [current_names(entry) for entry in extra['history']]
         seed, seconds, info = (extra[name] for name in ('seed', 'seconds', 'info'))
         return cls(model, state, arrays['initial'], poses, seed, history, seconds, info)

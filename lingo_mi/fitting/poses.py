@@ -8,7 +8,8 @@ A view's correction turns source and panel about the volume's centre and shifts 
     d loss / d shift = d loss / d source + d loss / d corner
 
 A common motion of all views equals a motion of the object; the projections do not determine it. So after every step the mean
-turn and the mean shift of all views are subtracted.
+turn and the mean shift of all views are subtracted. Corrections may be restricted to cubic polynomials in time, which hold what
+a single view tells poorly.
 """
 
 from __future__ import annotations
@@ -17,8 +18,11 @@ from dataclasses import replace
 
 import drjit as dr
 import numpy as np
+from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
+from lingo_mi.calibration.drift import times
+from lingo_mi.calibration.response.part import SMOOTH
 from lingo_mi.fitting.settings import AdamSettings
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
@@ -35,8 +39,15 @@ class Poses:
     first, second, steps   Adam's moments [n, 6] and number of steps [n] of every view
     """
 
-    def __init__(self, n: int, flat: bool = False):
-        """flat: True for a fan beam, whose views turn about z and shift in their plane only."""
+    def __init__(self, n: int, flat: bool = False, smooth: bool = False):
+        """flat: True for a fan beam, whose views turn about z and shift in their plane only.
+
+        smooth: True for corrections that are cubic polynomials in time, from the first view to the last.
+        """
+        self.projection = None
+        if smooth:
+            basis = np.linalg.qr(legendre.legvander(np.linspace(-1, 1, n), min(SMOOTH, n - 1)))[0]
+            self.projection = basis @ basis.T
         self.turn, self.shift = np.zeros((n, 3)), np.zeros((n, 3))
         self.first, self.second, self.steps = np.zeros((n, 6)), np.zeros((n, 6)), np.zeros(n, int)
         self.free = np.array([0, 0, 1, 1, 1, 0] if flat else [1] * 6, float)
@@ -63,6 +74,18 @@ class Poses:
         rays = replace(f, source=source, corner=f.corner / g.scale + centre, u=f.u / g.scale, v=f.v / g.scale)
         return Geometry.from_poses(rays, g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
 
+    def between(self, scan: Geometry, geometry: Geometry) -> Geometry:
+        """A geometry with smooth corrections for the time of its views, which were taken among those of the scan; as it is where
+        every view is corrected for itself, which tells nothing of others."""
+        if self.projection is None:
+            return geometry
+        t, own = times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))
+        there = Poses(len(geometry))
+        for name in ('turn', 'shift'):
+            values = getattr(self, name)
+            setattr(there, name, np.stack([np.interp(t, own, column) for column in values.T], 1))
+        return there.corrected(replace(geometry, nVoxel=scan.nVoxel, dVoxel=scan.dVoxel, offOrigin=scan.offOrigin))
+
     def undone(self) -> Poses:
         """The inverse corrections: they take corrected views back to the given poses."""
         back = Poses(len(self.turn))
@@ -88,6 +111,8 @@ class Poses:
         by = Rotation.from_rotvec(move[:3])
         self.turn[view] = (by * Rotation.from_rotvec(self.turn[view])).as_rotvec()
         self.shift[view] = by.apply(self.shift[view]) + move[3:]  # turns are about the origin, so the shift turns too
+        if self.projection is not None:  # of small turns, whose vectors add
+            self.turn, self.shift = self.projection @ self.turn, self.projection @ self.shift
         back = Rotation.from_rotvec(-self.turn.mean(0))
         self.turn = (back * Rotation.from_rotvec(self.turn)).as_rotvec()
         self.shift = back.apply(self.shift)

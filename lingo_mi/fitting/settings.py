@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar
 
+from lingo_mi.calibration.response.part import VARIES
 from lingo_mi.errors import InputError, shown
 from lingo_mi.fitting.field.settings import FieldSettings
 from lingo_mi.lingo.initialise import LingoSettings
@@ -87,7 +88,9 @@ class ModelSettings:
 class LossSettings:
     """The loss (paper, section III-C). That of a neural field is the mean squared error of its rays (NAF).
 
+    lambda_l1          weight of the mean absolute error (1)
     lambda_ssim        weight of 1 - SSIM (0.25)
+    lambda_gradient    weight of the root mean square of the error's gradient (own; see `losses.gradient_error`)
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
@@ -97,7 +100,9 @@ class LossSettings:
                        factor on the densification statistic only (Adam cancels a constant factor of the loss)
     """
 
+    lambda_l1: float = 1.0
     lambda_ssim: float = 0.25
+    lambda_gradient: float = 0.0
     lambda_tv: float = 0.05
     tv_size: int = 32
     tv_stride: int = 1
@@ -105,7 +110,12 @@ class LossSettings:
     loss_scale: str = 'none'
 
     def __post_init__(self):
-        require_ranges(self, lambda_ssim=(0, 1e6), lambda_tv=(0, 1e6), tv_size=(1, 1e6), tv_stride=(1, 1e6))
+        weights = dict.fromkeys(('lambda_l1', 'lambda_ssim', 'lambda_gradient', 'lambda_tv'), (0, 1e6))
+        require_ranges(self, **weights, tv_size=(1, 1e6), tv_stride=(1, 1e6))
+        _require(
+            self.lambda_l1 + self.lambda_ssim + self.lambda_gradient > 0,
+            'one of lambda_l1, lambda_ssim and lambda_gradient must be above 0: nothing else compares with the projections',
+        )
         _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
         _require(
             self.loss_scale in ('none', 'dynamic', 'statistic'),
@@ -158,6 +168,38 @@ class AdamSettings:
         """Step size of a parameter (see `lingo_mi.fitting.models`) or of 'pose'. share: progress of the decay, in [0, 1]."""
         first, last = getattr(self, f'rate_{name}')
         return first ** (1 - share) * last**share
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """Errors of the measurement that are found together with the cloud (own), each off unless asked for.
+
+    fit_air            air level of the views (see `lingo_mi.calibration.response.air`): 'off'; 'smooth', a cubic polynomial in
+                       time; or 'view', every view for itself
+    fit_gain           gain of the views, likewise
+    pose_motion        of the corrections that `rate_pose` asks for: 'view', every view for itself; or 'smooth', cubic
+                       polynomials in time, which views that are held out get, too
+
+    Time is told by the angles of the views, which must be in the order in which they were taken. A curve and scattered light,
+    which a cloud would explain away, are found before a fit: `lm.calibrate`.
+    """
+
+    fit_air: str = 'off'
+    fit_gain: str = 'off'
+    pose_motion: str = 'view'
+
+    def __post_init__(self):
+        for name in ('fit_air', 'fit_gain'):
+            value = getattr(self, name)
+            _require(value in VARIES, f'{name} is one of {", ".join(VARIES)}, not {shown(value)}')
+        _require(
+            self.pose_motion in ('view', 'smooth'), f"pose_motion is 'view' or 'smooth', not {shown(self.pose_motion)}"
+        )
+
+    @property
+    def responds(self) -> bool:
+        """Whether a response of the detector is fitted."""
+        return self.fit_air != 'off' or self.fit_gain != 'off'
 
 
 @dataclass(frozen=True)
@@ -232,7 +274,7 @@ class Settings:
     batch              views per step
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
-    start, model, neural, loss, adam, densification, bounds
+    start, model, neural, loss, adam, calibration, densification, bounds
                        the parts, each with its own documentation
 
     Raises InputError for a value out of its range, and for contradictory values.
@@ -248,6 +290,7 @@ class Settings:
     neural: FieldSettings = field(default_factory=FieldSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     adam: AdamSettings = field(default_factory=AdamSettings)
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     densification: DensificationSettings = field(default_factory=DensificationSettings)
     bounds: ScaleBounds = field(default_factory=ScaleBounds)
 
@@ -277,9 +320,14 @@ class Settings:
             or self.loss == LossSettings(lambda_ssim=0.0, lambda_tv=0.0, tv_size=self.loss.tv_size)
             and self.model.effects == 'ignore'
             and self.coarse_share == 0
-            and self.adam.rate_pose == (0, 0),
+            and self.adam.rate_pose == (0, 0)
+            and not self.calibration.responds,
             'render=field fits line integrals on single rays: it needs lambda_ssim=0, lambda_tv=0, effects=ignore, equal '
-            'weights and no loss_scale, coarse_share or rate_pose, as in the method naf',
+            'weights and no loss_scale, coarse_share, rate_pose, fit_air or fit_gain, as in the method naf',
+        )
+        _require(
+            self.volumetric or not self.calibration.responds,
+            'render=alpha composites grey images, which have no air level: leave fit_air and fit_gain off',
         )
         _require(
             not (self.volumetric and self.densification.reset_every),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -29,6 +30,9 @@ from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.scan import Scan
 
+RESPONSE_RENEWED = tuple(
+    k / 10 for k in range(1, 10)
+)  # shares of the iterations, before which the response is found anew
 SHARES_RENEWED = 50  # steps between updates of the shares of two materials
 
 
@@ -40,6 +44,9 @@ class Stepper:
     poses       corrections of the views; None if poses are not fitted
     share       current share of the second of two materials in every Gaussian
     scattered   current result of `ScatteredLight.estimate`
+
+    Where a response of the detector is fitted (`model.response`), `targets` hold what it leaves of the measured views: their line
+    integrals. So a step is the same with and without.
     """
 
     def __init__(self, scan: Scan, settings: Settings):
@@ -48,6 +55,9 @@ class Stepper:
         scan = trusted(scan, settings)
         unit = density_unit(scan, settings)
         self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
+        self.unit, self.measured = unit, None
+        if self.model.response is not None:
+            self.measured = scan
         self.forward = forward_model(settings)
         self.share: Any = None
         self.scattered: np.ndarray | None = None
@@ -57,7 +67,8 @@ class Stepper:
         self.half = scan.geometry.half
         # A fan beam does not determine the direction across its plane: nothing moves or turns out of the plane.
         self.flat = scan.geometry.nVoxel[2] == 1
-        self.poses = Poses(len(scan), self.flat) if max(settings.adam.rate_pose) > 0 else None
+        smooth = settings.calibration.pose_motion == 'smooth'
+        self.poses = Poses(len(scan), self.flat, smooth) if max(settings.adam.rate_pose) > 0 else None
 
     def start(self, initial: InitialCloud, rng: np.random.Generator) -> State:
         """The state at the start of a fit. `rng` is not used."""
@@ -93,6 +104,8 @@ class Stepper:
         lit = self.model.signal is not None and self.model.signal.scattered
         if lit and iteration in {round(x * s.iterations) for x in LIGHT_RENEWED}:
             self.renew_light(state)
+        if self.measured is not None and iteration in {round(x * s.iterations) for x in RESPONSE_RENEWED}:
+            self.renew_response(state)
         for value in state.values.values():
             dr.enable_grad(value)
         gaussians = self.forward.gaussians(state.values)
@@ -130,7 +143,8 @@ class Stepper:
         """The arrays that steps keep besides the state, by name, for a checkpoint."""
         share = {} if self.share is None else dict(share=self.share.numpy())
         scattered = {} if self.scattered is None else dict(scattered=self.scattered)
-        return ({} if self.poses is None else self.poses.arrays()) | share | scattered
+        response = {} if self.model.response is None else self.model.response.arrays()
+        return ({} if self.poses is None else self.poses.arrays()) | share | scattered | response
 
     def restore(self, arrays: dict) -> None:
         """Restore the output of `arrays`."""
@@ -141,6 +155,25 @@ class Stepper:
         if 'scattered' in arrays:
             self.scattered = arrays['scattered']
             self._light_targets()
+        if self.model.response is not None:
+            self.model.response.restore(arrays)
+            self._line_integral_targets()
+
+    def renew_response(self, state: DeviceState) -> None:
+        """Find the response of the detector anew from what the cloud, as it is, would give."""
+        if self.model.response is None or self.measured is None:
+            return
+        expected = self.model.render(state, self.corrected())
+        self.model.response.fit(expected, self.measured.projections, self.measured.valid)
+        self._line_integral_targets()
+
+    def _line_integral_targets(self):
+        """Give all views the line integrals that the response leaves of what was measured."""
+        undone = self.model.response.undone(self.measured.projections, self.geometry)
+        scan = replace(self.measured, projections=undone)
+        for targets, views in ((self.targets, scan), (self.coarse, scan.binned(2))):
+            for target, new in zip(targets, _targets(views, self.unit, self.settings) if targets else ()):
+                target.pixels, target.weights = new.pixels, new.weights
 
     def renew_light(self, state: DeviceState) -> None:
         """Estimate again the light that the cloud scatters into the views."""

@@ -93,7 +93,8 @@ def differentiate(
         return forward.integrals(replace(footprints, values=leaf), rays, share)
 
     image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
-    loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    compared = target.masked(image), target.pixels, view.height, view.width
+    loss = losses.combined(*compared, s.lambda_ssim, s.lambda_gradient, s.lambda_l1)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
     # Bundles share the graph from the pose, so its edges must be kept until the last bundle.

@@ -29,11 +29,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi import notebook
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError, shown
 from lingo_mi.geometry import astra, limits, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
+from lingo_mi.geometry.drawing import drawing
 from lingo_mi.geometry.limits import MOST_COUNT
 from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import Motion, helix, scanner_rays
@@ -97,6 +99,19 @@ class Geometry(ABC):
     offOrigin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """For a notebook: a drawing to scale, and the numbers."""
+
+        def sizes(counts, steps, unit):
+            return f'{" x ".join(map(str, counts))} {unit} of {" x ".join(f"{step:.4g}" for step in steps)} mm'
+
+        numbers = {'views': f'{len(self)}, a {self.mode} beam'}
+        if self.mode == 'cone':
+            numbers['DSO, DSD'] = f'{self.DSO:.6g}, {self.DSD:.6g} mm'
+        numbers['panel (v, u)'] = sizes(self.nDetector, self.dDetector, 'pixels')
+        numbers['volume (x, y, z)'] = sizes(self.nVoxel, self.dVoxel, 'voxels')
+        return notebook.box(type(self).__name__, drawing(self), notebook.table(numbers))
 
     # ---- constructors --------------------------------------------------------------------------------------
 
@@ -348,6 +363,23 @@ class Geometry(ABC):
     def with_volume(self, nVoxel: ArrayLike, dVoxel: ArrayLike) -> Geometry:
         """The same scan with another voxel grid, (x, y, z), about the same centre."""
         return replace(self, nVoxel=nVoxel, dVoxel=dVoxel)
+
+    def slab(self, begin: int, end: int) -> Geometry:
+        """The same scan with the slices begin <= z < end of the voxel grid alone, where they lie.
+
+        Raises InputError where there are no such slices.
+
+            geometry.slab(0, 32).nVoxel   # (512, 512, 32)
+        """
+        (nx, ny, nz), (x, y, z) = self.nVoxel, self.offOrigin
+        if not 0 <= begin < end <= nz:
+            raise InputError(f'the volume has the slices 0 to {nz}, so none from {begin} to {end}')
+        middle = z + ((begin + end) / 2 - nz / 2) * self.dVoxel[2]
+        return replace(self, nVoxel=(nx, ny, end - begin), offOrigin=(x, y, middle))
+
+    def slabs(self, thickness: int) -> list[tuple[int, int]]:
+        """(begin, end) of slabs of so many slices along z, from the first; the last may be thinner."""
+        return [(z, min(z + thickness, self.nVoxel[2])) for z in range(0, self.nVoxel[2], thickness)]
 
     @property
     def sDetector(self) -> tuple[float, float]:

@@ -16,6 +16,7 @@ COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
 VIEWS = 40  # of the plane: the time goes with its square
 CLEAR = 0.01  # a disagreement that is more than discretisation
 UNSTEADY = 0.5  # pixels of jitter that blur a volume
+UNEQUAL_AIR = 0.01  # relative to the highest line integral
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
 
 
@@ -90,6 +91,7 @@ def _air_and_truncation(found, p, valid, top):
             found.advice.append(
                 f'air is {found.air:.3g} instead of 0: import again with --air, or subtract it from the projections'
             )
+        _air_of_views(found, p, valid, edge, low, top)
     limit = (0.0 if np.isnan(found.air) else found.air) + 0.1 * top
     cut = {}
     for name, part in (('left or right', np.s_[:, :, [0, -1]]), ('upper or lower', np.s_[:, [0, -1], :])):
@@ -103,6 +105,24 @@ def _air_and_truncation(found, p, valid, top):
             found.advice.append(
                 f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object'
             )
+
+
+def _air_of_views(found, p, valid, edge, low, top):
+    """How much the air level of the views differs."""
+    near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2)
+    near = np.where(np.concatenate([valid[:, :, :edge], valid[:, :, -edge:]], 2), near, np.inf).reshape(len(p), -1)
+    levels = [
+        np.median(view[view < low + 0.1 * (top - low)]) for view in near if (view < low + 0.1 * (top - low)).sum() > 8
+    ]
+    if len(levels) < len(p) / 2:
+        return
+    spread = float(np.std(levels))
+    found.facts.append(f'air of the views: differs by {spread:.2g} rms')
+    if spread > UNEQUAL_AIR * top:
+        found.advice.append(
+            f'the air level of the views differs by {spread:.2g} rms: import again with --air, which scales every view by its '
+            'own air, or fit with -D fit_air=view'
+        )
 
 
 def _views(found, p, valid):
@@ -151,7 +171,7 @@ def _jitter(found, scan, air):
     if any(x > UNSTEADY for x, _ in known):
         found.advice.append(
             'the object or the panel moves from view to view: fit with -D rate_pose=2e-3,2e-4, and keep it if the held-out views '
-            'get better'
+            'get better; of a slow drift lingo-mi calibrate --drift 3 tells the course'
         )
 
 
@@ -202,7 +222,9 @@ def _angles(found, scan, air):
                 return
     plane = _plane(scan, air)
     if isinstance(plane, str):
-        found.facts.append(f'consistency of the views: not measured, as {plane}')
+        found.facts.append(
+            f'consistency of the views: not measured, as {plane}; lingo-mi calibrate finds an axis off centre all the same'
+        )
         return
     index = np.array([i for i in range(n) if i not in found.suspects])
     index = index[:: max(1, -(-len(index) // VIEWS))]
@@ -234,7 +256,9 @@ def _angles(found, scan, air):
         found.facts.append(
             f'axis: {shift:+.3g} mm on the panel ({shift / pixel:+.2g} pixels) lets them agree to {best:.2%}'
         )
-        found.advice.append(f'the axis is off: add {shift:+.3g} mm to the second number of offDetector')
+        found.advice.append(
+            f'the axis is off: add {shift:+.3g} mm to the second number of offDetector, or run lingo-mi calibrate'
+        )
 
 
 def _named(views):

@@ -18,6 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
+from lingo_mi import notebook
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
@@ -49,6 +50,10 @@ class Phantom:
     analytic: Analytic | None = field(default=None, repr=False)
 
     __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        """For a notebook: slices, each with a slider."""
+        return notebook.box(repr(self), notebook.slices(self.data, self.spacing, unit=''))
 
     @property
     def origin(self) -> tuple[float, float, float]:

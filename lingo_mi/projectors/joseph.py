@@ -193,9 +193,9 @@ def _column(columns, index, active=True):
 
 
 def _span(a, b, n):
-    """First and last index m >= 0 at which a + b m may be in [-1/2, n - 1/2], as floats; one too many is harmless."""
+    """First and last index m >= 0 at which a + b m may be in [-1/2, n - 1/2], as floats; too many are harmless."""
     inv = dr.rcp(dr.select(dr.abs(b) < 1e-12, 1e-12, b))
-    p, q = (-0.5 - a) * inv, (n - 0.5 - a) * inv
+    p, q = (-0.51 - a) * inv, (n - 0.49 - a) * inv  # a little more: a ray may run along a face
     return dr.minimum(p, q), dr.maximum(p, q)
 
 

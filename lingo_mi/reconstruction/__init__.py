@@ -11,6 +11,7 @@ A Mitsuba variant must be active.
 
 from lingo_mi.reconstruction.algorithm import Algorithm, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
+from lingo_mi.reconstruction.best import Best
 from lingo_mi.reconstruction.cgls import CGLS
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.refined import Refined
@@ -18,7 +19,7 @@ from lingo_mi.reconstruction.run import check_scan, progress_bar, reconstruct
 from lingo_mi.reconstruction.sart import OSSART, SART, SIRT
 
 ALGORITHMS: dict[str, type[Algorithm]] = {
-    algorithm.name: algorithm for algorithm in (FDK, SART, OSSART, SIRT, CGLS, ASDPOCS, Refined)
+    algorithm.name: algorithm for algorithm in (FDK, SART, OSSART, SIRT, CGLS, ASDPOCS, Refined, Best)
 }
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     'SART',
     'SIRT',
     'Algorithm',
+    'Best',
     'Reconstruction',
     'Refined',
     'check_scan',

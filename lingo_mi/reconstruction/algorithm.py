@@ -12,9 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi import notebook
 from lingo_mi.arrays import as_numpy, short_repr
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path, writing
+from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import compared
@@ -45,6 +47,13 @@ class Reconstruction:
 
     __repr__ = short_repr
 
+    def _repr_html_(self) -> str:
+        """For a notebook: slices, each with a slider."""
+        geometry = self.geometry
+        return notebook.box(
+            f'Reconstruction, {self.seconds:.1f} s', notebook.slices(self.volume, geometry.dVoxel, geometry.offOrigin)
+        )
+
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.volume, dtype) if copy else np.asarray(self.volume, dtype)
 
@@ -59,9 +68,9 @@ class Reconstruction:
         return compared(self.volume, as_numpy(truth, 'the true volume'))
 
     def save(self, path: str | PathLike, *, force: bool = False) -> Path:
-        """Write the volume as NIfTI, densities per mm, with voxel size and position in mm; returns the path.
+        """Write the volume, densities per mm, with voxel size and position in mm; returns the path.
 
-        path    .nii or .nii.gz; its folder is made
+        path    .nii, .nii.gz, or a new .ome.zarr; its folder is made
         force   replace an earlier file
 
         Raises InputError for another suffix, a file that is there already, or one that cannot be written.
@@ -71,7 +80,10 @@ class Reconstruction:
             if path.exists() and not force:
                 raise InputError(f'{path}: exists already; give force=True to replace it')
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+            if path.name.endswith(ZARR):
+                write_slabs(path, geometry, (self.volume[:, :, a:b] for a, b in geometry.slabs(THICKNESS)))
+            else:
+                write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
         return path
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -153,8 +153,12 @@ class ASDPOCS(Algorithm):
         progress: Progress | None = None,
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
+        watch: Callable[[int, mi.Float], bool] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. `weights` and `blur` of P are as in `OSSART.run`."""
+        """Reconstruct the volume of a scan, see `Algorithm.run`. `weights` and `blur` of P are as in `OSSART.run`.
+
+        watch   called after every pass as watch(passes done, volume on the device, mi.Float [voxels]); True stops
+        """
         began = time.perf_counter()
         order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
         system = System(scan, weights, blur)
@@ -183,6 +187,8 @@ class ASDPOCS(Algorithm):
                 progress(k + 1, self.niter, residuals[-1])
             cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
             if (cosine < -0.99 and error <= maxl2err) or lmbda < LMBDA_MIN:
+                break
+            if watch is not None and watch(k + 1, x):
                 break
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
 

@@ -12,7 +12,7 @@ where the view weights dbeta sum to pi (`view_weights`). A parallel beam has w =
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -236,28 +236,70 @@ class FDK(Algorithm):
                 'filtered backprojection starts from no volume: leave out start, or take another algorithm'
             )
         began = time.perf_counter()
-        level = rectified(scan, NAME)
-        rays = ray_weights(require_circle(level, NAME))[:, None].astype(np.float32)
-        level = extended(Scan(level.geometry, level.projections * rays))
-        geometry = require_circle(level, NAME)
-        volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
-        dr.make_opaque(volume)
-        matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
-        n = len(geometry)
+        projections, geometry = _weighted(scan)
+
+        def images(first):
+            return filtered(projections[first : first + BATCH], geometry, self.filter).transpose(0, 2, 1)
+
+        volume = _backprojected(geometry, images, progress)
+        return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
+
+    def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
+        """The volume of `run` in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
+
+        progress   called as progress(views done in all slabs, views of all slabs, None)
+
+        Takes memory for three sets of projections and for three slabs, however large the volume. Raises InputError as `run`.
+
+            for slab in FDK().slabs(scan, 64):
+                ...
+        """
+        projections, geometry = _weighted(scan)
+        n, parts = len(geometry), geometry.slabs(thickness)
+        found = np.empty((n, *geometry.nDetector[::-1]), np.float32)  # filtered once, for all slabs
         for first in range(0, n, BATCH):
-            images = filtered(level.projections[first : first + BATCH], geometry, self.filter).transpose(0, 2, 1)
-            views = []
-            for i in range(first, first + BATCH):  # the last batch is filled with views of weight zero
-                weight, i = (weights[i], i) if i < n else (0.0, first)
-                views.append(
-                    (
-                        mi.Float(np.ascontiguousarray(images[i - first]).ravel()),
-                        [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
-                        dr.opaque(mi.Float, float(weight)),
-                    )
+            some = filtered(projections[first : first + BATCH], geometry, self.filter)
+            found[first : first + BATCH] = some.transpose(0, 2, 1)
+        del projections
+        for k, part in enumerate(parts):
+
+            def report(done, *_):
+                if progress:
+                    progress(k * n + done, len(parts) * n, None)
+
+            slab: CircularGeometry = geometry.slab(*part)  # type: ignore[assignment] - of the same class
+            yield _backprojected(slab, lambda first: found[first : first + BATCH], report)
+
+
+def _weighted(scan: Scan) -> tuple[np.ndarray, CircularGeometry]:
+    """Projections on an upright panel, rays weighted by how often they were measured; and their geometry."""
+    level = rectified(scan, NAME)
+    rays = ray_weights(require_circle(level, NAME))[:, None].astype(np.float32)
+    level = extended(Scan(level.geometry, level.projections * rays))
+    return level.projections, require_circle(level, NAME)
+
+
+def _backprojected(
+    geometry: CircularGeometry, images: Callable[[int], np.ndarray], progress: Progress | None
+) -> np.ndarray:
+    """The volume [x, y, z] of filtered projections. images: gives those of a batch, [view, u, v], by its first view."""
+    volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    dr.make_opaque(volume)
+    matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
+    n = len(geometry)
+    for first in range(0, n, BATCH):
+        batch, views = images(first), []
+        for i in range(first, first + BATCH):  # the last batch is filled with views of weight zero
+            weight, i = (weights[i], i) if i < n else (0.0, first)
+            views.append(
+                (
+                    mi.Float(np.ascontiguousarray(batch[i - first]).ravel()),
+                    [[dr.opaque(mi.Float, float(x)) for x in row] for row in matrices[i]],
+                    dr.opaque(mi.Float, float(weight)),
                 )
-            volume = _add_views(volume, views, geometry)
-            dr.eval(volume)
-            if progress:
-                progress(min(first + BATCH, n), n, None)
-        return Reconstruction(volume.numpy().reshape(geometry.nVoxel), [], time.perf_counter() - began, scan.geometry)
+            )
+        volume = _add_views(volume, views, geometry)
+        dr.eval(volume)
+        if progress:
+            progress(min(first + BATCH, n), n, None)
+    return volume.numpy().reshape(geometry.nVoxel)

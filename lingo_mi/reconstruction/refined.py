@@ -81,7 +81,7 @@ class Refined(Algorithm):
     def __post_init__(self):
         check_counts(least=0, completed_niter=self.completed_niter)
         check_counts(finer=self.finer)
-        self._on_measured()  # checks the other options
+        self.on_measured()  # checks the other options
 
     def steps(self, scan: Scan) -> int:
         return self.completed_niter + self.niter
@@ -128,7 +128,7 @@ class Refined(Algorithm):
             volume = _on_completed(
                 completed, self.completed_niter, volume, blur, self.seed, _continued(progress, 0, steps)
             )
-        found = self._on_measured().run(
+        found = self.on_measured().run(
             scan,
             start=volume,
             progress=_continued(progress, self.completed_niter, steps),
@@ -139,7 +139,8 @@ class Refined(Algorithm):
         means = found.volume.reshape(parts).mean((1, 3, 5))
         return Reconstruction(means, found.residuals, time.perf_counter() - began, geometry)
 
-    def _on_measured(self) -> ASDPOCS:
+    def on_measured(self) -> ASDPOCS:
+        """The algorithm of the passes over the measured views."""
         return ASDPOCS(
             niter=self.niter,
             tviter=self.tviter,

@@ -1,7 +1,7 @@
 """Figures of a reconstruction, drawn with matplotlib's objects (no pyplot, no display, no global state).
 
 A section is a function draw(figure, data) with a height for a given width. `sections` lists those for which a
-`lingo_mi.report.page.ReportData` has content, and `overview` puts them on one sheet.
+`lingo_mi.report.data.ReportData` has content, and `overview` puts them on one sheet.
 
 Orientation of slices: x to the right and y up (axial), x to the right and z up (coronal), y to the right and z up
 (sagittal). Orientation of views: u to the right, v down.
@@ -10,12 +10,13 @@ Orientation of slices: x to the right and y up (axial), x to the right and z up 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+
+from lingo_mi.report.planes import grey_range, plane, plane_extent, planes, richest, series
 
 PLANES = {2: ('Axial', 'x', 'y', 'z'), 1: ('Coronal', 'x', 'z', 'y'), 0: ('Sagittal', 'y', 'z', 'x')}
 DIFFERENCE = 'RdBu_r'
@@ -34,124 +35,31 @@ STYLE: dict = {
 }
 
 
-# ---- What is drawn: pure functions ---------------------------------------------------------------
-
-
-def plane(volume: np.ndarray, axis: int, index: int) -> np.ndarray:
-    """The slice of a volume [x, y, z] across `axis` as an image [vertical, horizontal], lowest row first.
-
-    With imshow(origin='lower') x points right and y up in the axial slice (axis 2), x right and z up in the
-    coronal one (axis 1), y right and z up in the sagittal one (axis 0).
-    """
-    return np.take(volume, index, axis).T
-
-
-def plane_extent(
-    shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike, axis: int
-) -> tuple[float, float, float, float]:
-    """(left, right, bottom, top) of a slice across `axis`, in mm: the outer edges of its voxels."""
-    low, high = bounds(shape, spacing, centre)
-    a, b = (i for i in range(3) if i != axis)
-    return low[a], high[a], low[b], high[b]
-
-
-def bounds(shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike) -> Any:
-    """The corners (low, high) of a volume, each [3], mm."""
-    half, middle = np.array(shape) * np.asarray(spacing) / 2, np.asarray(centre)
-    return middle - half, middle + half
-
-
-def richest(volume: np.ndarray, axis: int) -> int:
-    """The index along `axis` of the slice with the largest energy (sum of squares); the middle of a plateau."""
-    energy = np.array([np.square(s, dtype=np.float64).sum() for s in np.moveaxis(volume, axis, 0)])
-    best = np.flatnonzero(energy >= 0.999 * energy.max())
-    return int(best[len(best) // 2])
-
-
-def planes(shape: Sequence[int]) -> list[int]:
-    """The axes across which slices are images, not lines. For a single-slice volume, only its thin axis."""
-    return [axis for axis in (2, 1, 0) if min(n for i, n in enumerate(shape) if i != axis) > 1] or [2]
-
-
-def series(history: list[dict], x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a curve: the entries of `history` with finite numbers for both quantities."""
-    points = [(float(h[x]), float(h[y])) for h in history if h.get(x) is not None and h.get(y) is not None]
-    points = np.array(points, float).reshape(-1, 2)
-    points = points[np.isfinite(points).all(1)]
-    return points[:, 0], points[:, 1]
-
-
-def grey_range(*arrays: Any) -> tuple[float, float]:
-    """A common grey scale: from 0 (or lower) to the 99.9th percentile, both of the last array."""
-    reference = arrays[-1]
-    low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))
-    return low, high if high > low else max(low + 1e-6, *(float(a.max()) for a in arrays))
-
-
 # ---- Sections ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Section:
-    """One block of the report: its name, how to draw it, its height for a width (inches), and a caption."""
+    """One block of the picture: its name, how to draw it, and its height for a width (inches)."""
 
     name: str
     draw: Callable
     height: Callable[[float], float]
-    caption: str
-    wide: bool = False  # takes a whole row of the overview
+    wide: bool = False  # takes a whole row
 
 
 def sections(data: Any) -> list[Section]:
     """The sections for which `data` has content, top to bottom."""
     out = []
     single = len(planes(data.shape)) == 1
-    compared = data.truth is not None
-    caption = 'The slice of the fan beam' if single else 'Slices through the object at its richest, z up'
-    caption += ', in mm. Grey is density in 1/mm, white is dense. '
-    if compared:
-        caption += (
-            'Reconstruction and truth share one grey scale; the difference is reconstruction minus '
-            'truth: red is too dense, blue too thin.'
-        )
-    else:
-        caption += 'This scan has no known true volume to compare with.'
     if data.volume is not None:
-        out.append(Section('Slices', draw_slices, lambda width: _slices_height(data, width), caption, single))
+        out.append(Section('Slices', draw_slices, lambda width: _slices_height(data, width), single))
     if data.views is not None:
-        thin = data.views.shape[1] == 1
-        caption = (
-            'Views the fit has never seen, as line integrals ln(I0/I), over the detector in mm from '
-            'its centre' + (': one line a view. ' if thin else ', v down as on the panel. ')
-        )
-        if data.views_truth is not None:
-            caption += (
-                'The dashed line is the measurement, the lower panel the difference.'
-                if thin
-                else 'Below each rendered view its measurement and the difference, rendered minus it.'
-            )
-        out.append(Section('Held-out views', draw_views, lambda width: _views_height(data, width), caption, single))
+        out.append(Section('Held-out views', draw_views, lambda width: _views_height(data, width), single))
     if data.cloud_centres is not None and len(data.cloud_centres):
-        caption = (
-            f'Centres of the Gaussians seen along an axis, in mm, coloured by {data.cloud_unit}; the largest are drawn '
-            'last. The box is the volume.'
-        )
-        if data.volume is None:
-            caption += (
-                ' Opacities and radiances are no attenuation: this cloud makes no volume, and no scene renders it.'
-            )
-        out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width), caption))
+        out.append(Section('Gaussians', draw_cloud, lambda width: _cloud_height(data, width)))
     if any(len(series(data.history, 'iteration', y)[0]) for y in ('loss', 'psnr_2d', 'psnr_3d', 'gaussians')):
-        grows = len(series(data.history, 'iteration', 'gaussians')[0]) > 0
-        out.append(
-            Section(
-                'Convergence',
-                draw_curves,
-                lambda width: 5.2,
-                f'Loss{", quality and number of Gaussians" if grows else " and quality"} against iterations (left) and against '
-                'wall-clock seconds (right). PSNR in dB, more is better.',
-            )
-        )
+        out.append(Section('Convergence', draw_curves, lambda width: 5.2))
     return out
 
 
@@ -366,15 +274,6 @@ def draw_curves(fig: Any, data: Any) -> None:
 # ---- Sheets --------------------------------------------------------------------------------------
 
 
-def sheet(data: Any, section: Section, width: float = 10.0, dpi: int = 130) -> bytes:
-    """One section as a PNG, `width` inches wide."""
-
-    def draw(fig):
-        section.draw(fig, data)
-
-    return _png(draw, width, section.height(width), dpi)
-
-
 def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> bytes:
     """All sections as one PNG, two beside each other, under the title and the line `headline`."""
     rows: list[list[Section]] = []
@@ -383,7 +282,8 @@ def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> b
             rows[-1].append(section)
         else:
             rows.append([section])
-    heights = [[s.height(width / len(row)) + 0.4 for s in row] for row in rows]
+    shares = [_shares(row, width) for row in rows]
+    heights = [[s.height(width * share) + 0.4 for s, share in zip(*pair)] for pair in zip(rows, shares)]
     tallest = [max(h) for h in heights]
 
     def draw(fig):
@@ -391,14 +291,30 @@ def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> b
         shown = dict(ha='center', va='center', parse_math=False)  # a name may have dollars
         parts[0].text(0.5, 0.66, data.title, fontsize=20, weight='bold', **shown)
         parts[0].text(0.5, 0.2, headline, fontsize=13, color='#333333', **shown)
-        for part, row, own, height in zip(parts[1:], rows, heights, tallest):
-            for sub, section, h in zip(np.ravel(part.subfigures(1, len(row), wspace=0.03)), row, own):
+        for part, row, share, own, height in zip(parts[1:], rows, shares, heights, tallest):
+            for sub, section, h in zip(
+                np.ravel(part.subfigures(1, len(row), wspace=0.03, width_ratios=share)), row, own
+            ):
                 if h < 0.9 * height:  # align a lower section with the top of its neighbour
                     sub = sub.subfigures(2, 1, height_ratios=[h, height - h])[0]
                 sub.suptitle(section.name, fontsize=13, weight='bold')
                 section.draw(sub, data)
 
     return _png(draw, width, sum(tallest) + 1, dpi)
+
+
+def _shares(row: list[Section], width: float) -> list[float]:
+    """The parts of the width that sections beside each other take, so that they are of one height, as far as that can be."""
+    if len(row) == 1:
+        return [1.0]
+    low, high = 0.36, 0.64
+    for _ in range(12):
+        middle = (low + high) / 2
+        if row[0].height(width * middle) < row[1].height(width * (1 - middle)):
+            low = middle
+        else:
+            high = middle
+    return [low, 1 - low]
 
 
 def _png(draw, width, height, dpi):

@@ -22,7 +22,7 @@ def quick_measure(dataset: Dataset, most: int = 4) -> Callable[..., dict]:
     def measure(model, state):
         out = {}
         if test is not None and len(test):
-            rendered = comparable(model.render(state, test.geometry), test)
+            rendered = comparable(model.expected(state, test.geometry), test)
             out['psnr_2d'] = _number(metrics.psnr_2d(rendered, test.projections))
         if dataset.volume is not None and (volume := model.volume(state)) is not None:
             out['psnr_3d'] = _number(metrics.psnr_3d(volume, dataset.volume))
@@ -57,7 +57,7 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
     truth   the true density in 1/mm, [x, y, z], on the grid of the fit's geometry
     """
     test = test if test is not None and len(test) else None
-    volume, views = fitted.volume(), None if test is None else fitted.render(test.geometry)
+    volume, views = fitted.volume(), None if test is None else fitted.expected(test.geometry)
     expected = None if test is None else test.projections
     rendered = None if test is None or views is None else comparable(views, test)
 

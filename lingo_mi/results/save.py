@@ -34,13 +34,21 @@ from lingo_mi.output_folder import (
     remove_others,
     view_name,
 )
-from lingo_mi.report.page import ReportData, write_report
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.page import write_report
 from lingo_mi.results.measure import Measured
 from lingo_mi.results.scene_file import write_scene
 
 
 def save(
-    folder: Path, fitted: Fitted, measured: Measured, *, title: str = 'fit', method: str = '', command: str = ''
+    folder: Path,
+    fitted: Fitted,
+    measured: Measured,
+    *,
+    title: str = 'fit',
+    method: str = '',
+    command: str = '',
+    request: dict | None = None,
 ) -> dict:
     """Write all files into `folder` and return the metrics: `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`,
     `report.png`, `report.html`, `metrics.json`. Files of an earlier result are replaced or removed, others are left alone.
@@ -52,6 +60,7 @@ def save(
     title      of the report
     method     the recipe's name, for metrics.json and the report
     command    the command line that reproduces the result, for the same
+    request    what was asked for, if metrics.json is to say so
 
     For alpha compositing there is no volume, and no scene, because no integrator renders it. For a neural field there is no
     cloud: the scene is of its volume, and the field itself is in the checkpoint.
@@ -84,6 +93,7 @@ def save(
         angles=np.degrees(geometry.angles).tolist(),
         test_angles=[] if measured.test is None else np.degrees(measured.test.geometry.angles).tolist(),
         versions=versions(),
+        **({} if request is None else dict(request=request)),
     )
     try:
         write_report(folder, report_data(fitted, replace(measured, numbers=numbers), title))
@@ -114,8 +124,8 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
         angles = np.degrees(test.geometry.angles)
         more = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
     if fitted.settings.cloud:
-        centres, _, _, density = fitted.world_gaussians()
-        more |= dict(cloud_centres=centres, cloud_density=density)
+        centres, scales, quaternions, density = fitted.world_gaussians()
+        more |= dict(cloud_centres=centres, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions)
     return ReportData(
         title=title,
         metrics=measured.numbers if fitted.settings.cloud else _without_gaussians(measured.numbers),
@@ -125,6 +135,7 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
         spacing=geometry.dVoxel,
         centre=geometry.offOrigin,
         pixel=geometry.dDetector,
+        scanner=fitted.corrected,
         cloud_unit='opacity' if measured.volume is None else 'density at the centre [1/mm]',
         command=measured.numbers.get('command', ''),
         **more,
@@ -147,11 +158,13 @@ def _without_gaussians(numbers: dict) -> dict:
 
 
 def _corrections(fitted: Fitted) -> dict:
-    """Corrections of the views' poses, if the fit has any: rotation vectors and shifts about the volume's centre."""
-    poses = fitted.poses
+    """What the fit has found of the measurement's errors: the response (levels, per cent), and corrections of the views' poses,
+    rotation vectors and shifts about the volume's centre."""
+    poses, response = fitted.poses, fitted.model.response
+    found = {} if response is None else dict(response=response.report())
     if poses is None:
-        return {}
-    return dict(
+        return found
+    return found | dict(
         pose_turns_degrees=np.degrees(poses.turn).tolist(),
         pose_shifts_mm=(poses.shift / fitted.geometry.scale).tolist(),
     )

@@ -126,8 +126,9 @@ def recipe(fit: Fit, scale: Scale) -> Settings:
 class Cells:
     """The cells of one scale and seed below a folder."""
 
-    def __init__(self, folder: Path, scale: Scale, seed: int = 0):
-        self.folder, self.scale, self.seed = Path(folder), scale, seed
+    def __init__(self, folder: Path, scale: Scale, seed: int = 0, command: str | None = None):
+        """command: to be kept with the cells; None: this process's."""
+        self.folder, self.scale, self.seed, self.command = Path(folder), scale, seed, command
         self.dataset = functools.lru_cache(1)(self._dataset)
         self._cloud = functools.lru_cache(1)(self._cloud)
         self._completed = functools.lru_cache(1)(self._completed)
@@ -142,12 +143,18 @@ class Cells:
         if isinstance(cell, Volume):
             options = dict(algorithm=ALGORITHMS[cell.algorithm].options, completed=COMPLETED)
             if fit.method == 'none':
-                return where / 'none' / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
+                return self.folder_of(fit) / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
         settings = recipe(fit, self.scale).flat()
         del settings['checkpoint_seconds']
         iterations = settings.pop('iterations')
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
+
+    def folder_of(self, fit: Fit) -> Path:
+        """Where all fits of a recipe to an object's views are stored, and the volumes made of them."""
+        if fit.method == 'none':
+            return self.folder / fit.object / f'{fit.views}_views' / 'none'
+        return self.path(fit).parents[1]
 
     def get(self, cell: Fit | Volume) -> dict | None:
         """The numbers of a cell, or None where it has not been computed, or its file is damaged or lacks a number."""
@@ -159,15 +166,17 @@ class Cells:
         found = metrics.current_names(found) if isinstance(found, dict) else {}
         return found if found.keys() >= set(needed) else None
 
-    def compute(self, cell: Fit | Volume, label: str) -> dict:
+    def compute(self, cell: Fit | Volume, label: str, report: Callable[..., None] | None = None) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
+
+        report   called between the steps of a fit, with their number, beside the bar
 
         Raises InputError where it cannot be computed, and KeyboardInterrupt, after which a fit goes on where it was.
         """
         path = self.path(cell)
         path.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(cell, Fit):
-            fit, found = cell, self._fit(cell, path, label)
+            fit, found = cell, self._fit(cell, path, label, report)
         else:
             fit, found = cell.fit, self._volume(cell, path, label)
         found |= dict(
@@ -176,7 +185,7 @@ class Cells:
             seed=self.seed,
             scale=asdict(self.scale),
             variant=mi.variant(),
-            provenance=provenance(),
+            provenance=provenance(self.command),
         )
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
@@ -213,7 +222,7 @@ class Cells:
     def _measured(self, fit: Fit) -> Dataset:
         return choose_views(self.dataset(fit.object), fit.views)
 
-    def _fit(self, cell: Fit, path: Path, label: str) -> dict:
+    def _fit(self, cell: Fit, path: Path, label: str, report: Callable[..., None] | None = None) -> dict:
         dataset, settings, saved = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
         if (path.exists() or saved.exists()) and _iterations(saved) is None:
             print(f'{saved}: is missing or damaged, so {cell} is fitted again', file=sys.stderr)
@@ -224,6 +233,8 @@ class Cells:
             def progress(iteration, **fields):
                 bar.update(iteration, **fields)
                 check()
+                if report is not None:
+                    report(iteration)
 
             fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
         found = measure(fitted, dataset.test, dataset.volume).numbers

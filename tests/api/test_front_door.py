@@ -168,7 +168,7 @@ def test_result(result, data):
     assert all(value is None or isinstance(value, int | float) for value in numbers.values())
     assert numbers['psnr_3d'] > 10 and numbers['gaussians'] == len(result)
     assert 'Gaussians' in repr(result) and result.seconds > 0
-    assert result._repr_html_().startswith('<img ')
+    assert result._repr_html_().count('<input type="range"') == 5  # three planes, rendered and measured views
 
 
 @pytest.mark.parametrize(

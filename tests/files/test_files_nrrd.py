@@ -115,3 +115,27 @@ def test_what_the_header_leaves_out(tmp_path):
     np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd'))[1], np.eye(4))
     changes = {'space': 'LPS', 'space directions': '(2,0,0) (0,3,0) (0,0,4)', 'kinds': 'none domain ???'}
     np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))[1], np.diag([2, 3, 4, 1]))
+
+
+# https://teem.sourceforge.net/nrrd/format.html#type
+NAMES_OF_TYPES = {
+    'i1': ['signed char', 'int8', 'int8_t'],
+    'u1': ['uchar', 'unsigned char', 'uint8', 'uint8_t'],
+    'i2': ['short', 'short int', 'signed short', 'signed short int', 'int16', 'int16_t'],
+    'u2': ['ushort', 'unsigned short', 'unsigned short int', 'uint16', 'uint16_t'],
+    'i4': ['int', 'signed int', 'int32', 'int32_t'],
+    'u4': ['uint', 'unsigned int', 'uint32', 'uint32_t'],
+    'i8': ['longlong', 'long long', 'long long int', 'signed long long', 'signed long long int', 'int64', 'int64_t'],
+    'u8': ['ulonglong', 'unsigned long long', 'unsigned long long int', 'uint64', 'uint64_t'],
+    'f4': ['float'],
+    'f8': ['double'],
+}
+
+
+@pytest.mark.parametrize('dtype', NAMES_OF_TYPES)
+def test_types(tmp_path, dtype):
+    body = VALUES.astype(dtype).tobytes('F')
+    for name in NAMES_OF_TYPES[dtype]:
+        data, _ = nrrd.read(written(tmp_path / 'v.nrrd', body, {'type': name, 'endian': 'little'}))
+        assert data.dtype == dtype, name
+        np.testing.assert_array_equal(data, VALUES)

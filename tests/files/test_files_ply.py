@@ -116,6 +116,35 @@ def test_properties_of_other_types_and_order(tmp_path):
     )
 
 
+TYPES = {  # as the format has them, and as other programs write them
+    'i1': ('char', 'int8'),
+    'u1': ('uchar', 'uint8'),
+    '<i2': ('short', 'int16'),
+    '<u2': ('ushort', 'uint16'),
+    '<i4': ('int', 'int32'),
+    '<u4': ('uint', 'uint32'),
+    '<f4': ('float', 'float32'),
+    '<f8': ('double', 'float64'),
+}
+
+
+@pytest.mark.parametrize('dtype', TYPES)
+def test_types(tmp_path, dtype):
+    path, names = tmp_path / 'a.ply', ('x', 'y', 'z', 'density', *(f'scale_{i}' for i in range(3)))
+    for kind in TYPES[dtype]:
+        header = 'ply\nformat binary_little_endian 1.0\nelement vertex 1\n'
+        header += ''.join(f'property {kind} {n}\n' for n in names)
+        header += ''.join(f'property float rot_{i}\n' for i in range(4)) + 'end_header\n'
+        body = np.array([10, 20, 100, 5, 0, 1, 2], dtype).tobytes() + np.array([1, 0, 0, 0], '<f4').tobytes()
+        path.write_bytes(header.encode() + body)
+        require_elements(path)
+        centres, scales, _, density = read_ply(path)
+        np.testing.assert_allclose([*centres[0], density[0], *scales[0]], [10, 20, 100, 5, *np.exp([0, 1, 2])])
+        path.write_bytes(header.encode() + body[:-1])
+        with pytest.raises(InputError, match='announces more'):
+            require_elements(path)
+
+
 def test_values_in_the_file_are_checked(tmp_path):
     path = tmp_path / 'a.ply'
     write_ply(path, *cloud())

@@ -13,6 +13,7 @@ from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.geometry import astra, matrices, rtk
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix, rotation
 from lingo_mi.scan import Dataset, Scan
 
@@ -116,6 +117,18 @@ def test_matrices_by_hand():
     for sign in (1, -1):
         same_poses(matrices.from_matrices([sign * P], SHAPE, STEP, False), circle.rays())
     np.testing.assert_allclose(matrices.to_matrices(circle.rays())[0] * 450, P, atol=1e-9)
+
+
+@pytest.mark.parametrize('step', [0.01, 1.0, 100.0])
+def test_a_matrix_is_parallel_to_rounding(step):
+    """Its last row, by the other rows' largest entry: one per pixel's size."""
+    g = CircularGeometry(DSO=0.0, DSD=0.0, nDetector=SHAPE, dDetector=step, **GRID, angles=[0.0], mode='parallel')
+    P = matrices.to_matrices(g.rays())
+    P[0, 2, 0] = 0.5e-9 / step
+    same_poses(matrices.from_matrices(P, SHAPE, (step, step), True), g.rays(), 1e-7 * step)
+    P[0, 2, 0] = 2e-9 / step
+    with pytest.raises(InputError, match='no parallel beam'):
+        matrices.from_matrices(P, SHAPE, (step, step), True)
 
 
 # Written by RTK 2.7: AddProjection(1000, 1500, gantry, 4, -7, 5, 8, 2, 3) for 30 and 70 degrees, and a parallel beam. Its
@@ -404,10 +417,14 @@ def test_bad_matrices(tmp_path):
 def test_what_rtk_cannot_say(tmp_path):
     f, path = scan_of().rays(), tmp_path / 'g.xml'
     tilted = scan_of('parallel', rotDetector=(0.1, 0.0, 0.0)).rays()
+    # A source in the panel: the distance of 0 would say that the beam is parallel.
+    corner = np.array([[0.0, -SHAPE[1] / 2, SHAPE[0] / 2]])
+    within = Rays(np.zeros((1, 3)), corner, np.array([[0.0, 1, 0]]), np.array([[0.0, 0, -1]]), False)
     for bad, match in (
         (replace(f, u=f.u + 0.1 * f.v), 'right angles'),
         (replace(f, u=f.u * [[1], [1], [1.1]]), 'one pixel size'),
         (replace(f, u=-f.u), 'mirrored'),
+        (within, 'mirrored'),
         (tilted, 'askew'),
     ):
         with pytest.raises(InputError, match=match):

@@ -118,7 +118,7 @@ def test_writes_what_its_reader_looks_up(tmp_path):
         'totalAngle',
         'startAngle',
     } <= meta['scanner'].keys()
-    assert meta['scanner']['offDetector'] == [-5, 4]
+    assert meta['scanner']['offDetector'] == [-5, 4] and meta['scanner']['noise'] is False
     assert meta['bbox'] == [[-1.5, -8, -7.5], [3.5, 4, 13.5]]
 
 

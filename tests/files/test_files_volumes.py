@@ -148,6 +148,17 @@ def test_nifti_header_and_place(tmp_path):
     np.testing.assert_allclose(image.affine @ [1.5, 2, 2.5, 1], [10, 20, 30, 1])
     write_volume(path, COUNTS, SPACING)
     np.testing.assert_allclose(nibabel.load(path).affine @ [1.5, 2, 2.5, 1], [0, 0, 0, 1], atol=1e-6)
+    assert read_volume(path).unit == 'normalised'
+
+
+@pytest.mark.parametrize('name', ['v.hdr', 'v.img'])
+def test_a_header_beside_its_voxels(tmp_path, name):
+    import nibabel
+
+    nibabel.save(nibabel.Nifti1Pair(COUNTS, np.diag([*SPACING, 1])), tmp_path / 'v.img')
+    v = read_volume(tmp_path / name)
+    np.testing.assert_allclose(v.data, COUNTS / 119, rtol=1e-6)
+    assert v.spacing == SPACING
 
 
 @pytest.mark.parametrize('unit, mm', [('mm', 1), ('meter', 1000), ('micron', 1e-3), ('unknown', 1)])
@@ -409,6 +420,27 @@ def test_a_tiff_whose_images_have_no_end(tmp_path, bigtiff, byteorder):
         refused(path, 'has no end')
 
 
+# By TIFF's numbers: bytes, deflate by its authors' word (at most 1032:1), and PackBits, whose longest run takes 2 bytes for 128.
+@pytest.mark.parametrize('compression, ratio', [(1, 1), (8, 1032), (32946, 1032), (32773, 64)])
+def test_what_a_tiff_file_may_claim(tmp_path, compression, ratio):
+    """As many bytes as its compression can make of the whole file, and not one more."""
+    tifffile = needs('tifffile')
+    path = tmp_path / 'v.tif'
+    tifffile.imwrite(path, np.zeros((1, 999), np.uint8), photometric='minisblack', rowsperstrip=1, metadata=None)
+    content = bytearray(path.read_bytes())
+    with tifffile.TiffFile(path) as file:
+        tags, order = file.pages[0].tags, file.byteorder
+        struct.pack_into(order + 'H', content, tags['Compression'].valueoffset, compression)
+        width = tags['ImageWidth']
+    assert width.dtype == tifffile.DATATYPE.LONG
+    for more in (0, 1):
+        struct.pack_into(order + 'I', content, width.valueoffset, len(content) * ratio + more)
+        path.write_bytes(content)
+        with pytest.raises(InputError) as caught:  # there are not that many bytes, but there could be
+            read_volume(path)
+        assert ('cannot hold' in str(caught.value)) == bool(more)
+
+
 def dicom_slice(path, z, pixels, **changes):
     pydicom = needs('pydicom')
     data = pydicom.Dataset()
@@ -589,7 +621,8 @@ def test_memory_that_an_array_of_a_file_needs(tmp_path, monkeypatch, ratio, byte
 
 
 def test_what_follows_an_array_is_read_only_where_asked():
-    content = bytes(120 + 2 * voxels._CHUNK)
+    content = bytes(120 + voxels._CHUNK + 1)
     assert len(voxels.read_exactly(io.BytesIO(content), 'v', 0, 120)) == 120
+    assert len(voxels.read_exactly(io.BytesIO(content[:-1]), 'v', 0, 120, finish=True)) == 120
     with pytest.raises(InputError, match='more data follow'):
         voxels.read_exactly(io.BytesIO(content), 'v', 0, 120, finish=True)

@@ -27,6 +27,14 @@ def test_images_do_not_depend_on_the_voxels_of_a_geometry(fitted):
         np.testing.assert_allclose(fitted.render(other), expected, atol=1e-5 * expected.max())
 
 
+def test_images_do_not_depend_on_where_the_panel_stands(fitted):
+    """Through the middle of the volume, or behind it with the same rays."""
+    g = fitted.geometry
+    middle = replace(g, DSD=g.DSO, dDetector=tuple(d * g.DSO / g.DSD for d in g.dDetector))
+    expected = fitted.render(g)
+    np.testing.assert_allclose(fitted.render(middle), expected, atol=1e-5 * expected.max())
+
+
 def test_progress_counts_the_views(fitted):
     seen = []
     fitted.render(fitted.geometry, progress=lambda done, of: seen.append((done, of)))
@@ -58,3 +66,15 @@ def test_pixels_are_compared_in_units_of_their_noise():
     plain, weighted = (Target.of(scan, 1, 1.0, w).pixels for w in (None, weights))
     np.testing.assert_allclose(weighted.numpy(), plain.numpy() * weights[1].ravel(), rtol=1e-6)
     np.testing.assert_array_equal(Target.of(scan, 1, 1.0, weights).weights.numpy(), weights[1].ravel())
+
+
+def test_a_large_volume_is_made_in_slabs(monkeypatch, scene):
+    import lingo_mi as lm
+
+    result = lm.fit(lm.simulate(scene), 'fast', iterations=10, n_points=100, progress=False)
+    grids = None, result.geometry.with_volume((20, 30, 17), (1.1, 0.8, 0.9))
+    whole = [result.volume(grid) for grid in grids]
+    monkeypatch.setattr('lingo_mi.fitting.cloud_model.AT_ONCE', 24 * 24 * 12)
+    for grid, want in zip(grids, whole):
+        found = result.volume(grid)
+        assert found.shape == want.shape and abs(found - want).max() < 2e-6 * want.max() and want.max() > 0

@@ -60,7 +60,8 @@ def plain_view(self, gaussians, target, batch):
     footprints = project(gaussians, view, extent, cut=cut)
     leaf = leaves(footprints.values)
     image = splat(replace(footprints, values=leaf), view.height, view.width, extent) * view.lengths()
-    loss = losses.combined(target.masked(image), target.pixels, view.height, view.width, s.lambda_ssim)
+    compared = target.masked(image), target.pixels, view.height, view.width
+    loss = losses.combined(*compared, s.lambda_ssim, s.lambda_gradient, s.lambda_l1)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
     weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
     dr.backward(loss * weight * (1 / batch))

@@ -15,7 +15,7 @@ import mitsuba as mi  # noqa: E402
 
 from lingo_mi.errors import InputError  # noqa: E402
 from lingo_mi.fitting.loss_scale import loss_scale, otsu  # noqa: E402
-from lingo_mi.fitting.losses import combined, l1, ssim, tv  # noqa: E402
+from lingo_mi.fitting.losses import combined, gradient_error, l1, ssim, tv  # noqa: E402
 from lingo_mi.metrics import C1, C2, WINDOW, ssim_map  # noqa: E402
 
 SIZES = [(64, 48), (37, 53), (8, 8), (5, 7), (1, 40), (41, 1), (1, 1)]
@@ -131,6 +131,45 @@ def test_the_combined_loss_is_the_sum_of_its_parts():
     np.testing.assert_allclose(gradient, 3 * (gradient_l1 - 0.25 * gradient_ssim.ravel()), rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize('size', SIZES)
+@pytest.mark.parametrize('name', ['noise', 'similar', 'edge'])
+def test_the_error_of_the_gradient_matches_float64(size, name):
+    a, b = images(*size)[name]
+    difference = a.astype(float) - b
+    down, across = np.diff(difference, axis=0), np.diff(difference, axis=1)
+    expected = np.sqrt(((down**2).sum() + (across**2).sum()) / a.size)
+    # Of the sum of squared steps s: each pixel ends one step and begins another.
+    slope = -np.diff(np.pad(down, ((1, 1), (0, 0))), axis=0) - np.diff(np.pad(across, ((0, 0), (1, 1))), axis=1)
+    value, gradient = value_and_gradient(lambda x: 3 * gradient_error(x, mi.Float(b.ravel()), *size), a)
+    assert value == pytest.approx(3 * expected, rel=1e-5, abs=1e-12)
+    wanted = 3 * slope.ravel() / (a.size * expected) if expected > 0 else np.zeros(a.size)
+    np.testing.assert_allclose(gradient, wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
+
+
+def test_the_error_of_the_gradient_does_not_see_a_constant():
+    a = images(21, 34)['noise'][0]
+    value, gradient = value_and_gradient(gradient_error, a, mi.Float(a.ravel()), 21, 34)
+    assert value == 0 and not gradient.any()
+    shifted = mi.Float((np.round(a) + 4).ravel())  # whole numbers: the difference is the same in float32
+    value, gradient = value_and_gradient(gradient_error, np.round(a), shifted, 21, 34)
+    assert value == 0 and not gradient.any()
+
+
+def test_the_weights_of_a_loss():
+    a, b = images(37, 53)['similar']
+    truth = mi.Float(b.ravel())
+    parts = [
+        lambda x: l1(x, truth),
+        lambda x: 1 - ssim(x, truth, *a.shape),
+        lambda x: gradient_error(x, truth, *a.shape),
+    ]
+    values, slopes = zip(*(value_and_gradient(part, a) for part in parts))
+    value, slope = value_and_gradient(lambda x: combined(x, truth, *a.shape, 0.5, 4.0, 2.0), a)
+    assert value == pytest.approx(2 * values[0] + 0.5 * values[1] + 4 * values[2], rel=1e-5)
+    wanted = 2 * slopes[0] + 0.5 * slopes[1] + 4 * slopes[2]
+    np.testing.assert_allclose(slope, wanted, rtol=1e-4, atol=1e-5 * np.abs(wanted).max())
+
+
 def test_a_loss_without_gradients_has_the_same_value():
     a, b = images(37, 53)['similar']
     plain = combined(mi.Float(a.ravel()), mi.Float(b.ravel()), 37, 53)
@@ -139,7 +178,12 @@ def test_a_loss_without_gradients_has_the_same_value():
 
 def test_sizes_must_agree():
     x = dr.zeros(mi.Float, 12)
-    for loss in (lambda: ssim(x, x, 3, 5), lambda: combined(x, dr.zeros(mi.Float, 4), 3, 4), lambda: tv(x, (3, 3, 3))):
+    for loss in (
+        lambda: ssim(x, x, 3, 5),
+        lambda: combined(x, dr.zeros(mi.Float, 4), 3, 4),
+        lambda: gradient_error(x, x, 3, 5),
+        lambda: tv(x, (3, 3, 3)),
+    ):
         with pytest.raises(InputError):
             loss()
 

@@ -47,7 +47,9 @@ def test_values(name, text, value):
         *(
             (name, '-1', f'{name} must lie in [0, ')
             for name in (
+                'lambda_l1',
                 'lambda_ssim',
+                'lambda_gradient',
                 'lambda_tv',
                 'epsilon',
                 'decay_steps',
@@ -155,7 +157,7 @@ def test_flat_names(method):
     """Every value has one, no two share one, and they are all that a set of settings is."""
     settings = METHODS[method]
     flat = settings.flat()
-    names = 'start', 'model', 'neural', 'loss', 'adam', 'densification', 'bounds'
+    names = 'start', 'model', 'neural', 'loss', 'adam', 'calibration', 'densification', 'bounds'
     parts = [getattr(settings, name) for name in names]
     assert len(flat) == 5 + sum(len(vars(part)) for part in parts)
     assert Settings().changed(**flat) == settings
@@ -176,6 +178,16 @@ def test_changed_keeps_the_rest():
         ('fdk_threshold', 1e6, 1.5e6),
         ('fdk_threshold', -1e6, -1.5e6),
         ('fdk_rescale', 1e6, 1.5e6),
+        ('scale_min', 1e-9, 0.9e-9),
+        ('scale_max', 1e3, 1.1e3),
+        ('rate_centre', (1e-12, 1e3), (0.9e-12, 1e3)),
+        ('rate_centre', (1e3, 1e-12), (1.1e3, 1e-12)),
+        ('iterations', 10**9, 10**9 + 1),
+        *((name, 0, -1) for name in ('decay_steps', 'densify_from', 'densify_until', 'reset_every')),
+        *((name, 1e6, 1.5e6) for name in ('low_factor', 'lambda_ssim', 'lambda_tv', 'tv_size', 'tv_stride')),
+        *((name, 1, 0) for name in ('tv_size', 'tv_stride', 'cuboid_step', 'n_points', 'occupancy_voxels')),
+        *((name, 10**8, 10**8 + 1) for name in ('n_points',)),
+        ('high_fraction', 1.0, 1.1),
     ],
 )
 def test_limits(name, within, beyond):

@@ -163,6 +163,8 @@ def test_binned_rays(tilt):
     np.testing.assert_allclose(coarse.dDetector, (1.5, 8.0))
     same_rays(coarse.rays(), Rays(f.source, f.corner, 4 * f.u, f.v, False))
     same_rays(g.binned(1).rays(), f, 1e-12)
+    assert [g.bins(n) for n in (11, 12)] == [(1, 11), (1, 1)]  # two new pixels at least
+    assert Geometry.cone(**CONE | dict(nDetector=(8, 7))).bins(4) == (4, 1)
     with pytest.raises(InputError, match='from 1 on'):
         g.binned(0)
 

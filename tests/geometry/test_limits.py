@@ -33,6 +33,17 @@ BEAMS = {
 }
 
 
+@pytest.mark.parametrize('sine, refused', [(1.5e-9, False), (0.7e-9, True)])
+def test_steps_that_span_a_panel(sine, refused):
+    """The sine of the angle between them is above 1e-9."""
+    rays = Rays(*np.array([[[0.0, 0, 9]], [[0, 0, 0]], [[2.0, 0, 0]], [[3.0, 3 * sine, 0]]]), False)
+    if refused:
+        with pytest.raises(InputError, match='span no panel'):
+            rays.checked()
+    else:
+        assert len(rays.checked()) == 1
+
+
 def finite_or_refused(make):
     """What `make` gives, all of whose numbers are finite; None where it refuses in one line."""
     with warnings.catch_warnings():

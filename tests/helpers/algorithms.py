@@ -2,4 +2,4 @@
 
 from lingo_mi.reconstruction import ALGORITHMS
 
-ITERATIVE = {name: algorithm for name, algorithm in ALGORITHMS.items() if name not in ('fdk', 'refined')}
+ITERATIVE = {name: algorithm for name, algorithm in ALGORITHMS.items() if name not in ('fdk', 'refined', 'best')}

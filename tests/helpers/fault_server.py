@@ -64,7 +64,7 @@ def work(request, calls):
         # Drawing takes longer than all else; what is drawn is written as ever.
         with (
             mock.patch('lingo_mi.report.figures.overview', return_value=b'a picture'),
-            mock.patch('lingo_mi.report.figures.sheet', return_value=b'a picture'),
+            mock.patch('lingo_mi.report.page.report_page', return_value='a page'),
         ):
             faults.install()
             guard(mains[request['task']])

@@ -47,10 +47,13 @@ def fit(*args, report=False):
     return run(FIT, *args, report=report)
 
 
-def run(script, *args, report=False):
-    """Exit code, standard output and standard error of `script ARGS`, run in this process; see `fit`."""
+def run(script, *args, report=False, variant=True):
+    """Exit code, standard output and standard error of `script ARGS`, run in this process; see `fit`.
+
+    variant   whether the script has a --variant, which is then the active one
+    """
     out, err = io.StringIO(), io.StringIO()
-    argv = [str(script), *map(str, args), *([] if '--variant' in args else ['--variant', mi.variant()])]
+    argv = [str(script), *map(str, args), *(['--variant', mi.variant()] if variant and '--variant' not in args else [])]
     drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.results.save.write_report')
     with drawn, mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:

@@ -85,6 +85,11 @@ def test_air_and_truncation(foot):
     assert any('left or right edge' in line and '-D outside=ignore' in line for line in look(cut).advice)
 
 
+def test_air_of_single_views(foot):
+    p = foot.projections + np.linspace(-1, 1, len(foot))[:, None, None] * 0.05 * foot.projections.max()
+    assert any('-D fit_air=view' in line for line in look(lm.Scan(foot.geometry, p)).advice)
+
+
 def test_noise(foot):
     """Photons to 20 %."""
     rng = np.random.default_rng(0)

@@ -8,7 +8,7 @@ from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo import voxel_filter
-from lingo_mi.lingo.masks import Masks, masks
+from lingo_mi.lingo.masks import Masks, masks, truncated
 from lingo_mi.lingo.otsu import otsu
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
@@ -99,6 +99,21 @@ def test_masks():
         np.testing.assert_array_equal(found.high[o], image > t_high)
         np.testing.assert_array_equal(found.low[o], image > t_high * 0.1)
     assert not found.low[2].any()
+
+
+@pytest.mark.parametrize(
+    'shape, axis', [((40, 60), 0), ((40, 60), 1), ((2, 60), 0), ((40, 2), 1), ((1, 60), 0), ((40, 1), 1)]
+)
+@pytest.mark.parametrize('end', [0, -1])
+def test_views_that_the_panel_cuts(shape, axis, end):
+    """More than 1 in 20 pixels of a side, away from its corners. An axis of one pixel has no sides."""
+    length, across = shape[1 - axis], shape[axis]
+    low = np.zeros((length // 20 + 2, *shape), bool)
+    for count, image in enumerate(low):
+        np.moveaxis(image, axis, 0)[end, 5 : 5 + count] = True
+    expected = [across > 1 and count > length / 20 for count in range(len(low))]
+    nothing = np.zeros(len(low))
+    assert truncated(Masks(low, low, nothing, nothing)).tolist() == expected
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])

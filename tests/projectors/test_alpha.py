@@ -1,5 +1,7 @@
 """Alpha compositing against a literal float64 transcription of 3DGS's equations, and its derivatives against differences."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -132,6 +134,21 @@ def test_derivatives_are_those_of_differences(mode):
             slope = (change * weight).sum()
             wrong += abs((found[name] * direction).sum() - slope) > 2e-3 * np.linalg.norm(found[name] * direction)
         assert wrong == 0, name
+
+
+@pytest.mark.parametrize('width', [8, 1, 37])
+def test_one_gaussian_in_one_tile(width):
+    """At the middle of a pixel: its opacity times its radiance, and their derivatives."""
+    c = {name: np.array([value]) for name, value in dict(opacity=0.5, radiance=0.7).items()}
+    c |= dict(centre=np.zeros((1, 3)), scale=np.full((1, 3), 1e-3), rotation=np.array([[0, 0, 0, 1.0]]))
+    g = replace(geometry('parallel'), nDetector=(1, width), offDetector=(0.0, 0.0 if width % 2 else 9.0))
+    arrays = on_device(c)
+    dr.enable_grad(arrays)
+    image = composite(flatten(*arrays, View.of(g.normalised_rays(), 0, 1, width, panel=False)), 1, width)
+    assert image.numpy()[width // 2 - 1 + width % 2] == pytest.approx(0.35, rel=1e-5)
+    dr.backward(dr.max(image))
+    assert dr.grad(arrays[3])[0] == pytest.approx(0.7, rel=1e-5)
+    assert dr.grad(arrays[4])[0] == pytest.approx(0.5, rel=1e-5)
 
 
 def test_nothing_in_view_is_black():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lingo_mi.projectors.balance import Sharing
+from lingo_mi.projectors.balance import Layout, Sharing, Work
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
 from lingo_mi.projectors.options import RenderOptions
@@ -85,3 +85,37 @@ def test_as_many_shares_as_asked():
     usual = Sharing().teams
     assert usual > 1 and Sharing().scaled(2).scaled(1.5).teams == 3 * usual
     assert Sharing().scaled(0.1 / usual).teams == 1
+
+
+@pytest.mark.parametrize('layout', [Layout(8, 1, 4), Layout(16, 2, 4), Layout(4, 8, 1)], ids=str)
+def test_packets_that_an_interval_covers(layout):
+    """All that hold one of its elements within the row, from the start of a step on, and none behind."""
+    width, rng = 27, np.random.default_rng(0)
+    low, column = rng.uniform(-12, 40, 500), rng.integers(-3, 4, 500)
+    high, offset = low + rng.uniform(-2, 9, 500), rng.uniform(-0.5, 0.5, 500)
+    arrays = [mi.Float(x.astype(np.float32)) for x in (low, high, offset)]
+    packets = layout.packets(width)
+    begin, end = layout.span(*arrays, mi.Int32(column), mi.Bool(np.arange(500) % 10 == 0), mi.Int32(packets))
+    size, step = layout.size, layout.step
+    for i, (first, last) in enumerate(zip(np.ceil(low + offset) + column, np.floor(high + offset) + column)):
+        within = [e for e in range(packets * size) if first <= e <= last] if i % 10 else []
+        found = range(begin.numpy()[i], end.numpy()[i])
+        if not within:
+            assert len(found) == 0
+        else:
+            assert found == range(within[0] // step * layout.columns, within[-1] // size + 1)
+
+
+@pytest.mark.parametrize('shares', [0.125, 1, 20])
+def test_every_block_belongs_to_the_team_in_whose_share_it_begins(shares):
+    """Items of no block and of many, blocks that cost 1 and more; a team's share is the total over the teams, up to a whole."""
+    blocks, costs, sharing = [3, 0, 2, 5, 0, 1, 40], [1, 1, 2, 3, 1, 1, 1], Sharing(shares=shares)
+    work = Work.of(mi.UInt32(blocks), mi.UInt32(costs), sharing)
+    share = work.shares(Layout(1, 1, 4))
+    first = np.concatenate([[0], np.cumsum(blocks)])
+    begin, end = (first[item.numpy()] + block.numpy() for item, block in (share.begin, share.end))
+    starts = np.concatenate([[0], np.cumsum(np.repeat(costs, blocks))])
+    owner = starts[:-1] // (starts[-1] // sharing.teams + 1)
+    assert len(begin) == sharing.teams
+    for team in range(sharing.teams):
+        assert list(range(begin[team], end[team])) == np.flatnonzero(owner == team).tolist()

@@ -8,6 +8,7 @@ import pytest
 from helpers.grids import scan
 from helpers.matrices import matrix
 from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph
 
@@ -60,6 +61,33 @@ def test_transpose(changes):
     aty = J.adjoint(device_images(y), range(n)).numpy().astype(float)
     scale = np.linalg.norm(ax) * np.linalg.norm(y)
     assert abs(ax @ y.transpose(0, 2, 1).ravel() - aty @ x.ravel()) < 1e-5 * scale and scale > 0
+
+
+def test_rays_along_all_faces_of_the_volume_are_alike():
+    """To the last bit on a face, they see the voxels beside it, there and back."""
+    geometry = CircularGeometry(
+        DSO=8.0, DSD=8.0, nDetector=(6, 5), dDetector=1.0, nVoxel=(3, 4, 5), dVoxel=1.0, angles=[0.0], mode='parallel'
+    )
+    J, ones = Joseph(geometry), mi.Float(np.ones(60, np.float32))
+    image, path = (a.numpy() for a in J.forward(ones, [0]))
+    np.testing.assert_array_equal(image, 3)
+    np.testing.assert_array_equal(path, 3)
+    back = J.adjoint(mi.Float(np.ones(30, np.float32)), [0]).numpy().reshape(3, 4, 5)
+    assert back.sum() == 3 * 30
+    np.testing.assert_array_equal(back, back[:, ::-1, ::-1])
+
+
+def test_voxels_beside_a_ray_add_nothing_whatever_they_hold():
+    """Rays through voxel centres, and half a voxel beyond the outermost: the neighbours have no weight."""
+    geometry = CircularGeometry(
+        DSO=8.0, DSD=8.0, nDetector=(3, 3), dDetector=1.0, nVoxel=(3, 3, 3), dVoxel=1.0, angles=[0.0], mode='parallel'
+    )
+    for i in range(9):
+        row, column = i // 3, i % 3
+        volume = np.full((3, 3, 3), np.nan, np.float32)
+        volume[:, 2 - column, 2 - row] = 1
+        image = Joseph(geometry).forward(mi.Float(volume.ravel()), [0])[0].numpy().reshape(3, 3).T
+        assert (image == 3).sum() == 1 and np.isnan(image).sum() == 8
 
 
 def test_smooth_ball_against_the_exact_projector():

@@ -251,6 +251,7 @@ def test_mitsuba_meshes():
         (BOX.vertices, BOX.faces[:0], 'at least one face'),
         (BOX.vertices[:, :2], BOX.faces, 'needs vertices'),
         (BOX.vertices * 0, BOX.faces, 'no extent'),
+        *((BOX.vertices, np.array([face]), 'no extent') for face in ((0, 0, 1), (0, 1, 1), (1, 0, 1))),
     ],
 )
 def test_unusable_meshes(vertices, faces, message):

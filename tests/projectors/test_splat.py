@@ -1,5 +1,6 @@
 """Line integrals of clouds of Gaussians against the float64 oracle: images, gradients, tangents, hard places."""
 
+import warnings
 from dataclasses import replace
 
 import drjit as dr
@@ -7,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.errors import AccuracyWarning
+from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
@@ -352,6 +353,50 @@ def test_needles_are_announced(aspect, warns):
         assert require_usable(*gaussians, 'here')
 
 
+@pytest.mark.parametrize(
+    'name, within, beyond',
+    [
+        ('centre', 1e12, 1.01e12),
+        ('scale', 1e12, 1.01e12),
+        ('scale', 1e-12, 0.99e-12),
+        ('density', 1e24, 1.01e24),
+        ('density', -1e24, -1.01e24),
+        ('rotation', 0.51e-15, 0.49e-15),
+    ],
+)
+def test_gaussians_within_the_limits_are_usable(name, within, beyond):
+    kinds = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
+    usual = dict(centre=0.0, scale=1.0, rotation=1.0, density=1.0)
+    for value, usable in ((within, True), (beyond, False)):
+        gaussians = [kind((usual | {name: value})[each]) for each, kind in kinds.items()]
+        if usable:
+            assert require_usable(*gaussians, 'here')
+        else:
+            with pytest.raises(InputError, match='Gaussian 0 of here is not usable'):
+                require_usable(*gaussians, 'here')
+
+
+def test_depth_of_items_that_fill_a_cell():
+    """8192 in the 64 elements of one cell, 128 at each; as they lie at random, only one in 32 of the cell's counts."""
+    i = np.arange(8192)
+    places = [mi.Int32(p) for p in (i % 8, i // 8 % 8)]
+    assert deepest(places, dr.full(mi.Float, 1, 8192), (512, 512)).numpy() == 128
+    assert deepest(places, dr.full(mi.Float, 64, 8192), (512, 512)).numpy() == 8192 / 32
+
+
+@pytest.mark.parametrize('options', [dict(), dict(footprint='affine'), dict(area=True)], ids=str)
+@pytest.mark.parametrize('near', [False, True])
+def test_gaussians_at_the_source_are_announced_where_options_cannot_hold(options, near):
+    frames, shape = scanner()
+    centre = frames.source[0] * (0.99 if near else 0.1)
+    gaussians = mi.Point3f(*centre.tolist()), mi.Vector3f(0.1), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        dr.eval(line_integrals(*gaussians, View.of(frames, 0, *shape), RenderOptions(EXTENT, **options)))
+    said = [str(w.message) for w in caught if w.category is AccuracyWarning]
+    assert len(said) == (near and bool(options)) and all(text.startswith('1 Gaussians reach') for text in said)
+
+
 def test_few_items_have_no_depth():
     zeros = dr.zeros(mi.Int32, 10)
     assert deepest((zeros, zeros), dr.full(mi.Float, 4, 10), (8, 8)).numpy() == 0
@@ -374,3 +419,20 @@ def test_footprints_are_not_widened_unasked():
     for a, b in zip(plain.values, none.values):
         assert a[0] == b[0]
     assert some.values[1][0] < 0.99 * none.values[1][0]
+
+
+@pytest.mark.parametrize('shape', [(33, 33), (17, 33)])
+def test_the_mean_over_a_pixel_widens_a_footprint_by_its_variance(shape):
+    """That of a unit square, 1/12 along each axis: the peak of a round one of variances a, b falls by sqrt(a b)."""
+    frames, _ = scanner('parallel', shape=shape, size=(3.3, 3.3))
+    sigma = 0.15  # in pixels of the panel: the variances a and b
+    a, b = ((sigma / np.linalg.norm(step[0])) ** 2 for step in (frames.u, frames.v))
+    gaussians = mi.Point3f(0), mi.Vector3f(sigma), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
+    view = View.of(frames, 0, *shape)
+    centre, mean = (
+        line_integrals(*gaussians, view, RenderOptions(EXTENT, area=area)).numpy() for area in (False, True)
+    )
+    factor = np.sqrt(a * b / ((a + 1 / 12) * (b + 1 / 12)))
+    assert centre.max() == pytest.approx(np.sqrt(2 * np.pi) * sigma, rel=1e-5)
+    assert mean.max() == pytest.approx(factor * centre.max(), rel=1e-5)
+    assert mean.sum() == pytest.approx(centre.sum(), rel=1e-4)

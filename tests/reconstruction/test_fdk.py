@@ -57,6 +57,20 @@ def test_parker_weights_of_opposite_rays_sum_to_one(span):
     np.testing.assert_allclose(ray_weights(geometry(angles=[0.3])), 1)
 
 
+def test_parker_weights_branch_by_branch():
+    """As Parker and Silver print them, with the half excess d and the fan angle g towards the side that is seen again last."""
+    n, span = 36, np.radians(240)
+    geo = geometry(angles=circular(n, 240), offDetector=(0.0, 0.0))
+    g, d = np.arctan((np.arange(72) - 35.5) * 3 / 450), (span - np.pi) / 2
+    for view, weights in enumerate(ray_weights(geo) * np.pi / span):
+        beta = (view + 0.5) * span / n
+        rising, falling = beta < 2 * (d + g), beta > np.pi + 2 * g
+        expected = np.ones(72)
+        expected[rising] = np.sin(np.pi / 4 * beta / (d + g[rising])) ** 2
+        expected[falling] = np.sin(np.pi / 4 * (np.pi + 2 * d - beta) / (d - g[falling])) ** 2
+        np.testing.assert_allclose(weights, expected, atol=1e-12)
+
+
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 @pytest.mark.parametrize('offset', [50.0, -50.0])
 def test_offset_detector_that_sees_little_more_than_half(mode, offset):
@@ -208,3 +222,14 @@ def test_measured_fan_beam(data):
     assert np.corrcoef(volume.ravel(), reference.ravel())[0, 1] > 0.99
     disc = reference > 0.7 * reference.max()
     assert abs(volume[disc].mean() * voxel / reference[disc].mean() - 1) < 0.02
+
+
+def test_all_four_edges_of_the_panel_are_alike():
+    """Voxel centres on the edges, to the last bit: none is seen, whichever edge it is."""
+    geo = CircularGeometry(
+        DSO=8.0, DSD=8.0, nDetector=(4, 4), dDetector=1.0, nVoxel=(3, 5, 5), dVoxel=1.0, angles=[0.0], mode='parallel'
+    )
+    volume = FDK().run(Scan(geo, np.ones((1, 4, 4), np.float32))).volume
+    assert (volume[:, 1:-1, 1:-1] != 0).all()
+    volume[:, 1:-1, 1:-1] = 0
+    assert not volume.any()

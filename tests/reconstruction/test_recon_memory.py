@@ -33,7 +33,8 @@ def run(size, pixels, views):
     scan = Scan(geometry, project.numpy().reshape(views, pixels, pixels).transpose(0, 2, 1))
     del project
     few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
-    options = {'fdk': {}, 'asd-pocs': dict(niter=1, tviter=2), 'refined': dict(niter=1, completed_niter=1, tviter=2)}
+    few_steps = dict(niter=1, tviter=2)
+    options = {'fdk': {}, 'asd-pocs': few_steps, 'refined': dict(completed_niter=1) | few_steps, 'best': dict(niter=1, finer=1)}
     algorithm = ALGORITHMS[sys.argv[1]](**options.get(sys.argv[1], dict(niter=1)))
     if sys.argv[1] == 'refined':
         algorithm.run(few, completed=scan, sample=lambda _: ramp)
@@ -95,3 +96,11 @@ def test_peak_memory_of_large_scans(algorithm):
     """512^3 voxels and 100 views of 1024^2 pixels within 8 GB."""
     share, peak = taken(algorithm, 512, 1024, 100)
     assert 0.8 < share < 1.3 and peak < 8e9
+
+
+@pytest.mark.parametrize('algorithm', NEEDS)
+def test_needs_are_counted_in_float32(algorithm):
+    """4 bytes a voxel and a pixel: many voxels, or many pixels."""
+    need, voxels, pixels = NEEDS[algorithm], 4 * 300**3, 4 * 900**2
+    assert needed(algorithm, scanned(300, 900, 1), 1) == pytest.approx(need.volumes * voxels + 2 * pixels)
+    assert needed(algorithm, scanned(20, 900, 99), 99) == pytest.approx(4 * 20**3 + need.projections * 99 * pixels)

@@ -57,6 +57,21 @@ def test_the_line_integrals_are_those_of_the_same_rays(mode):
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_zero_beyond_half_a_pixel_outside_the_real_panel(mode):
+    """Constant projections, which any interpolation keeps."""
+    real = moved(geometry(mode, circular(5)), TURNS['all'])
+    scan = rectified(Scan(real, np.ones((5, *real.nDetector))))
+    (n_v, n_u), rays = scan.geometry.nDetector, scan.geometry.rays()
+    x, y = (i.ravel() + 0.5 for i in np.meshgrid(np.arange(n_u), np.arange(n_v)))
+    for view, image in enumerate(scan.projections):
+        at = real.rays().project(np.sum(rays.through(view, x, y), 0), view)
+        beyond = np.max([np.maximum(-p, p - n) for p, n in zip(at, real.nDetector[::-1])], 0)
+        sure = np.abs(beyond - 0.5) > 1e-6
+        assert (beyond > 0.5).any() and ((beyond > 0) & (beyond < 0.5)).any()
+        np.testing.assert_allclose(image.ravel()[sure], (beyond < 0.5)[sure], atol=1e-5)
+
+
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
 @pytest.mark.parametrize('angles, offset', [(circular(6), 1.0), (circular(9, 200), -7.0)])
 def test_the_panel_holds_the_shadow_and_is_no_coarser(mode, angles, offset):
     real = moved(geometry(mode, angles, offDetector=(4.0, offset)), TURNS['all'])

@@ -1,5 +1,7 @@
 """The report: which way up its pictures are, what it says, and that it lacks nothing when data do."""
 
+import base64
+import hashlib
 import re
 import subprocess
 import sys
@@ -8,7 +10,10 @@ import numpy as np
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.report.page import ReportData, figures, headline, write_report
+from lingo_mi.report import figures, planes
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.numbers import headline
+from lingo_mi.report.page import report_page, write_report
 
 SHAPE, SPACING, CENTRE = (20, 16, 12), (1.0, 1.5, 2.0), (10.0, 0.0, -5.0)
 
@@ -90,15 +95,15 @@ def drawn(draw, data, cmap='gray'):
 def test_plane_puts_each_axis_where_it_belongs():
     volume = np.arange(2 * 3 * 4).reshape(2, 3, 4)
     # [vertical, horizontal], lowest row first
-    assert figures.plane(volume, 2, 1)[2, 0] == volume[0, 2, 1]  # axial: x right, y up
-    assert figures.plane(volume, 1, 2)[3, 1] == volume[1, 2, 3]  # coronal: x right, z up
-    assert figures.plane(volume, 0, 1)[3, 2] == volume[1, 2, 3]  # sagittal: y right, z up
+    assert planes.plane(volume, 2, 1)[2, 0] == volume[0, 2, 1]  # axial: x right, y up
+    assert planes.plane(volume, 1, 2)[3, 1] == volume[1, 2, 3]  # coronal: x right, z up
+    assert planes.plane(volume, 0, 1)[3, 2] == volume[1, 2, 3]  # sagittal: y right, z up
 
 
 def test_extents_in_mm():
-    assert figures.plane_extent(SHAPE, SPACING, CENTRE, 2) == (0, 20, -12, 12)
-    assert figures.plane_extent(SHAPE, SPACING, CENTRE, 1) == (0, 20, -17, 7)
-    assert figures.plane_extent(SHAPE, SPACING, CENTRE, 0) == (-12, 12, -17, 7)
+    assert planes.plane_extent(SHAPE, SPACING, CENTRE, 2) == (0, 20, -12, 12)
+    assert planes.plane_extent(SHAPE, SPACING, CENTRE, 1) == (0, 20, -17, 7)
+    assert planes.plane_extent(SHAPE, SPACING, CENTRE, 0) == (-12, 12, -17, 7)
 
 
 def test_bright_block_is_drawn_at_its_place_in_mm():
@@ -137,9 +142,9 @@ def test_slices_and_their_truth_share_one_grey_scale():
 def test_richest_slice():
     volume = np.zeros((5, 6, 20))
     volume[1, 2, 4:13] = 1
-    assert [figures.richest(volume, axis) for axis in range(3)] == [1, 2, 8]
-    assert figures.richest(-volume, 0) == 1
-    assert figures.richest(np.zeros((5, 5, 5)), 0) == 2
+    assert [planes.richest(volume, axis) for axis in range(3)] == [1, 2, 8]
+    assert planes.richest(-volume, 0) == 1
+    assert planes.richest(np.zeros((5, 5, 5)), 0) == 2
 
 
 # ---- Numbers -------------------------------------------------------------------------------------
@@ -152,9 +157,9 @@ def test_series_leaves_gaps_out():
         dict(loss=3.0),
         dict(iteration=2, loss=np.nan),
     ]
-    x, y = figures.series(history, 'iteration', 'loss')
+    x, y = planes.series(history, 'iteration', 'loss')
     assert x.tolist() == [1] and y.tolist() == [0.5]
-    assert [len(a) for a in figures.series([], 'seconds', 'loss')] == [0, 0]
+    assert [len(a) for a in planes.series([], 'seconds', 'loss')] == [0, 0]
 
 
 def test_headline():
@@ -179,26 +184,35 @@ def test_files(written):
 
 
 def test_page_needs_nothing_else(written):
+    """No address but of its own parts, and a policy that forbids all others."""
     text = written[1].read_text(encoding='utf-8')
-    sources = re.findall(r'(?:src|href|url)\s*[=(]\s*["\']?([^"\'>]{0,22})', text)
-    assert sources == ['data:image/png;base64,'] * 4
-    bare = re.sub(r'base64,[^"]+', '', text)
-    assert 'http' not in bare and '<script' not in bare and '<link' not in bare and '@import' not in bare
+    policy, rest = text.partition('Content-Security-Policy" content="')[2].split('">', 1)
+    assert policy.startswith("default-src 'none'; script-src 'sha256-") and policy.endswith("connect-src 'none'")
+    markup = re.sub(r'(?s)<(script|style)[^>]*>.*?</\1>', '', rest)
+    assert re.findall(r'(?:src|href)\s*=\s*["\']?([^"\'>]*)', markup) == ['#main']
+    assert 'http' not in markup and '<link' not in text and '@import' not in text
+
+
+def test_policy_names_the_page_own_script(written):
+    text = written[1].read_text(encoding='utf-8')
+    (script,) = re.findall(r'(?s)<script>(.*?)</script>', text)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in text
 
 
 def test_page_says_it_all(written):
-    text = re.sub(r'base64,[^"]+', '', written[1].read_text(encoding='utf-8'))
+    text = re.sub(r'(?s)<(script|style)[^>]*>.*?</\1>', '', written[1].read_text(encoding='utf-8'))
     for piece in (
         'Block &lt;1&gt;',
         'fit a &gt; b',
         '31.23 dB',
         '51,234',
-        '<td>n/a</td>',
+        '<td class="value">n/a</td>',
         'llvm_ad_mono',
         'mitsuba 3.9.1',
         '20 x 16 x 12 voxels of 1 x 1.5 x 2 mm',
-        '<th>note</th><td>extra</td>',
-        '<th>Seed</th><td>7</td>',
+        '<th scope="row">note</th><td class="value">extra</td>',
+        '<th scope="row">Seed</th><td class="value">7</td>',
     ):
         assert piece in text, piece
     assert 'nan' not in text and 'None' not in text
@@ -229,15 +243,14 @@ def test_page_says_it_all(written):
 )
 def test_what_is_missing_is_left_out(changes, images):
     data = content(**changes)
-    shown = figures.sections(data)
-    assert len(shown) == images
-    for section in shown:
-        assert figures.sheet(data, section, dpi=30).startswith(b'\x89PNG')
+    assert len(figures.sections(data)) == images
+    assert figures.overview(data, '', dpi=30).startswith(b'\x89PNG')
+    assert '</html>' in report_page(data)
 
 
 def test_volume_alone(tmp_path):
     page = write_report(tmp_path, ReportData('', {}, phantom(), SPACING))
-    assert page.read_text(encoding='utf-8').count('<img ') == 1
+    assert '"views"' not in page.read_text(encoding='utf-8').partition('id="known">')[2].partition('</script>')[0]
 
 
 @pytest.mark.parametrize('compared', [True, False])

@@ -1,0 +1,1 @@
+"""What a scan says of its own errors: the panel's place, found by quick reconstructions before a fit."""

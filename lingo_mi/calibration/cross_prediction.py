@@ -1,0 +1,73 @@
+"""Every view of a scan predicted from views other than itself, by quick reconstructions on few voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.sart import blocks, sweep
+from lingo_mi.reconstruction.system import System
+from lingo_mi.scan import Scan
+
+PASSES = 4  # over the views: fewer leave edges and peaks too low, which a curve of the detector would seem to explain
+RELAXATION = 1.0
+SMOOTH = 0.8  # pixels, standard deviation: leaves nothing that a shift by part of a pixel would smooth further
+EDGE = 0.15  # of the highest value: an object there goes on beyond the panel
+WIDER, MARGIN = 1.5, 1.15  # how much larger the volume then is, and otherwise: a panel that moves, moves the object
+
+
+def coarse(scan: Scan, pixels: int) -> Scan:
+    """The scan binned to about `pixels` columns and smoothed, on voxels as wide as a pixel at the axis.
+
+    Where the object reaches over the panel's edge, the volume is wider, so that there is room for what lies beyond.
+    """
+    small = scan.binned(max(1, round(max(scan.geometry.nDetector) / pixels)))
+    g = small.geometry
+    at_axis = g.DSO / g.DSD if g.mode == 'cone' else 1.0
+    step = max(g.dDetector[1] * at_axis, min(g.dVoxel[:2]))
+    highest = np.percentile(small.projections, 99.5)
+    sides = [small.projections[:, :, [0, -1]], small.projections[:, [0, -1], :]]
+    cut = [g.nDetector[k] > 2 and np.percentile(p, 95) > EDGE * highest for k, p in ((1, sides[0]), (0, sides[1]))]
+    size = np.array(g.sVoxel) * np.where([cut[0], cut[0], cut[1]], WIDER, MARGIN)
+    if g.mode == 'cone':  # the source stays outside
+        size[:2] = np.minimum(size[:2], max(1.3 * g.DSO, min(g.sVoxel[:2])))
+    count = np.maximum(np.ceil(size / step), 1).astype(int)
+    voxel = [step] * 3
+    if g.nVoxel[2] == 1:
+        count[2], voxel[2] = 1, g.dVoxel[2]
+    return replace(small, geometry=g.with_volume(count, voxel), projections=_smoothed(small))
+
+
+def _smoothed(scan):
+    """The projections, each pixel a weighted mean of valid ones."""
+    valid = np.ones(scan.projections.shape, np.float32) if scan.valid is None else scan.valid.astype(np.float32)
+    by = [0.0, *(SMOOTH if n > 2 else 0.0 for n in scan.geometry.nDetector)]
+    values, weights = (ndimage.gaussian_filter(x, by, mode='nearest') for x in (scan.projections * valid, valid))
+    return values / np.maximum(weights, 1e-3)
+
+
+def folds_of(geometry: Geometry) -> list[np.ndarray]:
+    """View numbers in turns around the circle: two groups of many views, three of few."""
+    order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind='stable')
+    groups = 2 if len(geometry) >= 48 else 3
+    return [np.sort(order[k::groups]) for k in range(groups)]
+
+
+def cross_predicted(scan: Scan, folds: Sequence[np.ndarray]) -> np.ndarray:
+    """Line integrals [view, v, u] of every view, from a reconstruction of the views outside its fold."""
+    system, n = System(scan), len(scan)
+    out = np.empty((n, *scan.geometry.nDetector[::-1]), np.float32)
+    for fold in folds:
+        others = np.setdiff1d(np.arange(n), fold)
+        turns = blocks(
+            scan.geometry.angles[others], max(1, len(others) // 20), 'angularDistance', np.random.default_rng(0)
+        )
+        x = system.start(None)
+        for _ in range(PASSES):
+            x = sweep(system, x, RELAXATION, [others[turn] for turn in turns], True)
+        out[fold] = system.A.forward(x, fold)[0].numpy().reshape(len(fold), *out.shape[1:])
+    return out.transpose(0, 2, 1)

@@ -1,0 +1,65 @@
+"""The panel's place as a function of time: a constant, and polynomials for a scanner that warms up. NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from lingo_mi.calibration.panel import Panel
+from lingo_mi.geometry.base import Geometry
+
+NEAR = 1e-6  # radians that are none
+
+
+def times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
+    """The time of views at `angles` [m] radians, -1 for a scan's first view and 1 for its last: their place between its angles.
+
+    The views of the scan are in the order of their time, at even intervals. Where its angles turn back, or there is one view
+    only, angles do not tell the time, and views are taken in their own order.
+    """
+    own, n = np.unwrap(geometry.angles), len(geometry)
+    turns = np.diff(own)
+    if n < 2 or not (np.all(turns > 0) or np.all(turns < 0)):
+        return np.linspace(-1, 1, len(angles)) if len(angles) > 1 else np.zeros(len(angles))
+    known, x = np.abs(own - own[0]), np.sign(turns[0]) * (angles - own[0])
+    if known[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
+        x = np.mod(x + NEAR, 2 * np.pi) - NEAR
+    step = 2 / (n - 1)
+    ends = np.append(known, known[-1] + np.median(np.abs(turns)))
+    return np.interp(x, ends, np.append(np.linspace(-1, 1, n), 1 + step))
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The panel's place over a scan, v(t) = sum of v[k] P_k(t) with Legendre's polynomials P_k, u(t) likewise, and its yaw.
+
+    scan   the geometry whose views define the time t, -1 for the first view and 1 for the last
+    v, u   [degree + 1] mm each: the constants first
+    yaw    radians
+    """
+
+    scan: Geometry
+    v: tuple[float, ...] = (0.0,)
+    u: tuple[float, ...] = (0.0,)
+    yaw: float = 0.0
+
+    @classmethod
+    def of(cls, scan: Geometry, numbers: dict[str, float]) -> Drift:
+        """From numbers by name: v, v1, v2, ..., u, u1, ... and yaw; missing ones are 0."""
+        degree = max((int(name[1:]) for name in numbers if name[1:].isdigit()), default=0)
+        v, u = (tuple(numbers.get(f'{axis}{k or ""}', 0.0) for k in range(degree + 1)) for axis in 'vu')
+        return cls(scan, v, u, numbers.get('yaw', 0.0))
+
+    @property
+    def constant(self) -> bool:
+        """Whether all views have the panel in the same place."""
+        return not any(self.v[1:]) and not any(self.u[1:])
+
+    def panel(self, geometry: Geometry) -> Panel:
+        """The panel in the views of a geometry, which need not be those of the scan, but were taken among them."""
+        if self.constant:
+            return Panel(self.v[0], self.u[0], self.yaw)
+        t = times(self.scan, geometry.angles)
+        return Panel(legendre.legval(t, self.v), legendre.legval(t, self.u), self.yaw)

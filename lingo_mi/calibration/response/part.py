@@ -1,0 +1,58 @@
+"""What the models of a response have in common. NumPy."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+VARIES = ('off', 'smooth', 'view')  # how air and gain change from view to view
+SMOOTH = 3  # degree in time of what is smooth
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where pixels lie: y (down) and x over the half-sizes of the panel, -1 to 1, of the shape of an image or [pixels]."""
+
+    y: np.ndarray
+    x: np.ndarray
+
+
+@dataclass
+class Part(ABC):
+    """A model that takes a view's line integrals p to what is measured, with K numbers c that may change from view to view.
+
+    varies   'view': numbers of every view for itself; 'smooth': polynomials in time; 'one': the same in all views
+    values   [T, K]: one row for each view, for each polynomial, or one in all
+    """
+
+    name: ClassVar[str]
+
+    varies: str
+    values: np.ndarray = field(init=False)
+
+    @property
+    @abstractmethod
+    def deviations(self) -> np.ndarray:
+        """What the numbers [K] are expected to be in size. It holds those that a scan does not tell."""
+
+    @abstractmethod
+    def apply(self, p: np.ndarray, c: np.ndarray, place: Place) -> np.ndarray:
+        """The measured values of line integrals p [...]."""
+
+    @abstractmethod
+    def undo(self, m: np.ndarray, c: np.ndarray, place: Place) -> np.ndarray:
+        """The line integrals of measured values m [...]."""
+
+    @abstractmethod
+    def slopes(self, p: np.ndarray, c: np.ndarray, place: Place) -> tuple[list[np.ndarray], np.ndarray]:
+        """Derivatives of `apply` by each of the numbers, K of [...], and by p, [...]."""
+
+    @abstractmethod
+    def report(self, c: np.ndarray) -> dict[str, list[float]]:
+        """Physical quantities by name, each [n], of the numbers c [n, K] of n views."""
+
+    def hold(self) -> None:  # noqa: B027 - most models need none
+        """Take out of `values` what no scan tells."""

@@ -1,0 +1,93 @@
+"""Fit a cohort: a list of scans, one a row, each into a folder of its own, with a table of all results.
+
+    lingo-mi batch cohort.csv --recipe fast --out out/cohort
+    lingo-mi batch cohort.csv --out out/cohort --cluster local:4
+    lingo-mi batch cohort.csv --out out/cohort --cluster tcp://head-node:8786
+
+The list is a CSV file whose first line names its columns; an empty cell is the default, and paths begin from the list's folder:
+
+    file       projections, as of `lingo-mi fit --projections`; with a scene in geometry, a CT volume that its scanner scans
+    geometry   the geometry file (.yml) of an .npy; or a scene, .xml or a shipped one, whose own object is scanned without a file
+    name       of the folder in --out (default: that of the file)
+    recipe, views, seed, mu_water   as of `lingo-mi fit`
+    any setting of the fit, such as iterations or lambda_tv, or parameter of the scene
+
+The whole list is checked first: every row that cannot be used gets a line, and nothing is begun. Then each scan is fitted into
+--out/NAME, and results.csv (and results.parquet, with pyarrow) gets a row of every number. A scan that fails is tried once more
+when all others have ended. The same command goes on after any interruption: what is done stays, a fit that was begun continues
+from its checkpoint.
+
+With --cluster, scans are fitted side by side on the workers of a Dask cluster, each with one GPU or some threads of the CPU.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser, cluster_arguments, runner_of
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
+from lingo_mi.folder_lock import locked
+from lingo_mi.runtime import use_variant
+
+SHOWN = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'gaussians', 'seconds_fit'
+
+
+def arguments() -> argparse.Namespace:
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('list', type=Path, metavar='LIST.csv', help='the scans, see above')
+    p.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the results')
+    p.add_argument(
+        '--recipe',
+        default='fast',
+        metavar='R',
+        help='of rows that name none: RECIPE[:setting=value,...] (default: fast)',
+    )
+    cluster_arguments(p)
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    return p.parse_args()
+
+
+def main() -> None:
+    args = arguments()
+    from lingo_mi.cohort.listing import BadList, read_list
+    from lingo_mi.cohort.run import done_already
+    from lingo_mi.cohort.table import CSV
+    from lingo_mi.fitting.recipes import settings_of
+
+    settings_of(args.recipe)
+    out = args.out
+    if out.exists() and not out.is_dir():
+        raise InputError(f'{out}: is a file, not a folder; choose another --out')
+    if args.list.resolve() == (out / CSV).resolve():
+        raise InputError(f'{args.list}: is the table that this command writes; choose another --out')
+    use_variant(args.variant)  # reading scenes needs one
+    try:
+        rows = read_list(args.list, args.recipe)
+        require_writable(out, out, 'choose another --out')
+        with locked(out):
+            run(args, rows, done_already(rows, out))
+    except BadList as error:
+        for line in error.lines:
+            print(f'error: {line}', file=sys.stderr)
+        raise
+
+
+def run(args: argparse.Namespace, rows: list, done: dict) -> None:
+    """Fit what is not done, in a folder that no other batch writes to, and say what came of it."""
+    from lingo_mi.cohort.run import run_cohort
+
+    if done:
+        print(f'{len(done)} of {len(rows)} scans are done already')
+    with runner_of(args, args.out) as runner:
+        found = run_cohort(rows, args.out, runner, done)
+    width = max(len(row.name) for row in rows)
+    print(f'{"":{width}s}  ' + '  '.join(f'{name:>11s}' for name in SHOWN))
+    for name, numbers in found.numbers.items():
+        values = (numbers.get(key) for key in SHOWN)
+        print(f'{name:{width}s}  ' + '  '.join(f'{"" if v is None else f"{v:.6g}":>11s}' for v in values))
+    for name, line in found.failed.items():
+        print(f'failed: {name}: {line}', file=sys.stderr)
+    print(', '.join(map(str, found.files)))
+    if found.failed:
+        raise InputError(f'{len(found.failed)} of {len(rows)} scans failed twice; the same command tries them again')

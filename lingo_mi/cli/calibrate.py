@@ -1,0 +1,74 @@
+"""Find where a scanner's panel really is (an axis off centre, a panel turned in its plane, one that drifts), and what its
+detector makes of line integrals."""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+from lingo_mi.runtime import use_variant
+
+EPILOG = """\
+examples:
+  lingo-mi calibrate scan.npy
+      prints what was found; changes nothing
+  lingo-mi calibrate scan.npy --drift 3 --out calibrated.npy
+      also a drift over the scan; writes the scan with the geometry that was found
+  lingo-mi fit x3d_foot --projections calibrated.npy"""
+
+
+def main() -> None:
+    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        'scan', help='a scan in any format that --projections of fit reads, views in the order of their time'
+    )
+    parser.add_argument(
+        '--drift',
+        type=int,
+        default=0,
+        metavar='N',
+        help='degree of a polynomial in time for its shifts (default 0: none)',
+    )
+    parser.add_argument('--air', action='store_true', help='also an air level, smooth in time')
+    parser.add_argument('--gain', action='store_true', help='also a gain of the views, smooth in time')
+    parser.add_argument(
+        '--curve',
+        type=int,
+        default=0,
+        metavar='K',
+        help='also a curve of K coefficients from line integral to measured value, as of beam hardening',
+    )
+    parser.add_argument('--scatter', action='store_true', help='also scattered light, one smooth image for all views')
+    parser.add_argument(
+        '--out', type=Path, metavar='F.npy', help='the scan with the geometry found; F.yml is written beside it'
+    )
+    parser.add_argument('--force', action='store_true', help='overwrite existing files')
+    parser.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    args = parser.parse_args()
+    written = []
+    if args.out is not None:
+        if args.out.suffix != '.npy':
+            raise InputError(
+                f'{args.out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy'
+            )
+        written = [args.out, args.out.with_suffix('.yml'), args.out.with_name(args.out.stem + '.valid.npy')]
+        if Path(args.scan).resolve() in [file.resolve() for file in written]:
+            raise InputError(f'{args.scan}: would be overwritten; give --out another name')
+        for file in written:
+            if file.exists() and not args.force:
+                raise InputError(f'{file}: exists already; give --force to overwrite it')
+    use_variant(args.variant)
+    from lingo_mi.api.calibration import calibrate
+    from lingo_mi.files.scans import read_scan, write_scan
+
+    scan = read_scan(args.scan).train
+    calibration = calibrate(
+        scan, drift=args.drift, air=args.air, gain=args.gain, curve=args.curve, scatter=args.scatter
+    )
+    print('\n'.join(calibration.lines()))
+    if not calibration.needed:
+        print('nothing to correct was found')
+    if args.out is not None:
+        history = dict(calibrated_from=Path(args.scan).name, calibration=calibration.lines())
+        write_scan(args.out, calibration.corrected(scan), 'npy', history)
+        print(args.out)

@@ -1,0 +1,46 @@
+"""Show results side by side: the same slices and views, their differences, numbers, settings and times, in one page."""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser, writing_file
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable, write_text
+
+EPILOG = """\
+examples:
+  lingo-mi compare out/fast out/lingo
+      writes compare.html in the current folder; differences are to the first result
+  lingo-mi compare out/fast out/x3d_foot-fdk.nii.gz --truth foot.nii.gz --out fast-fdk.html
+      a fit and a volume of reconstruct, with their differences to the true volume"""
+
+
+def main() -> None:
+    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        'results',
+        nargs='+',
+        metavar='RESULT',
+        help='a folder that fit wrote, or a volume in any format that --volume reads',
+    )
+    parser.add_argument('--truth', type=Path, metavar='F', help='the true volume, to compare with')
+    parser.add_argument(
+        '--out', type=Path, default=Path('compare.html'), metavar='F.html', help='the page (default: compare.html)'
+    )
+    parser.add_argument('--title', default='', help='of the page')
+    parser.add_argument('--force', action='store_true', help='replace an earlier page')
+    args = parser.parse_args()
+    from lingo_mi.files.volumes import read_volume
+    from lingo_mi.results.compare import compare_page
+    from lingo_mi.results.stored import read_stored
+
+    if args.out.suffix.lower() not in ('.html', '.htm'):
+        raise InputError(f'{args.out}: a comparison is a page; give a name that ends in .html')
+    if args.out.exists() and not args.force:
+        raise InputError(f'{args.out}: exists already; give --force to replace it, or another --out')
+    require_writable(args.out.parent, args.out)
+    found = [read_stored(path) for path in args.results]
+    page = compare_page(found, read_volume(args.truth) if args.truth else None, args.title)
+    with writing_file(args.out):
+        write_text(args.out, page)
+    print(args.out)

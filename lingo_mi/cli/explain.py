@@ -1,0 +1,65 @@
+"""Measure which errors of a scanner explain what a reconstruction leaves of a measured scan.
+
+    lingo-mi explain walnut_cone.npz --views 30
+    lingo-mi explain htc2022_fan.npz --views 60 --binning 2
+    lingo-mi explain walnut_cone.npz --views 30 --correct drift
+    lingo-mi explain walnut_cone.npz --views 30 --with-cloud
+
+Calibrates the views that are kept, adds what was found kind by kind, and compares predictions of the other views with what was
+measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to --out.
+"""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+from lingo_mi.runtime import use_variant
+
+KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
+
+
+def arguments() -> argparse.Namespace:
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('scan', help='a measured scan, views in the order in which they were taken')
+    p.add_argument('--views', type=int, default=30, metavar='N', help='evenly spaced views to keep (default 30)')
+    p.add_argument('--binning', type=int, default=1, metavar='N', help='N x N pixels, and voxels, as one (default 1)')
+    p.add_argument(
+        '--with-cloud',
+        action='store_true',
+        help='instead: corrections that fits of the recipe fast find with the cloud',
+    )
+    p.add_argument(
+        '--correct',
+        nargs='*',
+        default=list(KINDS),
+        choices=KINDS,
+        metavar='KIND',
+        help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
+    )
+    p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the recipe's)")
+    p.add_argument('--out', type=Path, default=Path('out/explain'), metavar='D', help='folder of the results')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    return p.parse_args()
+
+
+def main() -> None:
+    args = arguments()
+    if args.binning < 1:
+        raise InputError(f'--binning must be at least 1, not {args.binning}')
+    use_variant(args.variant)
+    from lingo_mi.api.data import load
+    from lingo_mi.studies.explain import binned, cloud_rows, find, report, rows
+
+    dataset = load(args.scan, views=args.views)
+    if dataset.test is None:
+        raise InputError(f'{args.scan}: no view is held out: give fewer --views')
+    dataset = binned(dataset, args.binning)
+    if args.with_cloud:
+        settings = {} if args.iterations is None else dict(iterations=args.iterations)
+        found = list(cloud_rows(dataset, **settings))
+        print(report(found, args.out, 'found with the cloud'))
+        return
+    calibration = find(dataset, args.correct)
+    print('\n'.join(calibration.lines()))
+    print(report(list(rows(dataset, calibration)), args.out, 'corrected'))

@@ -1,0 +1,100 @@
+"""One scan of a cohort: what to read, how to fit it, and the folder of its result."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import reading
+from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
+
+# How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
+COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scan of a list.
+
+    name        of the folder of its result
+    line        of the list
+    folder      of the list, which relative paths begin from
+    file        projections; with a scene for the geometry, a CT volume for its scanner, or '' for its own objects
+    geometry    '', a geometry file, or a scene: its file, or the name of a shipped one
+    recipe      or `recipe:setting=value,...`
+    views       evenly spaced ones to fit; None: all
+    seed        of every random choice
+    mu_water    of a CT volume in Hounsfield units, in 1/mm
+    settings    that differ from the recipe's, as text
+    parameters  of the scene, as text
+    """
+
+    name: str
+    line: int
+    folder: str
+    file: str = ''
+    geometry: str = ''
+    recipe: str = 'fast'
+    views: int | None = None
+    seed: int = 0
+    mu_water: float | None = None
+    settings: dict[str, str] = field(default_factory=dict)
+    parameters: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def path(self) -> Path | None:
+        """Of the file."""
+        return Path(self.folder) / self.file if self.file else None
+
+    def fit_settings(self) -> Settings:
+        """All settings of the fit. Raises InputError for an unknown one, or a value out of its range."""
+        return settings_of(self.recipe, **self.settings)
+
+    def request(self) -> dict:
+        """What a stored result must be the answer to: the file, by its name in the list and its size, and all that the numbers
+        depend on."""
+        path = self.path
+        size = path.stat().st_size if path is not None and path.is_file() else None
+        settings = {name: value for name, value in self.fit_settings().flat().items() if name != 'checkpoint_seconds'}
+        kept = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
+        return json.loads(json.dumps(kept | dict(bytes=size, settings=settings)))  # as a file has it
+
+
+def stored(out: Path, row: Row) -> dict | None:
+    """The metrics of a row's whole result in the folder `out`; None where it has not been completed.
+
+    Raises InputError where the row's folder holds something else: another row's result, or files that are not ours.
+    """
+    folder = out / row.name
+    if folder.is_symlink() or folder.exists() and not folder.is_dir():
+        raise InputError(f'{folder}: is a link or a file, not a folder; move it away, or give another name')
+    there = occupants(folder) if folder.is_dir() else []
+    if not there:
+        return None
+    if METRICS not in there and CHECKPOINT not in there:
+        raise InputError(f'{folder}: holds files but no result; move it away, or give another name')
+    require_ours(folder, FILES)
+    if METRICS not in there:
+        return None
+    try:
+        with reading(folder / METRICS):
+            found = json.loads((folder / METRICS).read_text(encoding='utf-8'))
+        files, asked, wanted = found['files'], found.get('request'), row.request()
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
+    if not isinstance(asked, dict):
+        raise InputError(f'{folder}: holds a result that is none of a list; give another name')
+    if changed := [k for k in wanted if asked.get(k) != wanted[k]]:
+        if changed == ['settings']:
+            changed = [k for k, v in wanted['settings'].items() if asked['settings'].get(k) != v]
+        raise InputError(
+            f'{folder}: holds a result of other values of {", ".join(changed)}; remove it, or give another name'
+        )
+    missing = [name for name in files if not (folder / name).exists()]
+    if missing:
+        raise InputError(f'{folder / missing[0]}: is missing from a whole result; remove the folder, to fit it again')
+    return found

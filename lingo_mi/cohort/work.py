@@ -1,0 +1,81 @@
+"""The fit of one scan of a cohort, into the folder of its name."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lingo_mi.cohort.listing import scene_of
+from lingo_mi.cohort.row import Row, stored
+from lingo_mi.errors import InputError
+from lingo_mi.files.scans import read_scan
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.folder_lock import locked
+from lingo_mi.output_folder import CHECKPOINT, clear_leftovers
+from lingo_mi.results.fit_into import fit_into
+from lingo_mi.scan import Dataset
+from lingo_mi.scene.checks import check_memory, warn_if_truncated
+from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.simulate import choose_views, take_scan
+
+PATIENCE = 60.0  # seconds: a worker that has lost its scheduler stops after its step, and writes its checkpoint
+
+
+def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
+    """Fit a row's scan into the folder `out`/NAME: from its checkpoint, if there is one. Returns the metrics of the result.
+
+    report   called between steps; after its KeyboardInterrupt, and after a kill, the same call goes on
+
+    What is there already is not done again. Raises InputError where the scan cannot be fitted.
+    """
+    folder = Path(out) / row.name
+    with _patiently_locked(folder, report):
+        clear_leftovers(folder)
+        if (done := stored(Path(out), row)) is not None:
+            return done
+        return fit_into(
+            folder,
+            read_row(row),
+            row.fit_settings(),
+            row.seed,
+            report,
+            resume=(folder / CHECKPOINT).exists(),
+            title=row.name,
+            method=row.recipe.partition(':')[0],
+            request=row.request(),
+        )
+
+
+def read_row(row: Row) -> Dataset:
+    """The scan of a row: its projections, or what the scene's scanner sees of its volume. Raises InputError."""
+    scene = scene_of(row)
+    if scene is not None:
+        volume = None if row.path is None else read_volume(row.path, row.mu_water)
+        return take_scan(load_scene(scene, row.parameters), row.views or 0, volume, row.seed)
+    geometry = Path(row.folder) / row.geometry if row.geometry else None
+    dataset = choose_views(read_scan(row.path, geometry), row.views or 0)
+    check_memory(dataset.train.geometry)
+    warn_if_truncated(dataset.train.geometry)
+    return dataset
+
+
+@contextmanager
+def _patiently_locked(folder: Path, report: Callable[..., None]) -> Iterator[None]:
+    """The folder's lock, which a process that is about to stop may still hold."""
+    ends = time.monotonic() + PATIENCE
+    while True:
+        lock = locked(folder)
+        try:
+            lock.__enter__()
+            break
+        except InputError:
+            if time.monotonic() > ends:
+                raise
+        report(0)
+        time.sleep(0.2)
+    try:
+        yield
+    finally:
+        lock.__exit__(None, None, None)

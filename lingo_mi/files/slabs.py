@@ -1,0 +1,138 @@
+"""Volumes written slab by slab, which need not fit into memory: NIfTI, and OME-Zarr with a pyramid.
+
+Both keep slices along z together, so that a slab is appended to a NIfTI file, and makes whole chunks of a Zarr array.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import new_folder, optional, replacing
+from lingo_mi.files.arrays import numeric
+from lingo_mi.files.volumes import first_voxel, volume_header
+from lingo_mi.geometry.base import Geometry
+
+NIFTI, ZARR = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr')
+THICKNESS = 64  # slices of a slab, unless the caller chooses
+AXES = 'z', 'y', 'x'
+CHUNK = 64  # voxels a side of an OME-Zarr's chunks, at most
+LEAST = 64  # voxels along the longest side of the coarsest level of a pyramid
+
+
+def write_slabs(
+    path: PathLike | str, geometry: Geometry, slabs: Iterable[np.ndarray], description: str = 'density per mm'
+) -> None:
+    """Write a volume on a geometry's voxels, whole or not at all, holding one slab of it at a time.
+
+    path          .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of
+                  2 x 2 x 2 voxels)
+    geometry      of the whole volume
+    slabs         float32 [x, y, slices] from the first slice on, together the whole volume
+    description   of the values, for NIfTI
+
+    Raises InputError for another suffix, values that are not finite, slabs that do not make the volume, and a file that cannot be
+    written. Slabs of `THICKNESS` slices make whole chunks of .ome.zarr, which are written fastest.
+
+        write_slabs('foot.ome.zarr', scan.geometry, FDK().slabs(scan, 64))
+    """
+    path = Path(path)
+    if path.name.endswith(NIFTI):
+        _write_nifti(path, geometry, slabs, description)
+    elif path.name.endswith(ZARR):
+        _write_zarr(path, geometry, slabs)
+    else:
+        raise InputError(
+            f'{path}: volumes are written as NIfTI (.nii, .nii.gz) or OME-Zarr (.ome.zarr); give such a name'
+        )
+
+
+def _checked(path: Path, geometry: Geometry, slabs: Iterable[np.ndarray]):
+    """The slabs, float32, with their first slices."""
+    begin = 0
+    for slab in slabs:
+        slab = np.asarray(numeric(np.asarray(slab), path, 3), np.float32)
+        if slab.shape[:2] != geometry.nVoxel[:2] or begin + slab.shape[2] > geometry.nVoxel[2]:
+            raise InputError(f'{path}: slabs of the shape {slab.shape} do not make {geometry.nVoxel} voxels')
+        yield begin, slab
+        begin += slab.shape[2]
+    if begin < geometry.nVoxel[2]:
+        raise InputError(f'{path}: slabs of {begin} slices do not make {geometry.nVoxel} voxels')
+
+
+def _write_nifti(path, geometry, slabs, description):
+    header = volume_header(path, geometry.nVoxel, geometry.dVoxel, first_voxel(geometry), description)
+    with ExitStack() as stack:
+        temporary = stack.enter_context(replacing(path))
+        if path.suffix == '.gz':
+            file = stack.enter_context(gzip.open(temporary, 'wb', 1))  # nibabel's level
+        else:
+            file = stack.enter_context(open(temporary, 'wb'))
+        file.write(header)
+        for _, slab in _checked(path, geometry, slabs):
+            file.write(slab.astype('<f4', copy=False).tobytes(order='F'))
+
+
+def _write_zarr(path, geometry, slabs):
+    zarr, writer = optional('zarr', 'ome-zarr'), optional('ome_zarr.writer', 'ome-zarr')
+    shapes = [geometry.nVoxel[::-1]]
+    while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
+        shapes.append(tuple(n // 2 for n in shapes[-1]))
+    with new_folder(path) as temporary:
+        group = zarr.open_group(str(temporary), mode='w', zarr_format=3)
+        levels = [
+            group.create_array(
+                str(i), shape=s, chunks=tuple(min(n, CHUNK) for n in s), dtype='float32', dimension_names=AXES
+            )
+            for i, s in enumerate(shapes)
+        ]
+        for begin, slab in _grouped(_checked(path, geometry, slabs), 2 ** (len(levels) - 1)):
+            _add(levels, begin, slab.transpose(2, 1, 0))
+        _describe(writer, group, geometry, len(levels))
+
+
+def _grouped(slabs: Iterable[tuple[int, np.ndarray]], step: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The same slices in slabs that begin at multiples of a pyramid's coarsest step."""
+    begin, kept = 0, None
+    for _, slab in slabs:
+        kept = slab if kept is None else np.concatenate([kept, slab], 2)
+        whole = kept.shape[2] // step * step
+        if whole:
+            yield begin, kept[:, :, :whole]
+            begin, kept = begin + whole, kept[:, :, whole:]
+    if kept is not None and kept.shape[2]:
+        yield begin, kept
+
+
+def _add(levels: list[Any], begin: int, slab: np.ndarray) -> None:
+    """Write a slab [z, y, x] to every level."""
+    for i, level in enumerate(levels):
+        if i:
+            z, y, x = (n // 2 * 2 for n in slab.shape)  # a voxel left over is in no coarser one
+            slab = slab[:z, :y, :x].reshape(z // 2, 2, y // 2, 2, x // 2, 2).mean((1, 3, 5), dtype=np.float32)
+            begin //= 2
+        end = min(begin + len(slab), level.shape[0])
+        level[begin:end] = slab[: end - begin]
+
+
+def _describe(writer, group, geometry, levels):
+    corner, step = first_voxel(geometry)[::-1], np.array(geometry.dVoxel)[::-1]
+    datasets = [
+        dict(
+            path=str(i),
+            coordinateTransformations=[
+                dict(type='scale', scale=(step * 2**i).tolist()),
+                dict(type='translation', translation=(corner + step * (2**i - 1) / 2).tolist()),
+            ],
+        )
+        for i in range(levels)
+    ]
+    axes = [dict(name=name, type='space', unit='millimeter') for name in AXES]
+    writer.write_multiscales_metadata(group, datasets, axes=axes)

@@ -1,0 +1,192 @@
+"""Jobs on the workers of a Dask cluster: one that is there already, or processes of this machine."""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import re
+import secrets
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from lingo_mi.errors import InputError, brief
+from lingo_mi.file_access import optional
+from lingo_mi.gpu import visible_gpus
+from lingo_mi.jobs.job import Event, Job, Tell
+from lingo_mi.jobs.worker import describe_worker, require_fit, work
+from lingo_mi.progress import Progress
+
+PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
+MOST_LOCAL = 1024
+
+
+@contextmanager
+def opened(address: str, folder: Path, threads: int = 0, variant: str | None = None) -> Iterator[Cluster]:
+    """A cluster, connected to; workers that were started here end with the block.
+
+    address   'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine
+    folder    that all workers must see; it exists
+    threads   of Dr.Jit a worker, on the CPU (0: all that a worker has; of local:N, its share)
+    variant   of Mitsuba on the workers; None: each chooses
+
+    Raises InputError where nobody answers there, and for workers that cannot do the jobs.
+    """
+    distributed = optional('distributed', 'cluster')
+    local = re.fullmatch(r'local:(\d{1,9})', address)
+    if address.startswith('local') and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
+        raise InputError(f'--cluster {address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
+    with ExitStack() as stack:
+        import dask
+
+        # No more than one job a worker is given away: the others wait for whoever is free.
+        stack.enter_context(dask.config.set({'distributed.scheduler.worker-saturation': 1.0}))
+        if local:
+            count = int(local[1])
+            threads = threads or max(1, _cores() // count)
+            where: dict[str, Any] = dict(address=stack.enter_context(_local(distributed, count)))
+        elif address.endswith('.json'):
+            if not Path(address).is_file():
+                raise InputError(f'--cluster {address}: there is no such file of a scheduler; check the path')
+            where = dict(scheduler_file=address)
+        else:
+            where = dict(address=address)
+        try:
+            client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
+        except (OSError, ValueError) as error:  # TimeoutError is an OSError; ValueError: no address
+            raise InputError(f'--cluster {address}: no scheduler answers ({brief(error, 120)}); check it') from None
+        yield Cluster(client, Path(folder).resolve(), threads, variant)
+
+
+class Cluster:
+    """A `Runner` on the workers of a Dask client."""
+
+    def __init__(self, client: Any, folder: Path, threads: int, variant: str | None):
+        self.client, self.folder, self.threads, self.variant = client, str(folder), threads, variant
+        self._require_workers()
+
+    @property
+    def dashboard(self) -> str:
+        """Address of the page that shows what the workers do."""
+        return self.client.dashboard_link
+
+    def run(self, jobs: list[Job], tell: Tell) -> None:
+        events: queue.SimpleQueue = queue.SimpleQueue()
+        topic, by_name = f'lingo_mi-{secrets.token_hex(6)}', {job.name: job for job in jobs}
+        futures = {}
+        try:
+            self.client.subscribe_topic(topic, lambda event: events.put(event[1]))
+            for i, job in enumerate(jobs):
+                key = f'{topic}-{i}'
+                arguments = job, key, topic, self.folder, self.threads, self.variant
+                future = self.client.submit(work, *arguments, key=key, pure=False, priority=-i)
+                futures[job.name] = future
+                future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
+            with Progress('Jobs', sum(job.steps for job in jobs)) as bar:
+                _follow(by_name, events, tell, bar)
+            self.client.unsubscribe_topic(topic)
+        except KeyboardInterrupt:
+            self._stop(futures, events)
+            raise
+        except _gone() as error:
+            raise InputError(
+                f'the scheduler has gone ({brief(error, 100)}); start one, and run the same command again'
+            ) from None
+        finally:
+            for future in futures.values():
+                future.release()
+
+    def _stop(self, futures: dict, events: queue.SimpleQueue) -> None:
+        """Tell all jobs to stop, and wait until those that run have stored what they have."""
+        running = {name for names in self.client.processing().values() for name in names}
+        waiting = {name for name, future in futures.items() if future.key in running}
+        print('\nstopping after a step of every job; Ctrl-C again to stop at once', file=sys.stderr)
+        self.client.cancel(list(futures.values()))
+        ends = time.monotonic() + PATIENCE
+        while waiting and time.monotonic() < ends:
+            try:
+                name, kind, _ = events.get(timeout=0.2)
+            except queue.Empty:
+                continue
+            if kind == 'stopped':
+                waiting.discard(name)
+
+    def _require_workers(self) -> None:
+        try:
+            self.client.wait_for_workers(1, timeout=PATIENCE)
+        except TimeoutError:
+            raise InputError(
+                f'--cluster: no worker came within {PATIENCE:.0f} s; start some, with --nthreads 1'
+            ) from None
+        for found in self.client.run(describe_worker, self.folder).values():
+            require_fit(found, self.folder)
+
+
+def _gone() -> tuple[type[BaseException], ...]:
+    """What a client raises whose scheduler does not answer any more."""
+    from distributed.client import FutureCancelledError
+    from distributed.comm import CommClosedError
+
+    return CommClosedError, FutureCancelledError, TimeoutError
+
+
+def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress) -> None:
+    """Pass events on until every job has ended."""
+    steps, running, left = dict.fromkeys(jobs, 0), set(), set(jobs)
+    while left:
+        try:
+            name, kind, value = events.get(timeout=0.5)
+        except queue.Empty:
+            continue
+        if name not in left:  # told before it ended, and come after
+            continue
+        if kind == 'ended':
+            event = _end(name, value)
+            left.discard(name)
+            running.discard(name)
+            steps[name] = jobs[name].steps
+            tell(event)
+        elif kind == 'began':
+            running.add(name)
+            tell(Event(name, kind, value))
+        elif kind == 'resumed':
+            tell(Event(name, kind, value))
+        elif kind == 'step':
+            steps[name] = max(value, steps[name])
+        bar.update(sum(steps.values()), ended=f'{len(jobs) - len(left)} of {len(jobs)}', running=len(running))
+
+
+def _end(name: str, future: Any) -> Event:
+    """How a task ended. A worker's death is no error of a job before several have died of it."""
+    if future.status == 'finished':
+        event = Event(*future.result())
+        return event if event.kind != 'stopped' else Event(name, 'failed', 'was cancelled on its worker')
+    if future.status == 'cancelled':
+        return Event(name, 'failed', 'was cancelled on the cluster, or the scheduler has gone')
+    error = future.exception()
+    return Event(name, 'failed', brief(f'{type(error).__name__}: {error}'))
+
+
+@contextmanager
+def _local(distributed: Any, count: int) -> Iterator[str]:
+    """A scheduler and worker processes of this machine, each with one thread for tasks and, where there are any, one GPU."""
+    gpus = visible_gpus()
+
+    def options(i):
+        env = {'CUDA_VISIBLE_DEVICES': gpus[i % len(gpus)]} if gpus else {}
+        return dict(
+            nthreads=1, memory_limit=0, env=env, silence_logs=logging.ERROR
+        )  # memory is watched by `lingo_mi.memory`
+
+    workers = {i: dict(cls=distributed.Nanny, options=options(i)) for i in range(count)}
+    scheduler = dict(cls=distributed.Scheduler, options=dict(host='127.0.0.1', dashboard_address='127.0.0.1:0'))
+    with distributed.SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR) as cluster:
+        yield cluster.scheduler_address
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1

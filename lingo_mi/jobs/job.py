@@ -1,0 +1,95 @@
+"""A job, what is told of it, and how it ends."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+from lingo_mi.errors import InputError, brief
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work, which can be sent to another machine.
+
+    name        of the job, another one for each
+    steps       that it reports, for the progress
+    function    of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its
+                steps, where KeyboardInterrupt says that it must stop; what it has stored by then it finds again
+    arguments   that pickle
+    """
+
+    name: str
+    steps: int
+    function: Callable[..., Any]
+    arguments: tuple = ()
+
+
+class Event(NamedTuple):
+    """What is told of a job.
+
+    name    of the job
+    kind    'began'; 'resumed', where its first step is not the first of all; 'step'; and at the end 'done', 'failed', or
+            'stopped': interrupted, and to be gone on with
+    value   began: where (text); resumed, step: the steps done; done: what the function returned; failed: one line
+    """
+
+    name: str
+    kind: str
+    value: Any = None
+
+
+Tell = Callable[[Event], object]
+
+
+class Runner(Protocol):
+    """Runs jobs, telling of each; every job ends in 'done' or 'failed'. Raises KeyboardInterrupt after Ctrl-C."""
+
+    def run(self, jobs: list[Job], tell: Tell) -> None: ...
+
+
+def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
+    """Run a job here: its last event, 'done' or 'failed'. What no `InputError` explains is also printed with its traceback.
+
+    report   called between steps, as the job's own
+    tell     called with 'resumed', where the job goes on from what is stored
+    """
+    first = True
+
+    def watch(done, **fields):
+        nonlocal first
+        if first and done > 1:
+            tell(Event(job.name, 'resumed', done))
+        first = first and not done
+        report(done, **fields)
+
+    try:
+        return Event(job.name, 'done', job.function(*job.arguments, report=watch))
+    except (InputError, OSError) as error:
+        return Event(job.name, 'failed', brief(error))
+    except MemoryError as error:
+        return Event(job.name, 'failed', f'not enough memory ({brief(error, 200)})')
+    except Exception as error:  # of one job: the others are worth having
+        traceback.print_exc()
+        return Event(job.name, 'failed', brief(f'{type(error).__name__}: {error}'))
+
+
+def run_all(jobs: list[Job], runner: Runner, tell: Tell) -> dict[str, str]:
+    """Run all jobs, and those that failed once more when all others have ended; the one line of each that failed twice, by name.
+
+    tell   called with every event, in this thread. After a first 'failed' the job begins again
+    """
+    failed: dict[str, str] = {}
+
+    def listen(event: Event) -> None:
+        if event.kind == 'failed':
+            failed[event.name] = event.value
+        tell(event)
+
+    runner.run(jobs, listen)
+    if again := [job for job in jobs if job.name in failed]:
+        failed.clear()
+        runner.run(again, listen)
+    return failed

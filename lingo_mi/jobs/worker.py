@@ -1,0 +1,87 @@
+"""What a worker of a cluster does with a job."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lingo_mi.errors import InputError
+from lingo_mi.jobs.job import Event, Job, attempt
+
+PAUSE = 1.0  # seconds between two reports
+
+
+def describe_worker(folder: str, dask_worker: Any) -> dict:
+    """Version, threads for tasks, address of this worker, and whether it sees a folder; called by `Client.run`."""
+    return dict(
+        version=version('lingo_mi'),
+        tasks=dask_worker.state.nthreads,
+        address=dask_worker.address,
+        sees=Path(folder).is_dir(),
+    )
+
+
+def require_fit(found: dict, folder: str) -> None:
+    """Raises InputError where a worker, by what `describe_worker` says, cannot do the jobs."""
+    who = f'worker {found["address"]}'
+    if found['version'] != (ours := version('lingo_mi')):
+        raise InputError(f'{who}: has lingo_mi {found["version"]}, not {ours}; install the same there')
+    if found['tasks'] != 1:
+        raise InputError(
+            f'{who}: runs {found["tasks"]} tasks at once, which would share one Dr.Jit; start it with --nthreads 1'
+        )
+    if not found['sees']:
+        raise InputError(
+            f'{who}: does not see the folder {folder}; choose one on a file system that all machines share'
+        )
+
+
+def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str | None) -> Event:
+    """Run a job in a task of Dask; returns its last event.
+
+    key       of the task
+    topic     of the events that it sends
+    folder    that all workers share
+    threads   of Dr.Jit on the CPU; 0: as many as it has
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    worker.log_event(topic, Event(job.name, 'began', worker.address))
+    told = time.monotonic()
+
+    def report(done, **_):
+        nonlocal told
+        if time.monotonic() - told > PAUSE:
+            told = time.monotonic()
+            worker.log_event(topic, Event(job.name, 'step', done))
+            task = worker.state.tasks.get(key)
+            if task is None or task.state == 'cancelled':  # nobody waits for it any more
+                raise KeyboardInterrupt
+
+    try:
+        require_fit(describe_worker(folder, worker), folder)
+        _prepare(threads, variant)
+        return attempt(job, report, lambda event: worker.log_event(topic, event))
+    except InputError as error:
+        return Event(job.name, 'failed', str(error))
+    except KeyboardInterrupt:
+        worker.log_event(topic, Event(job.name, 'stopped'))
+        return Event(job.name, 'stopped')
+
+
+def _prepare(threads: int, variant: str | None) -> None:
+    import mitsuba as mi
+
+    from lingo_mi.runtime import ensure_variant, use_variant
+
+    if variant is None:
+        ensure_variant()
+    elif mi.variant() != variant:
+        use_variant(variant)
+    import drjit as dr
+
+    if threads and dr.thread_count() != threads:
+        dr.set_thread_count(threads)

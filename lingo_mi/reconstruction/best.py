@@ -1,0 +1,225 @@
+"""The best voxel volume of a scan: settings are chosen by measured views that are held out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import ndimage
+
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.asd_pocs import ASDPOCS
+from lingo_mi.reconstruction.held_out import Score, Trial, Watch, split
+from lingo_mi.reconstruction.parameters import check_counts
+from lingo_mi.reconstruction.refined import Refined, structure
+from lingo_mi.reconstruction.wide_pixels import excess_width
+from lingo_mi.scan import Scan
+
+START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
+SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
+PLAIN, REFINED, SMOOTHED = 'asd-pocs', 'refined', 'refined, smooth'
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen(Reconstruction):
+    """A `Reconstruction` by `Best`, with what it was chosen by.
+
+        found = lm.reconstruct(scan, lm.Best())
+        print(found.report())
+
+    plan    the settings tried, a `Trial` each, in this order
+    taken   number of the one that was taken
+    error   float32 [x, y, z], density per mm: see `error_map`
+    """
+
+    plan: tuple[Trial, ...] = ()
+    taken: int = 0
+    error: np.ndarray | None = None
+
+    def report(self) -> str:
+        """What was tried, one line each: setting, voxels, passes, and how far the held-out views are off (`Score`)."""
+        lines = []
+        for i, trial in enumerate(self.plan):
+            size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.geometry.dVoxel)
+            mark = '*' if i == self.taken else ' '
+            lines.append(f'{mark} {trial.name:16} voxels {size} mm, {trial.niter:2} passes: {trial.score:.5f}')
+        return '\n'.join(lines)
+
+    def record(self) -> dict[str, Any]:
+        """The plan as plain values, for a JSON file."""
+        return dict(
+            score='|A x - b| / |b| of the held-out views, weighted by the root of the frequency, after every pass',
+            taken=self.taken,
+            tried=[trial.record for trial in self.plan],
+            seconds=self.seconds,
+        )
+
+
+@dataclass(frozen=True)
+class Best(Algorithm):
+    """Refined ASD-POCS whose settings are chosen by measured views that it holds out. It needs no cloud and no truth.
+
+    1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
+       are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
+    2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector) are
+       tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits them, and more total
+       variation is tried.
+    3. The setting that predicts the views best, with its number of passes, is applied to all views.
+
+    Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks; the result is
+    their mean over each voxel. The scan's own voxels are taken for objects that have no such detail.
+
+    niter      passes of a refinement, at most, at least 1
+    finer      parts along each side of a voxel to try, at least 1 (1: the scan's voxels only); memory grows with its cube
+    held_out   one view in so many is held out, at least 2
+    seed       of the random orders, at least 0
+
+        >>> from lingo_mi.phantoms import make, x3d_scan
+        >>> measured = x3d_scan.scan(make('foot', 24), views=10, pixels=48).train
+        >>> found = Best(niter=5).run(measured)
+        >>> len(found.plan) >= 3, found.error.shape
+        (True, (24, 24, 24))
+
+    Held-out views choose between regularisations as in cross-validation (Golub, Heath and Wahba, Technometrics 21, 1979). Raises
+    InputError for an option out of its range, and for a scan of fewer than four views.
+    """
+
+    name: ClassVar[str] = 'best'
+
+    niter: int = 20
+    finer: int = 2
+    held_out: int = 5
+    seed: int = 0
+
+    def __post_init__(self):
+        check_counts(niter=self.niter, finer=self.finer)
+        check_counts(least=2, held_out=self.held_out)
+        check_counts(least=0, seed=self.seed)
+
+    def steps(self, scan: Scan) -> int:
+        return 2 * START + 2 * TRIAL + 3 * self.niter
+
+    def grid(self, geometry: Geometry) -> Geometry:
+        return Refined(finer=self.finer).grid(geometry)
+
+    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Chosen:
+        """Reconstruct the volume of a scan, see `Algorithm.run`. The residuals are those of the last refinement.
+
+        Raises InputError for a `start`, which would have seen the views that are held out.
+        """
+        if start is not None:
+            raise InputError('best starts from nothing, since a volume has seen the views that it holds out')
+        began, count = time.perf_counter(), self._counter(progress, self.steps(scan))
+        kept, held_out = split(scan, self.held_out)
+        plan = self._plan(kept, held_out, count)
+        taken = int(np.argmin([trial.score for trial in plan]))
+        found = self._apply(scan, plan[0].niter, plan[taken], count)
+        chosen = plan[taken]
+        assert chosen.volume is not None  # of its best pass
+        tried = means(chosen.volume, chosen.finer)
+        volume = means(found.volume, chosen.finer)
+        if progress is not None:
+            progress(self.steps(scan), self.steps(scan), found.residuals[-1])
+        for trial in plan:
+            trial.volume = None
+        return Chosen(
+            volume,
+            found.residuals,
+            time.perf_counter() - began,
+            scan.geometry,
+            tuple(plan),
+            taken,
+            error_map(volume, tried),
+        )
+
+    def _plan(self, kept: Scan, held_out: Scan, count) -> list[Trial]:
+        plain = Trial(PLAIN, 1)
+        ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain))
+        plan = [plain]
+        own = self._try(kept, held_out, plain, REFINED, 1, count, by=TRIAL)
+        plan.append(own)
+        if self.finer > 1:
+            plan.append(self._try(kept, held_out, plain, REFINED, self.finer, count, beat=own.score, by=TRIAL))
+        best = min(plan[1:], key=lambda trial: trial.score)
+        if best is own and own.niter == TRIAL < self.niter:  # it was cut short
+            plan[1] = best = self._try(kept, held_out, plain, REFINED, 1, count)
+        if best.niter < self.niter // 2:
+            plan.append(self._try(kept, held_out, plain, SMOOTHED, best.finer, count))
+        return plan
+
+    def _try(self, kept, held_out, plain: Trial, name: str, finer: int, count, beat=None, by=0) -> Trial:
+        trial, grid = Trial(name, finer), Refined(finer=finer).grid
+        score = Score(replace(held_out, geometry=grid(held_out.geometry)))
+        niter = by if by and beat is None else self.niter
+        assert plain.volume is not None  # of its best pass
+        refine(kept, plain.volume, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
+        return trial
+
+    def _apply(self, scan: Scan, start_niter: int, trial: Trial, count) -> Reconstruction:
+        """The chosen setting on all views."""
+        plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
+        if trial.name == PLAIN:
+            return plain
+        return refine(scan, plain.volume, trial.niter, trial.finer, trial.name == SMOOTHED, self.seed, count)
+
+    @staticmethod
+    def _counter(progress: Progress | None, steps: int):
+        """A `progress` for one stage after another, which counts on; trials may end early, so it may jump at the end."""
+        if progress is None:
+            return None
+        done = iter(range(1, steps))
+
+        def count(_, __, residual):
+            progress(next(done, steps - 1), steps, residual)
+
+        return count
+
+
+def refine(
+    scan: Scan,
+    start: np.ndarray,
+    niter: int,
+    finer: int = 1,
+    smooth: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+    watch: Watch | None = None,
+) -> Reconstruction:
+    """The passes of `Refined` over measured views, from a volume [x, y, z] on the scan's own voxels.
+
+    finer    parts along each side of a voxel; the volume that is returned has the smaller voxels
+    smooth   whether to take more total variation
+    """
+    fine = replace(scan, geometry=Refined(finer=finer).grid(scan.geometry))
+    start = _parts(start, finer)
+    algorithm = Refined(niter=niter, seed=seed)
+    if smooth:
+        algorithm = replace(algorithm, alpha=SMOOTH)
+    weights, blur = structure(start), excess_width(fine.geometry)
+    return algorithm.on_measured().run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
+
+
+def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
+    """How far a volume can be believed: its difference from one of fewer views, root mean square around each voxel.
+
+    Both float32 [x, y, z], density per mm, and so the result. It is large where views decide, small where all agree. It ranks
+    the voxels; the size of the error it does not tell: what all views lack, both volumes lack.
+    """
+    square = ndimage.gaussian_filter((volume - fewer) ** 2, SPREAD)
+    return np.sqrt(np.maximum(square, 0))
+
+
+def _parts(volume: np.ndarray, finer: int) -> np.ndarray:
+    """A volume on `finer` times smaller voxels, interpolated linearly."""
+    return volume if finer == 1 else np.asarray(ndimage.zoom(volume, finer, order=1, mode='nearest', grid_mode=True))
+
+
+def means(volume: np.ndarray, finer: int) -> np.ndarray:
+    """The means over `finer` voxels along each side."""
+    return volume.reshape([n for count in volume.shape for n in (count // finer, finer)]).mean((1, 3, 5))

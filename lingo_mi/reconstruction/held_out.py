@@ -1,0 +1,121 @@
+"""Measured views that are held out of a reconstruction, and how well it predicts them.
+
+Errors of a volume and of its projections are not alike: noise in the voxels, which a reconstruction takes over from noisy views,
+cancels along a ray. By the Fourier slice theorem the squared norm of a slice is that of its parallel projections P, weighted by
+the frequency w along the detector's rows,
+
+    integral of f^2  ~  integral over the angles and w of |w| |P(angle, w)|^2
+
+(Natterer, "The Mathematics of Computerized Tomography", 1986, theorem II.1.1 and section II.5). So the difference between
+predicted and measured views is weighted by |w| before its norm is taken; a fan or a cone is nearly parallel for this purpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.projectors.grid_pair import GridPair
+from lingo_mi.reconstruction.system import evaluated
+from lingo_mi.scan import Scan
+
+LEAST_VIEWS = 4
+PATIENCE = 3  # passes without a better score, after which a trial ends
+
+
+def split(scan: Scan, every: int) -> tuple[Scan, Scan]:
+    """The views to reconstruct from, and those held out: one of `every` consecutive ones, never the first or the last.
+
+    Raises InputError for fewer than four views.
+
+        kept, held_out = split(scan, 5)
+    """
+    if len(scan) < LEAST_VIEWS:
+        raise InputError(
+            f'best holds views out to choose by, and needs at least {LEAST_VIEWS}, but the scan has {len(scan)}: '
+            'take another algorithm'
+        )
+    every = min(every, len(scan) - 1)
+    held = np.arange(every // 2, len(scan) - 1, every)
+    return scan.subset(np.setdiff1d(np.arange(len(scan)), held)), scan.subset(held)
+
+
+@dataclass
+class Trial:
+    """One setting, tried on the views that are kept.
+
+    name     of the setting
+    finer    parts along each side of a voxel
+    scores   `Score` of the held-out views after every pass
+    volume   after the pass with the lowest score, on the setting's own voxels
+    """
+
+    name: str
+    finer: int
+    scores: list[float] = field(default_factory=list)
+    volume: np.ndarray | None = None
+
+    @property
+    def niter(self) -> int:
+        """The pass with the lowest score, from 1 on."""
+        return int(np.argmin(self.scores)) + 1
+
+    @property
+    def score(self) -> float:
+        return min(self.scores)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Everything but the volume, for a file."""
+        return dict(setting=self.name, finer=self.finer, niter=self.niter, score=self.score, scores=self.scores)
+
+
+class Score:
+    """|A x - b| / |b| of held-out views, both weighted by the square root of the frequency along the rows.
+
+    The line integrals A x are exact. Joseph's projector would favour small voxels, on which its error is smaller.
+
+    scan   the views, and the voxels of the volumes
+
+        Score(held_out)(x)  # of a volume on the device, mi.Float [voxels]
+    """
+
+    def __init__(self, scan: Scan):
+        self.A, self.views, self.size = GridPair(scan.geometry, scan.valid), np.arange(len(scan)), scan.geometry.nVoxel
+        self.b = self.A.images(scan.projections)
+        rows, columns = scan.geometry.nDetector
+        self.shape = len(scan), columns, rows
+        self.all = self._norm(self.b) or 1.0
+
+    def __call__(self, x: mi.Float) -> float:
+        return self._norm(evaluated(self.b - self.A.forward(x, self.views)[0])) / self.all
+
+    def _norm(self, images: mi.Float) -> float:
+        size = 2 * self.shape[1]  # padded, since a row ends and does not repeat
+        spectrum = np.fft.rfft(images.numpy().reshape(self.shape), size, axis=1)
+        frequency = np.maximum(np.arange(spectrum.shape[1]), 0.25)  # the mean of |w| in the bin about 0
+        return float(np.sqrt((np.abs(spectrum) ** 2 * frequency[:, None]).mean()))
+
+
+class Watch:
+    """The `watch` of `ASDPOCS.run` that scores a trial after every pass, and keeps its best volume.
+
+    score    of the held-out views, on the trial's voxels
+    beat     score to beat by the pass `by`, else the trial ends there; None: it goes on
+    """
+
+    def __init__(self, score: Score, trial: Trial, beat: float | None = None, by: int = 0):
+        self.score, self.trial, self.beat, self.by = score, trial, beat, by
+
+    def __call__(self, done: int, x: mi.Float) -> bool:
+        trial = self.trial
+        trial.scores.append(self.score(x))
+        if trial.niter == done:
+            trial.volume = x.numpy().reshape(self.score.size)
+        if self.beat is not None and done == self.by and trial.score >= self.beat:
+            return True
+        return done - trial.niter >= PATIENCE

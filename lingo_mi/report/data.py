@@ -1,0 +1,98 @@
+"""What a report shows, checked: numbers, volume, views, cloud, scanner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lingo_mi.errors import InputError, brief
+from lingo_mi.geometry.base import Geometry
+
+
+@dataclass(frozen=True, eq=False)
+class ReportData:
+    """The contents of a report. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
+
+    title           of the report: any text, shown as it is, on one line of printable characters
+    metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are shown as 'n/a'; other scalar
+                    entries are listed with the settings. `history` is a list of dicts with `iteration`,
+                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
+    volume          [x, y, z] density, 1/mm; None for a cloud without densities
+    shape           its voxels, (x, y, z); by default those of `volume`
+    spacing         voxel size, (x, y, z), mm
+    truth           the true volume, as `volume`; None for measured data
+    centre          of the volume, (x, y, z), mm
+    views           [n, v, u] rendered held-out views: line integrals ln(I0/I)
+    views_truth     [n, v, u] the same views as measured, or None
+    views_angles    [n] degrees
+    pixel           size of a detector pixel, (v, u), mm
+    cloud_centres   [N, 3] centres of the Gaussians, mm
+    cloud_density   [N] density at their centres, 1/mm, or the quantity that `cloud_unit` names
+    cloud_scales    [N, 3] standard deviations, mm, and
+    cloud_quaternions [N, 4] (x, y, z, w), for ellipsoids in place of points; None: points only
+    scanner         the geometry of the fitted views, for the drawing of source and panel
+    command         the command line that reproduces this result
+
+    Raises InputError if shapes do not fit or an image holds NaN or infinity.
+    """
+
+    title: str
+    metrics: dict
+    volume: np.ndarray | None
+    spacing: tuple[float, float, float]
+    truth: np.ndarray | None = None
+    shape: tuple[int, int, int] | None = None
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    views: np.ndarray | None = None
+    views_truth: np.ndarray | None = None
+    views_angles: np.ndarray | None = None
+    pixel: tuple[float, float] = (1.0, 1.0)
+    cloud_centres: np.ndarray | None = None
+    cloud_density: np.ndarray | None = None
+    cloud_unit: str = 'density at the centre [1/mm]'
+    cloud_scales: np.ndarray | None = None
+    cloud_quaternions: np.ndarray | None = None
+    scanner: Geometry | None = None
+    command: str = ''
+    history: list[dict] = field(init=False)
+
+    def __post_init__(self):
+        def fix(name, shape):
+            value = getattr(self, name)
+            if value is None:
+                if name in ('views_angles', 'cloud_density'):
+                    raise InputError(f'the report needs {name} of the shape {shape}')
+                return
+            value = np.asarray(value)
+            if value.dtype not in (np.float32, np.float64):
+                value = value.astype(float)
+            if value.ndim != len(shape) or any(s is not None and n != s for n, s in zip(value.shape, shape)):
+                wanted = tuple('n' if s is None else s for s in shape)
+                raise InputError(f'{name} of the report has the shape {value.shape}, not {wanted}')
+            if not np.isfinite(value).all():
+                raise InputError(f'{name} of the report contains NaN or infinity')
+            object.__setattr__(self, name, value)
+
+        if self.volume is None and self.shape is None:
+            raise InputError('the report needs a volume, or its shape')
+        fix('volume', (None,) * 3)
+        if self.volume is not None:
+            object.__setattr__(self, 'shape', self.volume.shape)
+            fix('truth', self.volume.shape)
+        for name, n in (('spacing', 3), ('centre', 3), ('pixel', 2)):
+            fix(name, (n,))
+        fix('views', (None,) * 3)
+        if self.views is not None:
+            fix('views_truth', self.views.shape)
+            fix('views_angles', (len(self.views),))
+        fix('cloud_centres', (None, 3))
+        if self.cloud_centres is not None:
+            fix('cloud_density', (len(self.cloud_centres),))
+            fix('cloud_scales', self.cloud_centres.shape)
+            fix('cloud_quaternions', (len(self.cloud_centres), 4))
+        for name in ('volume', 'views'):
+            if getattr(self, name) is not None and getattr(self, name).size == 0:
+                raise InputError(f'{name} of the report is empty')
+        object.__setattr__(self, 'title', brief(self.title, 120))
+        object.__setattr__(self, 'history', list(self.metrics.get('history') or []))

@@ -1,0 +1,113 @@
+"""The numbers of a result as text, and one plain line about each."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Number(NamedTuple):
+    """How a number is shown: its label, unit, format, and what it says."""
+
+    label: str
+    unit: str
+    form: str
+    meaning: str
+
+
+# The absolute forms first, whose full scale is the largest true value; then R2-Gaussian's.
+QUALITY = {
+    'psnr_3d': Number(
+        "PSNR 3D, peak the truth's maximum", 'dB', '.2f',
+        'Mean squared error of the volume against the largest true density, on a logarithmic scale. More is better.',
+    ),
+    'ssim_3d': Number(
+        "SSIM 3D, windows of 11 x 11 x 11 voxels, the truth's maximum as full scale", '', '.4f',
+        'How alike the structures of volume and truth are, from small windows; 1 is identical.',
+    ),
+    'psnr_2d': Number(
+        'PSNR 2D, held-out views as they are', 'dB', '.2f',
+        'The same for views that the fit has never seen, against the largest measured line integral. More is better.',
+    ),
+    'ssim_2d': Number(
+        'SSIM 2D, held-out views as they are', '', '.4f',
+        'How alike rendered and measured held-out views are; 1 is identical.',
+    ),
+    'psnr_3d_r2': Number(
+        'PSNR 3D as in R2-Gaussian: peak 1', 'dB', '.2f',
+        'To compare with published tables. Only for densities that reach 1: those of a dim object look better than they are.',
+    ),
+    'ssim_3d_r2': Number(
+        'SSIM 3D as in R2-Gaussian: mean over the slices of the three axes, full scale 1', '', '.4f',
+        'To compare with published tables; the same caution.',
+    ),
+    'psnr_2d_r2': Number(
+        'PSNR 2D as in R2-Gaussian: each view divided by its own maximum', 'dB', '.2f',
+        'To compare with published tables.',
+    ),
+    'ssim_2d_r2': Number(
+        'SSIM 2D as in R2-Gaussian: each view divided by its own maximum', '', '.4f',
+        'To compare with published tables.',
+    ),
+    'ipsd': Number(
+        'IPSD: mean distance between Gaussians born in the fit and initial points (longest side of the volume = 2)',
+        '', '.4f',
+        'How far new Gaussians lie from the start. Less means that the start was where Gaussians were needed.',
+    ),
+    'ipsd_targets': Number(
+        'Gaussians born in the fit that IPSD counts', '', ',d', 'How many Gaussians that mean is of.'
+    ),
+    'ipsd_reverse': Number(
+        'Mean distance of initial points to Gaussians born in the fit', '', '.4f', 'The same, seen from the initial points.'
+    ),
+    'gaussians': Number('Gaussians', '', ',d', 'The size of the cloud at the end.'),
+    'seconds_init': Number('Time to initialise', 's', '.2f', 'From projections to the initial cloud.'),
+    'seconds_fit': Number('Time to fit', 's', '.1f', 'All steps, without the measurements in between.'),
+    'ms_per_iteration': Number('Time per iteration', 'ms', '.2f', 'The time to fit, divided by the iterations.'),
+}  # fmt: skip
+SETTINGS = {
+    'method': Number('Method', '', '', 'The recipe of settings that the fit began from.'),
+    'views': Number('Views used', '', '', 'Projections that the fit has seen.'),
+    'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
+    'seed': Number('Seed', '', '', 'Of every random choice; the same seed gives the same result.'),
+    'variant': Number('Mitsuba variant', '', '', 'CPU or GPU.'),
+    'versions': Number('Versions', '', '', 'The software that computed this result.'),
+}
+HEADLINE = {
+    'psnr_3d': 'PSNR 3D {}',
+    'ssim_3d': 'SSIM 3D {}',
+    'psnr_2d': 'PSNR 2D {}',
+    'ssim_2d': 'SSIM 2D {}',
+    'gaussians': '{} Gaussians',
+    'iterations': '{} iterations',
+    'seconds_fit': 'fit {}',
+}
+LISTED = {'history', 'files', 'settings', 'initial', 'angles', 'test_angles', 'command'}  # shown in other ways
+
+
+def headline(metrics: dict) -> str:
+    """The main numbers with units on one line, without missing ones and NaN."""
+    shown = [(text, as_text(key, metrics.get(key))) for key, text in HEADLINE.items()]
+    return '   ·   '.join(text.format(value) for text, value in shown if value != 'n/a')
+
+
+def as_text(key: str, value: object) -> str:
+    """A number as text with its unit; what is missing or NaN as 'n/a'."""
+    if isinstance(value, dict):
+        return ', '.join(f'{k} {as_text("", v)}' for k, v in value.items())
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return ', '.join(as_text('', v) for v in value)
+    if value is None or isinstance(value, (float, np.floating)) and math.isnan(value):
+        return 'n/a'
+    known = QUALITY.get(key) or SETTINGS.get(key)
+    unit, form = (known.unit, known.form) if known else ('', '')
+    if isinstance(value, (bool, str)):
+        return str(value)
+    if form:
+        value = int(value) if form.endswith('d') else float(value)  # pyright: ignore[reportArgumentType]
+    elif isinstance(value, (float, np.floating)):
+        form = '.6g'
+    text = '∞' if value == math.inf else format(value, form)
+    return f'{text} {unit}' if unit else text

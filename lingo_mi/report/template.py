@@ -1,0 +1,90 @@
+"""A page as text: the files of `web/` with the contents of a report in their places."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+from functools import cache
+from importlib.resources import files
+from string import Template
+
+from lingo_mi.report.payload import Arrays
+
+STYLES = 'vendor/uPlot.min.css', 'page.css'
+LIBRARIES = 'vendor/uPlot.iife.min.js', 'vendor/three.min.js'
+SCRIPTS = (
+    'elements.js', 'decode.js', 'colours.js', 'curves.js', 'slices.js', 'views.js', 'space.js', 'live.js', 'main.js'
+)  # fmt: skip
+
+
+def page(title: str, headline: str, numbers: str, command: str, known: dict, arrays: Arrays, live: bool = False) -> str:
+    """A page that loads nothing and runs no script but its own, whose digest its policy names.
+
+    title, headline     plain text
+    numbers, command    markup of those sections, made by `table` and `paragraph`
+    known               what the scripts know (JSON); arrays: by name
+    live                whether it asks the server that sent it for news
+    """
+    known = known | dict(arrays={name: packed.head() for name, packed in arrays.items()})
+    script = _script()
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')
+    holders = (f'<script type="text/plain" id="array-{name}">{packed.text}</script>' for name, packed in arrays.items())
+    return Template(_file('page.html')).substitute(
+        digest=f'sha256-{digest}',
+        connect="'self'" if live else "'none'",
+        title=html.escape(title),
+        headline=html.escape(headline),
+        style='\n'.join(map(_file, STYLES)),
+        numbers=numbers,
+        command=command,
+        known=as_json(known),
+        arrays='\n'.join(holders),
+        script=script,
+    )
+
+
+def as_json(value: object) -> str:
+    """JSON that ends no element of a page: no `<`."""
+    return json.dumps(value, allow_nan=False, separators=(',', ':')).replace('<', '\\u003c')
+
+
+def table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tuple[str, ...] = ()) -> str:
+    """A section with a table: of each row the name, the values, and what it means where `kind` is 'numbers'."""
+    out = [f'<section><h2>{html.escape(title)}</h2><div class="scroll"><table class="{kind}">']
+    if head:
+        out.append('<thead><tr>' + ''.join(f'<th scope="col">{html.escape(h)}</th>' for h in head) + '</tr></thead>')
+    for name, *cells in rows:
+        classes = ['value'] * len(cells)
+        if kind == 'numbers' and not head:
+            classes[-1] = 'meaning'
+        found = ''.join(f'<td class="{c}">{html.escape(cell)}</td>' for c, cell in zip(classes, cells))
+        out.append(f'<tr><th scope="row">{html.escape(name)}</th>{found}</tr>')
+    return ''.join([*out, '</table></div></section>'])
+
+
+def code(title: str, text: str) -> str:
+    """A section with a command, as it is."""
+    return f'<section><h2>{html.escape(title)}</h2><pre>{html.escape(text)}</pre></section>'
+
+
+def folded(title: str, parts: dict[str, list[tuple[str, str]]]) -> str:
+    """A section of tables of names and values, each opened by a click."""
+    out = [f'<section><h2>{html.escape(title)}</h2>']
+    for name, rows in parts.items():
+        cells = ''.join(f'<tr><th scope="row">{html.escape(a)}</th><td>{html.escape(b)}</td></tr>' for a, b in rows)
+        out.append(f'<details><summary>{html.escape(name)}</summary><table>{cells}</table></details>')
+    return ''.join([*out, '</section>'])
+
+
+@cache
+def _file(name: str) -> str:
+    return files('lingo_mi.report').joinpath('web', *name.split('/')).read_text(encoding='utf-8')
+
+
+@cache
+def _script() -> str:
+    libraries = '\n'.join(map(_file, LIBRARIES))
+    own = '\n'.join(map(_file, SCRIPTS))
+    return f"{libraries}\n(() => {{\n'use strict';\n{own}\n}})();\n"

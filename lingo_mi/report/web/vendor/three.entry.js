@@ -1,0 +1,2 @@
+export { AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, Color, DirectionalLight, DoubleSide, HemisphereLight, IcosahedronGeometry, InstancedMesh, LineBasicMaterial, LineSegments, Matrix4, Mesh, MeshLambertMaterial, PerspectiveCamera, Points, PointsMaterial, Quaternion, Scene, Sprite, SpriteMaterial, Vector3, WebGLRenderer } from 'three'
+export { OrbitControls } from 'three/addons/controls/OrbitControls.js'

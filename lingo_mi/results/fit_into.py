@@ -1,0 +1,52 @@
+"""A fit into a folder, from the first step or from the checkpoint that is there, to the whole result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.settings import Settings
+from lingo_mi.interrupts import between_steps
+from lingo_mi.output_folder import CHECKPOINT, require_ours
+from lingo_mi.results.measure import measure, quick_measure
+from lingo_mi.results.save import result_names, save
+from lingo_mi.scan import Dataset
+
+
+def fit_into(
+    folder: Path,
+    dataset: Dataset,
+    settings: Settings,
+    seed: int,
+    progress: Callable[..., None],
+    *,
+    resume: bool = False,
+    title: str,
+    method: str,
+    command: str = '',
+    request: dict | None = None,
+) -> dict:
+    """Fit a scan, measure the fit, and write all files of the result; returns its metrics.
+
+    folder     which no other process writes to
+    progress   called between steps, as of `fitting.loop.run`. After its KeyboardInterrupt, or Ctrl-C, `resume` goes on
+    resume     from the checkpoint in the folder
+    request    what was asked for, kept in metrics.json
+
+    title, method, command   as of `save`
+
+    Raises InputError where the fit or the folder does not work out.
+    """
+    require_ours(folder, result_names(settings, 0 if dataset.test is None else len(dataset.test)))
+    cloud = None if resume else initial_cloud(dataset.train, settings, seed)
+    with between_steps() as check:
+
+        def report(iteration, **fields):
+            progress(iteration, **fields)
+            check()
+
+        fit = run(dataset.train, settings, cloud, seed, quick_measure(dataset), report, folder / CHECKPOINT)
+    measured = measure(fit, dataset.test, dataset.volume)
+    return save(folder, fit, measured, title=title, method=method, command=command, request=request)

@@ -1,0 +1,56 @@
+"""The figure and the table of how cost grows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lingo_mi.file_access import replacing
+from lingo_mi.studies.growth.stages import AXES, DEPENDS
+from lingo_mi.studies.growth.sweep import exponent
+from lingo_mi.studies.markdown import table
+
+
+def rows_of(found: list[dict], stage: str, axis: str) -> list[dict]:
+    """The measurements of a stage along an axis, by number."""
+    return sorted((r for r in found if (r['stage'], r['axis']) == (stage, axis)), key=lambda row: row['number'])
+
+
+def exponents(found: list[dict]) -> str:
+    """Markdown: the exponent of CPU time, and of peak memory in brackets, by stage and axis; – where nothing depends."""
+
+    def cell(axis):
+        def text(row):
+            rows = rows_of(found, row['stage'], axis)
+            return f'{exponent(rows, "seconds"):.2f} ({exponent(rows, "peak"):.2f})' if len(rows) > 1 else '–'
+
+        return text
+
+    columns = [('stage', lambda row: row['stage']), *((axis, cell(axis)) for axis in AXES)]
+    return table(columns, [dict(stage=stage) for stage in DEPENDS])
+
+
+def draw(found: list[dict], path: Path) -> None:
+    """CPU seconds (above) and peak memory (below) of every stage against voxels, pixels, views and Gaussians."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=(15, 8), layout='constrained')
+    axes = fig.subplots(2, len(AXES), sharex='col', sharey='row')
+    for column, axis in enumerate(AXES):
+        for i, stage in enumerate(DEPENDS):
+            rows = rows_of(found, stage, axis)
+            if len(rows) < 2:
+                continue
+            numbers = [row['number'] for row in rows]
+            for line, (key, unit) in enumerate((('seconds', 1), ('peak', 1e9))):
+                values = [max(row[key] / unit, 1e-4) for row in rows]
+                label = f'{stage}: {exponent(rows, key):.2f}'
+                axes[line, column].loglog(numbers, values, 'o-', color=f'C{i}', label=label, markersize=4)
+        axes[1, column].set_xlabel(axis)
+        for line in range(2):
+            axes[line, column].grid(alpha=0.3)
+            axes[line, column].legend(fontsize=7, title='exponent of the last factor of ten', title_fontsize=7)
+    axes[0, 0].set_ylabel('CPU time of a call [s]')
+    axes[1, 0].set_ylabel('peak memory [GB]')
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        fig.savefig(temporary, dpi=80)

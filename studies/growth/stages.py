@@ -1,0 +1,225 @@
+"""The stages of a fit, as functions of the size of everything; run as a program, it measures one of them.
+
+    python -m lingo_mi.studies.growth.stages step 64,128,16,10000    # voxels a side, pixels a side, views, Gaussians; more sizes
+
+prints a line of JSON for every size: CPU seconds of a call (user and system), and the peak of memory in bytes, inputs included,
+above what libraries and a tiny call take.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import resource
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+TINY = 16, 16, 4, 100
+AXES = 'voxels', 'pixels', 'views', 'Gaussians'
+# What each stage's cost depends on; the others are passed over.
+DEPENDS = {
+    'initialise': AXES,
+    'step': ('pixels', 'Gaussians'),
+    'voxelise': ('voxels', 'Gaussians'),
+    'FDK': ('voxels', 'pixels', 'views'),
+    'SART, one pass': ('voxels', 'pixels', 'views'),
+    'measure': ('voxels', 'pixels', 'views'),
+    'save': ('voxels', 'Gaussians'),
+}
+
+
+@dataclass(frozen=True)
+class Size:
+    """voxels and pixels a side, views, Gaussians."""
+
+    voxels: int
+    pixels: int
+    views: int
+    gaussians: int
+
+
+def prepare(stage: str, size: Size) -> Callable[[], object]:
+    """A function that runs a stage once, with its inputs made."""
+    return globals()[f'_{stage.partition(",")[0].lower()}'](size)
+
+
+def _geometry(size: Size):
+    from lingo_mi.geometry.base import Geometry
+
+    return Geometry.cone(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(size.pixels, size.pixels),
+        dDetector=512 / size.pixels,
+        nVoxel=(size.voxels,) * 3,
+        dVoxel=256 / size.voxels,
+        angles=np.arange(size.views) * np.pi / size.views,
+    )
+
+
+def _scan(size: Size):
+    """A ball with a texture: what is measured does not depend on it."""
+    from lingo_mi.scan import Scan
+
+    g = _geometry(size)
+    v, u = np.meshgrid(*(np.linspace(-1, 1, size.pixels, dtype=np.float32),) * 2, indexing='ij')
+    ball = 150 * np.sqrt(np.maximum(0, 0.3 - u * u - v * v)) * (1 + 0.1 * np.sin(40 * u) * np.sin(40 * v))
+    return Scan(g, np.broadcast_to(ball.astype(np.float32), (size.views, size.pixels, size.pixels)).copy())
+
+
+def _settings(size: Size):
+    from lingo_mi.fitting.recipes import settings_of
+
+    return settings_of('fast', n_points=size.gaussians, values_per_gaussian=0)
+
+
+def _fitted(size: Size):
+    """A cloud as `fast` has it in its course, whose Gaussians fill half of the volume, at two spacings a standard deviation."""
+    from lingo_mi.fitting.bounded import bounded
+    from lingo_mi.fitting.state import start
+
+    rng = np.random.default_rng(0)
+    n = size.gaussians
+    points = rng.uniform(-0.8, 0.8, (n, 3)).astype(np.float32)
+    spacing = np.full(n, 0.6 * 1.6 / n ** (1 / 3), np.float32)
+    settings = bounded(_settings(size), _scan(Size(size.voxels, size.pixels, 1, 1)))
+    return start(points, spacing, np.full(n, 0.3, np.float32), settings), settings, points
+
+
+def _initialise(size: Size):
+    from lingo_mi.fitting.initial import initial_cloud
+
+    scan, settings = _scan(size), _settings(size)
+    return lambda: initial_cloud(scan, settings, 0)
+
+
+def _step(size: Size):
+    import drjit as dr
+
+    from lingo_mi.fitting.device_state import DeviceState
+    from lingo_mi.fitting.step import Stepper
+
+    host, settings, _ = _fitted(size)
+    stepper, state, rng = Stepper(_scan(size), settings), DeviceState(host), np.random.default_rng(0)
+    done = iter(range(10**9))
+
+    def step():
+        i = next(done)
+        stepper.step(state, [i % size.views], i, rng)
+        dr.sync_thread()
+
+    step()
+    step()  # the second step's kernels are those of all others
+    return step
+
+
+def _voxelise(size: Size):
+    from lingo_mi.fitting.fitted import Fitted
+
+    return _as_fitted(size, Fitted).volume
+
+
+def _as_fitted(size: Size, kind):
+    from lingo_mi.fitting.cloud_model import CloudModel
+
+    host, settings, points = _fitted(size)
+    return kind(CloudModel(settings, _geometry(size), 1.0), host, points, info=dict(seconds=0.0))
+
+
+def _fdk(size: Size):
+    from lingo_mi.reconstruction import FDK
+
+    scan = _scan(size)
+    return lambda: FDK().run(scan)
+
+
+def _sart(size: Size):
+    from lingo_mi.reconstruction import SART
+
+    scan = _scan(size)
+    return lambda: SART(niter=1).run(scan)
+
+
+def _measure(size: Size):
+    from lingo_mi import metrics
+
+    rng, shape = np.random.default_rng(0), (size.voxels,) * 3
+    truth = rng.random(shape, np.float32)
+    volume, views = truth + np.float32(0.1), _scan(size).projections
+    images = views + np.float32(0.1)
+
+    def measure():
+        metrics.compared(volume, truth)
+        for function in (metrics.psnr_2d, metrics.ssim_2d, metrics.psnr_2d_r2, metrics.ssim_2d_r2):
+            function(images, views)
+
+    return measure
+
+
+def _save(size: Size):
+    """Volume, cloud and checkpoint; the report is drawn from what it needs, which does not grow with the scan."""
+    from lingo_mi.files.ply import write_ply
+    from lingo_mi.files.volumes import write_volume
+    from lingo_mi.fitting import checkpoint
+    from lingo_mi.fitting.fitted import Fitted
+
+    fitted, g = _as_fitted(size, Fitted), _geometry(size)
+    volume = np.random.default_rng(0).random((size.voxels,) * 3, np.float32)
+
+    def save():
+        with tempfile.TemporaryDirectory() as folder:
+            write_volume(Path(folder) / 'volume.nii.gz', volume, g.dVoxel)
+            write_ply(Path(folder) / 'gaussians.ply', *fitted.world_gaussians())
+            checkpoint.save(Path(folder) / 'fit.npz', fitted.state, {})
+
+    return save
+
+
+def _memory(name: str) -> int:
+    """VmRSS, the memory of this process, or VmHWM, the largest since `_forget_peak`, bytes."""
+    lines = Path('/proc/self/status').read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def _forget_peak() -> int:
+    """Give back what nobody uses, and let the peak begin anew; the memory that is in use, bytes."""
+    import drjit as dr
+
+    gc.collect()
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    Path('/proc/self/clear_refs').write_text('5')
+    return _memory('VmRSS')
+
+
+def _cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def measure(stage: str, size: Size, least: float = 0.2) -> dict:
+    """CPU seconds of a call, the second and later ones for `least` seconds unless the first takes ten times that; and the peak of
+    memory, bytes."""
+    before = _forget_peak()
+    call = prepare(stage, size)
+    began, calls = _cpu(), 0
+    while calls < 2 and _cpu() - began < 10 * least or _cpu() - began < least:
+        if calls == 1:  # the first has compiled the kernels of this size, which a long call does not notice
+            began = _cpu()
+        call()
+        calls += 1
+    return dict(seconds=(_cpu() - began) / max(calls - 1, 1), peak=_memory('VmHWM') - before)
+
+
+if __name__ == '__main__':
+    from lingo_mi.runtime import use_variant
+
+    use_variant('llvm_ad_mono')
+    prepare(sys.argv[1], Size(*TINY))()
+    for word in sys.argv[2:]:
+        print(json.dumps(measure(sys.argv[1], Size(*map(int, word.split(','))))), flush=True)

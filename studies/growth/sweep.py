@@ -1,0 +1,75 @@
+"""Measures every stage along every axis, one factor of ten after the other, in a process a stage."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import astuple, replace
+
+from lingo_mi.errors import InputError, brief
+from lingo_mi.studies.growth.stages import DEPENDS, Size
+
+BASE = Size(voxels=64, pixels=128, views=20, gaussians=10_000)
+FIELDS = dict(zip(('voxels', 'pixels', 'views', 'Gaussians'), ('voxels', 'pixels', 'views', 'gaussians')))
+SIDES = dict(voxels=3, pixels=2)  # axes that sizes give by a side, and the sides that multiply
+# Each about ten times the one before, in numbers of voxels, pixels, views and Gaussians.
+SIZES = dict(
+    voxels=(32, 69, 149, 320),
+    pixels=(64, 202, 640, 2024),
+    views=(4, 40, 400),
+    Gaussians=(1000, 10_000, 100_000, 1_000_000),
+)
+SHORT = dict(voxels=3, pixels=3, views=3, Gaussians=3)  # of these sizes, unless all are wanted
+
+
+def number(axis: str, value: int) -> int:
+    """How many voxels, pixels, views or Gaussians a value of `SIZES` stands for."""
+    return value ** SIDES.get(axis, 1)
+
+
+def sizes(axis: str, large: bool) -> list[int]:
+    """The values of an axis. large: all of them, which takes half an hour of CPU time instead of minutes."""
+    return list(SIZES[axis] if large else SIZES[axis][: SHORT[axis]])
+
+
+def planned(stage: str, large: bool) -> list[tuple[str, int]]:
+    """What is measured of a stage: pairs of an axis and a value of `SIZES`."""
+    return [(axis, value) for axis in DEPENDS[stage] for value in sizes(axis, large)]
+
+
+def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict]], object]) -> list[dict]:
+    """Measurements: stage, axis, number, seconds of CPU time, peak in bytes.
+
+    stored       measurements of before; a stage that is whole there is not measured again
+    after_each   called with all measurements so far, after every stage
+
+    Raises InputError where a stage fails.
+    """
+    found: list[dict] = []
+    for stage in DEPENDS:
+        wanted = [(axis, number(axis, value)) for axis, value in planned(stage, large)]
+        kept = [row for row in stored if row['stage'] == stage and (row['axis'], row['number']) in wanted]
+        found += kept if len(kept) == len(wanted) else _measured(stage, planned(stage, large))
+        after_each(found)
+    return found
+
+
+def _measured(stage: str, plan: list[tuple[str, int]]) -> list[dict]:
+    words = [astuple(replace(BASE, **{FIELDS[axis]: value})) for axis, value in plan]
+    command = [sys.executable, '-m', 'lingo_mi.studies.growth.stages', stage]
+    command += [','.join(map(str, word)) for word in words]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ['it was killed'])[-1]
+        raise InputError(f'{stage}: {brief(last, 200)}')
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{')]
+    return [dict(stage=stage, axis=axis, number=number(axis, value)) | line for (axis, value), line in zip(plan, lines)]
+
+
+def exponent(rows: list[dict], key: str) -> float:
+    """The law at the large end: the slope of log cost over log number between the last two rows."""
+    first, last = rows[-2:]
+    return math.log(max(last[key], 1e-9) / max(first[key], 1e-9)) / math.log(last['number'] / first['number'])

@@ -1,0 +1,216 @@
+"""How far `Best`, which knows no truth, is behind the best of fixed settings, chosen with the truth at hand.
+
+A cell is one setting on one scan: a JSON file, written atomically. A stored cell is not computed again.
+
+    study = Study(Path('out/regret'))
+    study.compute_missing([Case('foot', finer=2, views=25)], clouds=False)
+    print(study.table([Case('foot', finer=2, views=25)]))
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.stats import spearmanr
+
+from lingo_mi.completion.views import insert_views
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run as fit
+from lingo_mi.fitting.recipes import FAST
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.projectors import grid
+from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
+from lingo_mi.reconstruction.best import SPREAD, START, means, refine
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.load import load_scene
+from lingo_mi.scene.shipped import scene_path
+from lingo_mi.scene.simulate import choose_views
+from lingo_mi.studies.provenance import provenance
+from lingo_mi.studies.tables.objects import averaged, load_object
+
+LARGEST = 4.0  # line integral of every simulated scan: 1.8 % of the photons arrive
+COMPLETED = 100  # views
+MEASURED = 'walnut'  # a scene of measured views; their reference is the FDK of all of them
+BEST = 'best'
+VOXELS = {'asd-pocs': 'ASD-POCS', 'refined': 'refined, own voxels', 'refined_finer': 'refined, half the size'}
+CLOUDS = {
+    'cloud': "cloud's volume",
+    'completed': 'ASD-POCS, completed',
+    'cloud_refined': 'refined from the cloud',
+    'cloud_finer': 'the same, half the size',
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan.
+
+    object    one of `studies.tables.objects`, scanned over a full turn; or 'walnut'
+    finer     how many times as many voxels are scanned along each side
+    views     reconstructed from
+    photons   a pixel in the open beam; 0: no noise
+    """
+
+    object: str
+    finer: int = 1
+    views: int = 25
+    photons: float = 0.0
+
+
+class Study:
+    """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of 5/3 as many pixels."""
+
+    def __init__(self, folder: Path, size: int = 48):
+        self.folder, self.size = Path(folder), size
+        self.dataset = functools.lru_cache(1)(self._dataset)
+        self._cloud = functools.lru_cache(1)(self._fitted)
+
+    def path(self, case: Case, setting: str) -> Path:
+        scan = f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
+        return self.folder / scan / f'{setting}.json'
+
+    def get(self, case: Case, setting: str) -> dict | None:
+        """A stored cell, or None where there is none that can be read."""
+        try:
+            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
+        except (FileNotFoundError, ValueError):
+            return None
+        return found if isinstance(found, dict) and {'psnr_3d', 'seconds'} <= found.keys() else None
+
+    def compute_missing(
+        self, cases: Iterable[Case], clouds: bool, say: Callable[[str], object] = lambda line: None
+    ) -> None:
+        """Compute and store the cells that are missing. `clouds`: also the settings that need a fitted cloud, minutes a case."""
+        for case in cases:
+            for setting in [*VOXELS, BEST, *(CLOUDS if clouds else ())]:
+                if self.get(case, setting) is None:
+                    found = self._compute(case, setting)
+                    say(f'{case}, {setting}: {found["psnr_3d"]:.2f} dB, {found["seconds"]:.1f} s')
+                    path = self.path(case, setting)
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    write_text(path, json.dumps(found, indent=1) + '\n')
+
+    def _compute(self, case: Case, setting: str) -> dict:
+        dataset = self.dataset(case)
+        assert dataset.volume is not None
+        if setting in CLOUDS:
+            self._cloud(case)  # not in this setting's time, but in its sum
+        began, extra = time.process_time(), {}
+        if setting == BEST:
+            found = Best().run(dataset.train)
+            volume = found.volume
+            wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
+            assert found.error is not None
+            extra = dict(
+                plan=found.record(), error_map=float(np.asarray(spearmanr(found.error.ravel(), wrong.ravel()))[0])
+            )
+        else:
+            volume = self._volume(case, dataset.train, setting)
+        seconds = time.process_time() - began + (self._cloud(case)[1] if setting in CLOUDS else 0.0)
+        dB = psnr_3d(volume, dataset.volume)
+        return dict(
+            asdict(case), setting=setting, psnr_3d=dB, seconds=seconds, size=self.size, provenance=provenance(), **extra
+        )
+
+    def _volume(self, case: Case, scan: Scan, setting: str) -> np.ndarray:
+        if setting == 'asd-pocs':
+            return ASDPOCS().run(scan).volume
+        if setting in VOXELS:
+            finer = 2 if setting == 'refined_finer' else 1
+            start = ASDPOCS(niter=START).run(scan).volume
+            return means(refine(scan, start, Best.niter, finer).volume, finer)
+        cloud = self._cloud(case)[0]
+
+        def sample(geometry: Geometry) -> np.ndarray:
+            found = cloud.volume(geometry)
+            assert found is not None  # fast has densities
+            return found
+
+        if setting == 'cloud':
+            return sample(scan.geometry)
+        if setting == 'cloud_finer':
+            return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=sample).volume
+        completed = insert_views(scan, max(COMPLETED, len(scan)), cloud.render)
+        if setting == 'completed':
+            return ASDPOCS(niter=10).run(completed).volume
+        return Refined().run(scan, sample=sample, completed=completed).volume
+
+    def _fitted(self, case: Case) -> tuple[Fitted, float]:
+        began, scan = time.process_time(), self.dataset(case).train
+        return fit(scan, FAST, initial_cloud(scan, FAST, 0), 0), time.process_time() - began
+
+    def _dataset(self, case: Case) -> Dataset:
+        if case.object == MEASURED:
+            return self._measured(case)
+        thing = load_object(case.object, self.size * case.finer)
+        truth = averaged(thing, self.size)
+        pixels = 5 * self.size // 3
+        pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
+        turn = 2 * np.pi * np.arange(case.views) / case.views
+        geometry = CircularGeometry(
+            DSO=1000.0,
+            DSD=1500.0,
+            nDetector=(pixels, pixels),
+            dDetector=(pixel, pixel),
+            nVoxel=thing.data.shape,
+            dVoxel=thing.spacing,
+            angles=turn,
+        )
+        views = grid.project(thing.data, geometry)
+        unit = np.float32(LARGEST / views.max())
+        views = noisy(views * unit, case.photons) if case.photons else views * unit
+        on_voxels = geometry.with_volume(truth.data.shape, truth.spacing)
+        return Dataset(Scan(on_voxels, views), None, truth.data * unit)
+
+    def _measured(self, case: Case) -> Dataset:
+        if case.finer != 1 or case.photons:
+            raise InputError(
+                f'{MEASURED} is measured: it has its own detail and noise, so give --finer 1 and --photons 0'
+            )
+        parameters = dict(voxels=str(self.size), voxel=f'{128 * 0.305 / self.size}')
+        every = load_scene(scene_path(MEASURED), parameters).scanner.dataset
+        assert every is not None  # it has no object
+        train = every.train.binned(max(1, round(256 / (2 * self.size))))
+        return replace(choose_views(Dataset(train), case.views), volume=FDK().run(train).volume)
+
+    def table(self, cases: Iterable[Case]) -> str:
+        """The Markdown table of the cells that are there, a row a case: dB and processor seconds, and the regret of `Best`."""
+        names = VOXELS | CLOUDS
+        lines = [
+            '| object | scanned | views | photons | '
+            + ' | '.join(names.values())
+            + ' | **best** | regret, dB | error map |',
+            '|---|---:|---:|---:|' + '---:|' * (len(names) + 3),
+        ]
+        for case in cases:
+            chosen = self.get(case, BEST)
+            if chosen is None:
+                continue
+            fixed = {name: found for name in names if (found := self.get(case, name))}
+            cells = [f'{fixed[n]["psnr_3d"]:.2f} ({fixed[n]["seconds"]:.0f} s)' if n in fixed else '–' for n in names]
+            best = max((found['psnr_3d'] for found in fixed.values()), default=np.nan)
+            photons = f'{case.photons:g}' if case.photons else 'no noise'
+            lines.append(
+                f'| {case.object} | x{case.finer} | {case.views} | {photons} | '
+                + ' | '.join(cells)
+                + f' | {chosen["psnr_3d"]:.2f} ({chosen["seconds"]:.0f} s) | {best - chosen["psnr_3d"]:+.2f} '
+                + f'| {chosen["error_map"]:.2f} |'
+            )
+        return '\n'.join(lines)
+
+
+def noisy(views: np.ndarray, photons: float, seed: int = 0) -> np.ndarray:
+    """Line integrals as counted with so many photons a pixel in the open beam; no count is taken for half of one."""
+    counts = np.random.default_rng(seed).poisson(photons * np.exp(-views.astype(float)))
+    return -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)

@@ -1,0 +1,200 @@
+"""Known errors of the panel's place are found, from sound, noisy and truncated scans; a sound scan is left as it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from lingo_mi.calibration.drift import Drift, times
+from lingo_mi.calibration.panel import Panel
+from lingo_mi.calibration.response.response import Response
+from lingo_mi.geometry import circular
+from lingo_mi.projectors import grid
+
+PIXELS, SIZE = 72, 40
+
+
+def scanner(views=20, rows=80, mode='cone', flat=False):
+    phantom = lm.phantom('foot', SIZE)
+    side = max(phantom.spacing) * SIZE
+    sizes = dict(nDetector=(1 if flat else rows, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views))
+    data = phantom.data
+    if flat:
+        sizes |= dict(nVoxel=(SIZE, SIZE, 1))
+        data = data[:, :, SIZE // 2 : SIZE // 2 + 1]
+    if mode == 'cone':
+        return lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.2 / PIXELS, **sizes), data
+    return lm.Geometry.parallel(dDetector=side * 1.4 / PIXELS, **sizes), data
+
+
+def scanned(geometry, data, true):
+    """Views by the real panel, with the geometry that is told."""
+    return lm.Scan(geometry, grid.project(data, true.moved(geometry)))
+
+
+def in_pixels(calibration, name):
+    return calibration.found.measured[name] / calibration.geometry.dDetector[name[0] == 'u']
+
+
+@pytest.mark.parametrize(
+    'true', [Panel(v=2.0), Panel(u=-3.0), Panel(yaw=0.1), Panel(np.array([1.0, -2, 3]), 2.0, -0.05)]
+)
+def test_moves_are_those_of_tigre(true):
+    geometry, _ = scanner(3)
+    v, u = (np.broadcast_to(x, 3) for x in (true.v, true.u))
+    numbers = geometry.numbers() | dict(offDetector=np.stack([v, u], 1))
+    expected = lm.Geometry.per_view(**numbers, rotDetector=(0, 0, true.yaw)).rays()
+    moved = true.moved(geometry).rays()
+    for name in ('source', 'corner', 'u', 'v'):
+        np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    'true', [Panel(v=4.0), Panel(u=-4.0), Panel(yaw=0.06), Panel(np.array([1.0, -2, 3]), 2.0, -0.05)]
+)
+def test_resampled_views_are_those_of_the_named_panel(true):
+    """Of a smooth object; to a hundredth of its highest value."""
+    geometry, _ = scanner(3)
+    x = np.linspace(-1, 1, SIZE)
+    ball = np.exp(-6 * sum(np.square(np.meshgrid(x - 0.2, x, x + 0.1, indexing='ij')))).astype(np.float32)
+    named = grid.project(ball, geometry)
+    back = true.resampled(scanned(geometry, ball, true))
+    valid = np.ones(named.shape, bool) if back.valid is None else back.valid
+    assert valid.mean() > 0.8
+    assert np.abs(back.projections - named)[valid].max() < 0.01 * named.max()
+    assert np.abs(scanned(geometry, ball, true).projections - named).max() > 0.02 * named.max()
+
+
+def test_axis_and_turn_of_the_panel():
+    """To a twentieth of a pixel and four hundredths of a degree."""
+    geometry, data = scanner()
+    pixel = geometry.dDetector[1]
+    true = Panel(u=-2.4 * pixel, yaw=np.radians(0.8))
+    scan = scanned(geometry, data, true)
+    found = lm.calibrate(scan, progress=False)
+    assert in_pixels(found, 'u') == pytest.approx(-2.4, abs=0.05)
+    assert np.degrees(found.found.measured['yaw']) == pytest.approx(0.8, abs=0.04)
+    assert found.found.after < 0.5 * found.found.before
+    corner = true.moved(geometry).rays().corner
+    given, mended = (np.abs(s.geometry.rays().corner - corner).max() for s in (scan, found.corrected(scan)))
+    assert mended < 0.05 * given
+    assert len(found.lines()) == 3 and all('not taken' not in line for line in found.lines())
+
+
+def test_noisy_and_truncated():
+    """The object beyond both sides and the upper edge; a hundredth of the highest value of noise: to a tenth of a pixel."""
+    geometry, data = scanner(30)
+    pixel = geometry.dDetector[1]
+    scan = scanned(geometry, data, Panel(u=1.7 * pixel))
+    cut = np.s_[:, 20:, 16:-16]
+    told = replace(geometry, nDetector=(60, PIXELS - 32), offDetector=(-10 * geometry.dDetector[0], 0))
+    p = scan.projections[cut]
+    assert (p[:, :, [0, -1]] > 0.2 * p.max()).any() and (p[:, 0] > 0.2 * p.max()).any()
+    p = p + np.random.default_rng(0).normal(0, 0.01 * p.max(), p.shape)
+    found = lm.calibrate(lm.Scan(told, p), progress=False)
+    assert in_pixels(found, 'u') == pytest.approx(1.7, abs=0.1)
+
+
+def test_drift_is_found_and_held_out_views_get_theirs():
+    """A drift of 1.2 pixels from the first to the last view: to a tenth of a pixel in every view."""
+    geometry, data = scanner(40)
+    pixel = geometry.dDetector[1]
+    true = Drift.of(geometry, dict(u=0.8 * pixel, u1=0.6 * pixel, v1=-0.3 * pixel))
+    every = scanned(geometry, data, true.panel(geometry))
+    dataset = lm.Dataset(every.subset(slice(0, None, 2)), every.subset(slice(1, None, 2)))
+    found = lm.calibrate(dataset, drift=1, progress=False)
+    mended = found.corrected(dataset)
+    right = true.panel(geometry).moved(geometry).rays().corner
+    for scan, part in ((mended.train, slice(0, None, 2)), (mended.test, slice(1, None, 2))):
+        error = scan.geometry.rays().corner - right[part]
+        error -= error.mean(0) * [0, 0, 1]  # the height is not told
+        assert np.linalg.norm(error, axis=1).max() < 0.1 * pixel
+
+
+def test_a_sound_scan_is_left_as_it_is():
+    geometry, data = scanner(30)
+    scan = scanned(geometry, data, Panel())
+    found = lm.calibrate(scan, progress=False)
+    assert not found.needed and found.corrected(scan) is scan
+    assert all('not taken' in line for line in found.lines()[:-1])
+
+
+@pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.slow)])
+def test_one_row(mode):
+    geometry, data = scanner(40, mode=mode, flat=True)
+    pixel = geometry.dDetector[1]
+    found = lm.calibrate(scanned(geometry, data, Panel(u=3.3 * pixel)), progress=False)
+    assert list(found.found.measured) == ['u']
+    assert in_pixels(found, 'u') == pytest.approx(3.3, abs=0.05)
+
+
+def responding(numbers, **parts):
+    """Line integrals up to 2.5 as measured by a detector with these numbers, and as they are."""
+    geometry, data = scanner()
+    ideal = scanned(geometry, data, Panel())
+    p = ideal.projections * (2.5 / ideal.projections.max())
+    response = Response.of(geometry, highest=2.5, **parts).changed(numbers)
+    return lm.Scan(geometry, response.applied(p, geometry)), p
+
+
+def test_curve_of_the_detector():
+    """A fifth of the highest line integral is missing: three quarters of the error go, and a coefficient is told to 0.03."""
+    scan, p = responding({'curve0': -0.08}, curve=1)
+    found = lm.calibrate(scan, curve=1, progress=False)
+    assert found.found.measured['curve0'] == pytest.approx(-0.08, abs=0.03)
+    assert np.std(found.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
+
+
+@pytest.mark.slow
+def test_air_and_scatter():
+    """Air to 0.01, scatter to a hundredth of the open beam."""
+    scan, _ = responding({'air0': 0.05, 'air1': 0.03}, air='smooth')
+    found = lm.calibrate(scan, air=True, progress=False).found.measured
+    assert (found['air0'], found['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
+    scan, _ = responding({'scatter0_0': 0.03}, scatter='one')
+    assert lm.calibrate(scan, scatter=True, progress=False).found.measured['scatter0_0'] == pytest.approx(
+        0.03, abs=0.01
+    )
+
+
+@pytest.mark.slow
+def test_parallel_and_posed():
+    geometry, data = scanner(24, mode='parallel')
+    pixel = geometry.dDetector[1]
+    true = Panel(u=1.3 * pixel, yaw=np.radians(-0.7))
+    found = lm.calibrate(scanned(geometry, data, true), progress=False)
+    assert in_pixels(found, 'u') == pytest.approx(1.3, abs=0.05)
+    assert np.degrees(found.found.measured['yaw']) == pytest.approx(-0.7, abs=0.05)
+    posed = Panel(u=-1.1 * pixel).moved(true.moved(geometry))
+    found = lm.calibrate(lm.Scan(posed, scanned(geometry, data, true).projections), progress=False)
+    assert in_pixels(found, 'u') == pytest.approx(1.1, abs=0.05)
+
+
+def test_times_of_views():
+    geometry, _ = scanner(10)
+    np.testing.assert_allclose(times(geometry, geometry.angles), np.linspace(-1, 1, 10), atol=1e-12)
+    between = circular(10, start=18)  # the last one after the last of the scan
+    np.testing.assert_allclose(times(geometry, between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-12)
+    np.testing.assert_allclose(times(geometry, between + 2 * np.pi), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
+    reverse = replace(geometry, angles=-geometry.angles + 1)
+    np.testing.assert_allclose(times(reverse, 1 - between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
+    shuffled = replace(geometry, angles=geometry.angles[[0, 2, 1, 3, 4, 5, 6, 7, 8, 9]])
+    np.testing.assert_allclose(times(shuffled, between), np.linspace(-1, 1, 10))
+
+
+def test_bad_input():
+    geometry, data = scanner(7, rows=8)
+    scan = scanned(geometry, data, Panel())
+    with pytest.raises(lm.InputError, match='at least 8, not 7'):
+        lm.calibrate(scan, progress=False)
+    with pytest.raises(lm.InputError, match='drift must be a whole number'):
+        lm.calibrate(scan, drift=0.5)
+    with pytest.raises(lm.InputError, match='0 to 8, not 9'):
+        lm.calibrate(scan, drift=9)
+    with pytest.raises(lm.InputError, match='0 to 3, not 4'):
+        lm.calibrate(scan, curve=4)
+    with pytest.raises(lm.InputError, match='air'):
+        lm.calibrate(scan, air='smooth')
+    with pytest.raises(lm.InputError, match='zero everywhere'):
+        lm.calibrate(lm.Scan(geometry, np.zeros_like(scan.projections)))

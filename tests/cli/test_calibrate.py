@@ -1,0 +1,58 @@
+"""`lingo-mi calibrate`: what it prints and writes, and bad input in one line."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from lingo_mi.cli import calibrate
+from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.geometry import circular
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, 'argv', ['lingo-mi calibrate', *map(str, arguments)])
+    calibrate.main()
+
+
+@pytest.fixture
+def fan(tmp_path):
+    """Three discs in one row, with the axis 2.5 columns off."""
+    geometry = lm.Geometry.cone(
+        DSO=400, DSD=600, nDetector=(1, 96), dDetector=2.0, nVoxel=(48, 48, 1), dVoxel=2.0, angles=circular(24)
+    )
+    x, y = np.meshgrid(*2 * [np.arange(48) - 23.5], indexing='ij')
+    discs = sum((np.hypot(x - a, y - b) < r) * 0.02 for a, b, r in ((0, 0, 15), (6, 3, 4), (-5, -6, 3)))
+    true = lm.simulate(discs[:, :, None].astype(np.float32), geometry, progress=False).train
+    write_scan(tmp_path / 'scan.npy', lm.Scan(geometry, np.roll(true.projections, 2, 2)), 'npy')
+    return tmp_path / 'scan.npy'
+
+
+def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
+    out = fan.with_name('mended.npy')
+    run(monkeypatch, fan, '--out', out)
+    assert 'shift of the panel along u: -' in capsys.readouterr().out
+    given, mended = read_scan(fan).train, read_scan(out).train
+    assert mended.geometry.offDetector[1] == pytest.approx(-4.0, abs=0.2)
+    np.testing.assert_array_equal(mended.projections, given.projections)
+    assert 'calibrated_from: scan.npy' in out.with_suffix('.yml').read_text()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (('--out', 'x.raw'), 'a name that ends in .npy'),
+        (('--out', 'scan.npy', '--force'), 'would be overwritten'),
+        (('--out', 'there.npy'), 'exists already'),
+        (('--drift', '99'), 'degree of a polynomial'),
+        (('--curve', '-1'), 'curve must be a whole number'),
+    ],
+)
+def test_bad_input(fan, monkeypatch, arguments, message):
+    monkeypatch.chdir(fan.parent)
+    fan.with_name('there.npy').write_bytes(b'')
+    before = fan.read_bytes()
+    with pytest.raises(lm.InputError, match=message):
+        run(monkeypatch, 'scan.npy', *arguments)
+    assert fan.read_bytes() == before

@@ -1,0 +1,289 @@
+"""A cohort in this process: the list, what is stored, interruptions, failures."""
+
+import csv
+import json
+from unittest import mock
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from helpers.cohorts import BATCH, events, results
+from helpers.script import FIT, SCENE, run
+from lingo_mi.cohort import work
+from lingo_mi.cohort.listing import BadList, read_list
+from lingo_mi.cohort.row import stored
+from lingo_mi.errors import InputError
+from lingo_mi.files.scans import write_scan
+from lingo_mi.files.volumes import write_volume
+from lingo_mi.output_folder import CHECKPOINT, METRICS
+
+SHORT = 'fast:iterations=20,n_points=100'
+
+
+@pytest.fixture
+def home(tmp_path):
+    """A folder with a scene, tiny.xml, and a list of three scans of it."""
+    (tmp_path / 'tiny.xml').write_text(SCENE)
+    (tmp_path / 'list.csv').write_text('name,geometry,views\na,tiny.xml,5\nb,tiny.xml,6\nc,tiny.xml,\n')
+    return tmp_path
+
+
+def batch(home, *args):
+    return run(BATCH, home / 'list.csv', '--recipe', SHORT, '--out', home / 'out', *args)
+
+
+def test_a_cohort(home):
+    code, text, err = batch(home)
+    assert code == 0, err
+    rows = results(home)
+    assert [row['status'] for row in rows.values()] == ['done'] * 3 and [r['views'] for r in rows.values()] == [
+        '5',
+        '6',
+        '8',
+    ]
+    for name, row in rows.items():
+        assert row['iterations'] == '20' and row['seed'] == '0' and name in text
+        stored_numbers = json.loads((home / 'out' / name / METRICS).read_text())
+        assert float(row['psnr_2d']) == stored_numbers['psnr_2d'] and float(row['psnr_3d']) == stored_numbers['psnr_3d']
+    # The numbers are those of `lingo-mi fit`.
+    code, _, err = run(
+        FIT, home / 'tiny.xml', '--views', 5, '--iterations', 20, '-D', 'n_points=100', '--out', home / 'fit'
+    )
+    assert code == 0, err
+    assert json.loads((home / 'fit' / METRICS).read_text())['psnr_2d'] == pytest.approx(
+        float(rows['a']['psnr_2d']), rel=1e-4
+    )
+    # Done is not done again; a new row is.
+    before = {name: (home / 'out' / name / METRICS).stat().st_mtime_ns for name in rows}
+    with open(home / 'list.csv', 'a') as file:
+        file.write('d,tiny.xml,4\n')
+    code, text, err = batch(home)
+    assert code == 0 and '3 of 4 scans are done already' in text, err
+    assert {name: (home / 'out' / name / METRICS).stat().st_mtime_ns for name in before} == before
+    assert results(home)['d']['status'] == 'done' and len(events(home, 'done')) == 4
+    # With other options, what is there is not the answer, and stays.
+    code, _, err = run(BATCH, home / 'list.csv', '--recipe', 'fast:iterations=21,n_points=100', '--out', home / 'out')
+    assert code == 2 and err.count('holds a result of other values of recipe, settings') == 4 and err.count('\n') == 5
+    assert {name: (home / 'out' / name / METRICS).stat().st_mtime_ns for name in before} == before
+
+
+def test_parquet(home):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    (home / 'list.csv').write_text('geometry,lambda_tv\ntiny.xml,0.1\n')
+    assert batch(home)[0] == 0
+    table = parquet.read_table(home / 'out' / 'results.parquet').to_pylist()
+    assert table[0]['psnr_2d'] == float(results(home)['tiny']['psnr_2d']) and table[0]['lambda_tv'] == '0.1'
+    assert table[0]['error'] is None and table[0]['views'] == 8
+
+
+def test_projections_and_volumes(home):
+    geometry = lm.Geometry.cone(
+        DSO=100, DSD=150, nDetector=(20, 24), dDetector=1.8, nVoxel=16, dVoxel=1.5, angles=np.linspace(0, 3, 7)
+    )
+    volume = lm.phantom('foot', size=16).data
+    write_scan(home / 'one.npy', lm.simulate(volume, geometry, progress=False).train, 'npy')
+    (home / 'deep').mkdir()
+    (home / 'one.yml').rename(home / 'deep' / 'two.yml')
+    write_volume(home / 'ct.nii.gz', volume, (1.5,) * 3)
+    (home / 'list.csv').write_text('file,geometry,views\none.npy,deep/two.yml,5\nct.nii.gz,tiny.xml,6\n')
+    code, _, err = batch(home)
+    assert code == 0, err
+    rows = results(home)
+    assert rows['one']['psnr_3d'] == '' and float(rows['one']['psnr_2d']) > 10  # 2 of 7 views are held out
+    assert float(rows['ct']['psnr_3d']) > 10 and lm.load_result(home / 'out' / 'ct').volume().shape == (16,) * 3
+
+
+def test_failures_are_tried_once_more(home):
+    np.save(home / 'bad.npy', np.full((2, 4, 4), np.nan))
+    (home / 'bad.yml').write_text('DSO: 100\nDSD: 150\nnDetector: 4\ndDetector: 1\nnVoxel: 4\ndVoxel: 1\n')
+    (home / 'list.csv').write_text('file,geometry\nbad.npy,bad.yml\n,tiny.xml\n')
+    code, _, err = batch(home)
+    assert code == 2 and err.splitlines()[-1] == 'error: 1 of 2 scans failed twice; the same command tries them again'
+    assert [line.split(':')[0] for line in events(home)[1:]] == [
+        'began bad', 'failed bad', 'began tiny', 'done tiny', 'began bad', 'failed bad'
+    ]  # fmt: skip
+    rows = results(home)
+    assert (rows['bad']['status'], rows['tiny']['status']) == ('failed', 'done') and 'bad.npy' in rows['bad']['error']
+    assert f'failed: bad: {rows["bad"]["error"]}' in err and not (home / 'out' / 'bad').exists()
+    # Mended, the second attempt of the same command does it.
+    np.save(home / 'bad.npy', np.ones((2, 4, 4)))
+    first, fit_into = [], work.fit_into
+
+    def once(*args, **kwargs):
+        if not first:
+            first.append(True)
+            raise RuntimeError('a library fell over\nbadly')
+        return fit_into(*args, **kwargs)
+
+    with mock.patch.object(work, 'fit_into', once):
+        code, _, err = batch(home)
+    assert code == 0 and 'Traceback' in err and results(home)['bad']['status'] == 'done'
+    assert 'failed bad: RuntimeError: a library fell over badly' in events(home)
+
+
+def test_ctrl_c_and_on(home):
+    seen = []
+
+    def stop_at(self, done, **_):
+        seen.append(done)
+        if self.description.endswith('b') and done == 13:
+            raise KeyboardInterrupt
+
+    with mock.patch('lingo_mi.jobs.in_process.Progress.update', stop_at):
+        code, _, err = batch(home)
+    assert code == 130 and err.splitlines()[-1] == 'interrupted: the same command goes on from here'
+    assert [row['status'] for row in results(home).values()] == ['done', 'interrupted', 'waiting']
+    assert (home / 'out' / 'b' / CHECKPOINT).exists() and not (home / 'out' / 'b' / METRICS).exists()
+    code, _, err = batch(home)
+    assert code == 0 and events(home, 'resumed') == ['resumed b: 14'] and len(events(home, 'done')) == 3, err
+    broken = results(home)['b']
+    (home / 'out').rename(home / 'before')
+    batch(home)
+    assert float(results(home)['b']['psnr_2d']) == pytest.approx(float(broken['psnr_2d']), rel=1e-4)
+
+
+def test_another_batch_in_the_folder(home):
+    with lm_locked(home / 'out'):
+        code, _, err = batch(home)
+    assert code == 2 and 'is writing there' in err and err.count('\n') == 1
+
+
+def lm_locked(folder):
+    from lingo_mi.folder_lock import locked
+
+    return locked(folder)
+
+
+@pytest.mark.parametrize('content', [
+    '\ufeffname,geometry\na,tiny.xml\n'.encode(), b'name;geometry\r\n\r\na;tiny.xml\r\n', b'name\tgeometry\na\ttiny.xml',
+    b'\n\n"name", geometry\n" a ","tiny.xml"\n\n', 'name,geometry\nMüller 1,tiny.xml\n'.encode(),
+])  # fmt: skip
+def test_lists_that_spreadsheets_write(home, content):
+    (home / 'list.csv').write_bytes(content)
+    (row,) = read_list(home / 'list.csv')
+    assert row.name in ('a', 'Müller 1') and row.geometry == 'tiny.xml'
+
+
+@pytest.mark.parametrize('content, message', [
+    (b'', 'is empty'), (b'\xef\xbb\xbf\n \n', 'is empty'), (b'file\n', 'no scan below'), (b'name,views\na,3\n', 'no column file'),
+    (b'file,file\na,b\n', "2 columns 'file'"), (b'file,,views\na,b,3\n', 'column 2 has no name'),
+    ('file\nä\n'.encode('latin-1'), 'line 2: is not UTF-8'), ('file\na\n'.encode('utf-16'), 'UTF-16'),
+    (b'file\n"a\n', 'no CSV'), (b'file\na\0b\n', ''), (b'\x00\x01\x02', ''),
+])  # fmt: skip
+def test_files_that_are_no_list(home, content, message):
+    (home / 'list.csv').write_bytes(content)
+    code, _, err = batch(home)
+    assert code == 2 and message in err and err.startswith('error: ') and 'Traceback' not in err
+    assert not (home / 'out').exists()
+
+
+ROWS = {
+    ',nothing.xml': 'there is no such scene', ',nothing': 'must be a geometry file', 'list.csv,': 'no known scan format',
+    'no.pickle,': 'no such file', 'out_of_place,': 'has neither', '/dev/zero,tiny.xml': 'device', ',one.yml': 'has no file',
+    'no\x07.pickle,': 'is no name of a folder', '../../etc/passwd.npy,': 'no such file', ',': '', 'x,y,z': 'has 3 cells',
+    'a': 'has 1 cell',
+}  # fmt: skip
+
+
+def test_every_bad_row_has_its_line(home):
+    rows = [row for row in ROWS if row != ',']  # a row of empty cells is blank
+    (home / 'out_of_place').mkdir()
+    (home / 'list.csv').write_text('file,geometry\n,tiny.xml\n' + '\n'.join(rows) + '\n')
+    code, _, err = batch(home)
+    lines = err.splitlines()
+    assert code == 2 and len(lines) == len(rows) + 1 and not (home / 'out').exists()
+    for number, (row, line) in enumerate(zip(rows, lines), 3):
+        assert f'list.csv, line {number}' in line and ROWS[row] in line, line
+        assert len(line) < 310 and line.isprintable()
+    assert lines[-1].endswith(f'{len(rows)} of {len(rows) + 1} rows cannot be used, so nothing was begun')
+
+
+@pytest.mark.parametrize('name', [
+    '..', '.', '.hidden', 'a/b', 'a\\b', '/tmp/x', '-rf', 'a ', 'con', 'LPT1.txt', 'results.csv', 'Batch.LOG', 'x' * 101, 'a:b',
+    'a*', 'a\x07b', 'ä' * 60, 'a.',
+])  # fmt: skip
+def test_names_that_are_no_folder(home, name):
+    with open(home / 'list.csv', 'w', newline='') as file:
+        csv.writer(file).writerows([['name', 'geometry'], ['x ' + name if name == 'a ' else name, 'tiny.xml']])
+    if name == 'a ':  # spaces around a cell are not part of it
+        assert read_list(home / 'list.csv')[0].name == 'x a'
+        return
+    with pytest.raises(BadList) as caught:
+        read_list(home / 'list.csv')
+    assert 'name' in caught.value.lines[0] and len(caught.value.lines) == 1
+
+
+def test_names_that_collide(home):
+    """Also where only some file systems take them for the same."""
+    (home / 'list.csv').write_text(
+        'name,geometry\nFoot,tiny.xml\nfoot,tiny.xml\nüber,tiny.xml\nu\u0308ber,tiny.xml\n,tiny.xml\n,tiny.xml\n'
+    )
+    with pytest.raises(BadList) as caught:
+        read_list(home / 'list.csv')
+    assert [line.rpartition('line ')[2].split(';')[0] for line in caught.value.lines] == ['2', '4', '6']
+
+
+@pytest.mark.parametrize('cells, message', [
+    ('views,0', 'views must be'), ('views,1e3', 'views must be'), ('seed,-1', 'seed must be'), ('mu_water,-1', 'mu_water'),
+    ('recipe,nerf', 'no such recipe'), ('recipe,fast:x=1', 'unknown setting'), ('iterations,0', 'iterations must'),
+    ('iteration,5', 'did you mean iterations'), ('lambda_tv,nan', 'lambda_tv'), ('seed,99999999999999999999', 'seed must be'),
+])  # fmt: skip
+def test_bad_options(home, cells, message):
+    column, value = cells.split(',')
+    (home / 'list.csv').write_text(f'geometry,{column}\ntiny.xml,{value}\n')
+    with pytest.raises(BadList) as caught:
+        read_list(home / 'list.csv')
+    assert message in caught.value.lines[0]
+
+
+def test_parameters_of_a_scene_go_before_settings(home):
+    (home / 'tiny.xml').write_text(
+        SCENE.replace('name="views" value="8"', 'name="batch" value="8"').replace('$views', '$batch')
+    )
+    (home / 'list.csv').write_text('geometry,batch,lambda_tv\ntiny.xml,5,0.1\n')
+    (row,) = read_list(home / 'list.csv')
+    assert (row.parameters, row.settings) == (dict(batch='5'), dict(lambda_tv='0.1'))
+    assert len(work.read_row(row).train) == 5
+
+
+def test_folders_that_are_not_ours(home):
+    out = home / 'out'
+    for name in 'abc':
+        (out / name).mkdir(parents=True)
+    (out / 'a' / 'notes.txt').write_text('mine')
+    (out / 'b').rmdir()
+    (out / 'b').symlink_to(home)
+    (out / 'c' / METRICS).write_text('{}')
+    code, _, err = batch(home)
+    assert code == 2 and err.count('\n') == 4 and 'so nothing was begun' in err, err
+    assert (out / 'a' / 'notes.txt').read_text() == 'mine' and (out / 'c' / METRICS).read_text() == '{}'
+    (out / 'a' / 'notes.txt').unlink()
+    (out / 'b').unlink()
+    (out / 'c' / METRICS).unlink()
+    (out / 'results.csv').write_text('mine')
+    code, _, err = batch(home)
+    assert code == 2 and 'results.csv: is no table of a batch' in err and (out / 'results.csv').read_text() == 'mine'
+
+
+def test_a_damaged_result(home):
+    assert batch(home)[0] == 0
+    row = read_list(home / 'list.csv', SHORT)[0]
+    assert stored(home / 'out', row)['views'] == 5
+    (home / 'out' / 'a' / 'gaussians.ply').unlink()
+    with pytest.raises(InputError, match=r'gaussians\.ply: is missing'):
+        stored(home / 'out', row)
+    (home / 'out' / 'a' / METRICS).write_text('{')
+    with pytest.raises(InputError, match='is damaged'):
+        stored(home / 'out', row)
+
+
+@pytest.mark.parametrize('arguments, message', [
+    (('--cluster', 'local:0'), 'write local:N'), (('--cluster', 'local'), 'write local:N'), (('--threads', '2'), 'goes with'),
+    (('--cluster', 'no.json'), 'no such file'), (('--cluster', 'nothing://x:1'), 'no scheduler'),
+    (('--recipe', 'x'), 'no such recipe'),
+])  # fmt: skip
+def test_bad_arguments(home, arguments, message):
+    code, _, err = batch(home, *arguments)
+    assert code == 2 and message in err and err.count('\n') == 1, err
+    assert not (home / 'out').exists()

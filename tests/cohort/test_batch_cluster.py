@@ -1,0 +1,132 @@
+"""A cohort on a Dask cluster: a real scheduler with three workers, one of which is killed; and what cannot work."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+from helpers.cohorts import BATCH, events, results
+from helpers.dask_cluster import cluster, wait_until
+from helpers.script import SCENE, run
+from lingo_mi.output_folder import CHECKPOINT, METRICS
+
+pytest.importorskip('distributed')
+KEYS = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'gaussians', 'iterations'
+NAMES = [f's{i}' for i in range(4)]
+
+
+@pytest.fixture
+def home(tmp_path):
+    """A folder with a list of four scans, of which each takes seconds and writes a checkpoint several times a second."""
+    (tmp_path / 'tiny.xml').write_text(SCENE)
+    rows = [f'{name},tiny.xml,{i + 3},150,200,0.2' for i, name in enumerate(NAMES)]
+    header = 'name,geometry,views,iterations,n_points,checkpoint_seconds'
+    (tmp_path / 'list.csv').write_text('\n'.join([header, *rows]))
+    return tmp_path
+
+
+def arguments(home, address):
+    return [home / 'list.csv', '--out', home / 'out', '--cluster', address, '--variant', mi.variant(), '--threads', '1']
+
+
+def start(home, address):
+    command = [sys.executable, BATCH, *arguments(home, address)]
+    return subprocess.Popen([*map(str, command)], stdout=-1, stderr=-1, text=True, start_new_session=True)
+
+
+def half_done(home, but=()):
+    """A scan that a worker fits now, with a checkpoint, and the worker's address."""
+    if not (home / 'out' / 'batch.log').exists():
+        return None
+    for line in events(home, 'began '):
+        name, address = line.removeprefix('began ').split(': ')
+        folder = home / 'out' / name
+        if address not in but and (folder / CHECKPOINT).exists() and not (folder / METRICS).exists():
+            return name, address
+    return None
+
+
+def require_all_done_once(home):
+    assert [row['status'] for row in results(home).values()] == ['done'] * len(NAMES)
+    assert sorted(events(home, 'done')) == [f'done {name}' for name in NAMES]
+    left = [path.name for path in (home / 'out').rglob('.lingo_mi*') if path.name != '.lingo_mi.json']
+    assert not left
+
+
+def require_same(home, name):
+    """The numbers are those of a fit of as many threads that nothing has interrupted."""
+    found = json.loads((home / 'out' / name / METRICS).read_text())
+    rows = (home / 'list.csv').read_text().splitlines()
+    (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    try:
+        code, _, err = run(BATCH, home / 'one.csv', '--out', home / 'alone')
+    finally:
+        dr.set_thread_count(before)
+    assert code == 0, err
+    wanted = json.loads((home / 'alone' / name / METRICS).read_text())
+    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=1e-4)
+
+
+def test_a_worker_is_killed(home):
+    with cluster(home, workers=3) as (address, processes):
+        numbers, batch = processes(), start(home, address)
+        wait_until(lambda: half_done(home) or batch.poll() is not None)
+        found = half_done(home)
+        assert found, batch.communicate()
+        name, worker = found
+        os.kill(numbers[worker], signal.SIGKILL)
+        out, err = batch.communicate(timeout=600)
+        assert batch.returncode == 0, err
+        begun = {name: [line for line in events(home, 'began') if line.startswith(f'began {name}:')] for name in NAMES}
+        assert {n: len(lines) for n, lines in begun.items()} == dict.fromkeys(NAMES, 1) | {name: 2}
+        assert worker in begun[name][0] and worker not in begun[name][1]
+        (line,) = events(home, 'resumed')
+        assert line.startswith(f'resumed {name}: ') and int(line.split(': ')[1]) > 1
+        assert len({line.split(': ')[1] for lines in begun.values() for line in lines}) == 3  # all three have worked
+        require_all_done_once(home)
+        require_same(home, name)
+        # Nothing is left to do.
+        code, text, err = run(BATCH, *arguments(home, address))
+        assert code == 0 and f'{len(NAMES)} of {len(NAMES)} scans are done already' in text, err
+        require_all_done_once(home)
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGKILL])
+def test_the_command_is_stopped(home, how):
+    """After Ctrl-C every worker stops with a checkpoint, after `kill -9` at its next report; the same command ends the list."""
+    with cluster(home, workers=2) as (address, _):
+        batch = start(home, address)
+        wait_until(lambda: half_done(home) or batch.poll() is not None)
+        name, _ = half_done(home)
+        os.kill(batch.pid, how)
+        out, err = batch.communicate(timeout=600)
+        if how == signal.SIGINT:
+            assert (
+                batch.returncode == 130 and err.splitlines()[-1] == 'interrupted: the same command goes on from here'
+            ), err
+        code, text, err = run(BATCH, *arguments(home, address))
+        assert code == 0, err
+        resumed = [line.split(':')[0] for line in events(home, 'resumed')]
+        assert f'resumed {name}' in resumed, (events(home), err)
+        require_all_done_once(home)
+
+
+def test_local_workers(home):
+    (home / 'list.csv').write_text('name,geometry,iterations,n_points\na,tiny.xml,10,100\nb,tiny.xml,10,100\n')
+    code, text, err = run(BATCH, *arguments(home, 'local:2'))
+    assert code == 0 and 'dashboard: http://127.0.0.1:' in err, err
+    assert [row['status'] for row in results(home).values()] == ['done'] * 2
+    assert len({line.split(': ')[1] for line in events(home, 'began')}) == 2
+
+
+def test_workers_that_cannot_do_it(home):
+    with cluster(home, workers=1, threads_of_tasks=2) as (address, _):
+        code, _, err = run(BATCH, *arguments(home, address))
+    assert code == 2 and 'runs 2 tasks at once' in err and err.count('\n') == 1

@@ -1,0 +1,175 @@
+"""Volumes written slab by slab: the same files as of the whole, and volumes that are the same to float32's last digits."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from helpers.script import FIT, SCENE, run
+from lingo_mi.errors import InputError
+from lingo_mi.files.slabs import write_slabs
+from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
+
+RECONSTRUCT = FIT.with_name('reconstruct.py')
+
+
+def geometry(shape, spacing=(1.0, 1.5, 2.0), origin=(3.0, -4.0, 5.0)):
+    return lm.Geometry.cone(
+        DSO=300,
+        DSD=450,
+        nDetector=(40, 48),
+        dDetector=4.0,
+        nVoxel=shape,
+        dVoxel=spacing,
+        offOrigin=origin,
+        angles=np.linspace(0, 6, 9),
+    )
+
+
+def noise(shape):
+    return np.random.default_rng(0).random(shape, np.float32)
+
+
+def slabs(volume, thickness):
+    return (volume[:, :, z : z + thickness] for z in range(0, volume.shape[2], thickness))
+
+
+@pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz'])
+def test_nifti(tmp_path, name):
+    """Byte for byte what the whole volume gives, but for what gzip keeps of the name and the time."""
+    g, v = geometry((7, 6, 11)), noise((7, 6, 11))
+    write_slabs(tmp_path / name, g, slabs(v, 4))
+    write_volume(tmp_path / 'whole.nii', v, g.dVoxel, first_voxel(g), 'density per mm')
+    if name.endswith('.nii'):
+        assert (tmp_path / name).read_bytes() == (tmp_path / 'whole.nii').read_bytes()
+    found, whole = read_volume(tmp_path / name), read_volume(tmp_path / 'whole.nii')
+    np.testing.assert_array_equal(found.data, v)
+    np.testing.assert_array_equal(found.affine, whole.affine)
+    assert found.unit == whole.unit == 'density per mm'
+
+
+@pytest.mark.parametrize('thickness', [64, 7, 1])
+def test_ome_zarr(tmp_path, thickness):
+    zarr = pytest.importorskip('zarr')
+    g, v = geometry((140, 30, 40)), noise((140, 30, 40))
+    write_slabs(tmp_path / 'v.ome.zarr', g, slabs(v, thickness))
+    group = zarr.open_group(str(tmp_path / 'v.ome.zarr'), mode='r')
+    np.testing.assert_array_equal(np.asarray(group['0'][:]).transpose(2, 1, 0), v)
+    level, want = 1, v.transpose(2, 1, 0)
+    while str(level) in group:
+        z, y, x = (n // 2 * 2 for n in want.shape)
+        want = want[:z, :y, :x].reshape(z // 2, 2, y // 2, 2, x // 2, 2).mean((1, 3, 5))
+        np.testing.assert_allclose(group[str(level)][:], want, rtol=1e-6)
+        level += 1
+    assert level == 3
+    (image,) = group.attrs['ome']['multiscales']
+    assert [axis['name'] for axis in image['axes']] == ['z', 'y', 'x'] and image['axes'][0]['unit'] == 'millimeter'
+    corner = first_voxel(g)[::-1]
+    for i, dataset in enumerate(image['datasets']):
+        scale, place = (t[t['type']] for t in dataset['coordinateTransformations'])
+        np.testing.assert_allclose(scale, np.array(g.dVoxel)[::-1] * 2**i)
+        # The outer corner of all levels is the same.
+        np.testing.assert_allclose(np.array(place) - np.array(scale) / 2, corner - np.array(g.dVoxel)[::-1] / 2)
+
+
+def test_ome_zarr_is_valid(tmp_path):
+    """By the models of the specification, written by others."""
+    models = pytest.importorskip('ome_zarr_models.v05')
+    zarr = pytest.importorskip('zarr')
+    write_slabs(tmp_path / 'v.ome.zarr', geometry((70, 20, 10)), slabs(noise((70, 20, 10)), 10))
+    image = models.Image.from_zarr(zarr.open_group(str(tmp_path / 'v.ome.zarr'), mode='r'))
+    assert len(image.ome_attributes.multiscales[0].datasets) == 2
+
+
+@pytest.mark.parametrize('name', ['v.nii', 'v.ome.zarr'])
+def test_bad_slabs(tmp_path, name):
+    g, v = geometry((70, 6, 11)), noise((70, 6, 11))
+    for bad in (slabs(v[:, :, :10], 4), slabs(v[:, :5], 4), slabs(np.concatenate([v, v], 2), 6), slabs(v * np.nan, 4)):
+        with pytest.raises(InputError):
+            write_slabs(tmp_path / name, g, bad)
+        assert not any(tmp_path.iterdir())
+    with pytest.raises(InputError, match='NIfTI'):
+        write_slabs(tmp_path / 'v.tif', g, slabs(v, 4))
+
+
+@pytest.mark.parametrize('thickness', [1, 5, 8, 24])
+def test_fdk(thickness):
+    g = geometry((24, 20, 16), (4.0, 5.0, 6.0))
+    scan = lm.simulate(noise((24, 20, 16)), g, progress=False).train
+    whole = lm.FDK().run(scan).volume
+    found = np.concatenate(list(lm.FDK().slabs(scan, thickness)), 2)
+    assert np.abs(found - whole).max() < 2e-6 * np.abs(whole).max()
+
+
+def test_a_cloud(tmp_path):
+    (tmp_path / 'tiny.xml').write_text(SCENE)
+    data = lm.simulate(tmp_path / 'tiny.xml')
+    result = lm.fit(data, 'fast', iterations=15, n_points=150, progress=False)
+    grid = data.train.geometry.with_volume((30, 26, 50), (0.8, 0.9, 0.5))
+    whole = result.volume(grid)
+    result.save_volume(tmp_path / 'v.nii', grid, slab=7)
+    assert np.abs(read_volume(tmp_path / 'v.nii').data - whole).max() < 2e-6 * whole.max() and whole.max() > 0
+    with pytest.raises(InputError, match='exists already'):
+        result.save_volume(tmp_path / 'v.nii')
+
+
+def test_the_command(tmp_path):
+    zarr = pytest.importorskip('zarr')
+    scene = tmp_path / 'tiny.xml'
+    scene.write_text(SCENE)
+    code, _, err = run(FIT, scene, '--iterations', 10, '-D', 'n_points=100', '--out', tmp_path / 'fit')
+    assert code == 0, err
+    for algorithm, more in (('fdk', ()), ('voxelize', ('--complete', tmp_path / 'fit' / 'result.xml'))):
+        names = [
+            tmp_path / f'{algorithm}{end}' for end in ('.nii.gz', '-slabs.nii.gz', '-slabs.ome.zarr', '-whole.ome.zarr')
+        ]
+        for name in names:
+            slab = ('--slab', 8) if 'slabs' in name.name else ()
+            code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, *more, *slab, '--out', name)
+            assert code == 0 and str(name) in text, err
+        whole = read_volume(names[0]).data
+        found = [
+            read_volume(names[1]).data,
+            *(zarr.open_group(str(n), mode='r')['0'][:].transpose(2, 1, 0) for n in names[2:]),
+        ]
+        for volume in found:
+            assert np.abs(volume - whole).max() < 2e-6 * np.abs(whole).max()
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '--slab', 8, '--out', tmp_path / 'x.nii')
+    assert code == 2 and '--slab is' in err
+    code, _, err = run(RECONSTRUCT, scene, '--out', names[3], '--force')
+    assert code == 2 and 'is a folder' in err
+
+
+PROGRAM = """
+import sys, json
+from pathlib import Path
+import numpy as np
+import lingo_mi as lm
+from lingo_mi.runtime import use_variant
+use_variant('llvm_ad_mono')
+from lingo_mi.files.slabs import write_slabs
+
+def go(nz, out):
+    g = lm.Geometry.cone(DSO=1000, DSD=1500, nDetector=64, dDetector=8, nVoxel=(256, 256, nz), dVoxel=1, angles=np.arange(8.0))
+    scan = lm.Scan(g, np.ones((8, 64, 64), np.float32))
+    write_slabs(out, g, lm.FDK().slabs(scan, 16))
+
+def peak():
+    return 1024 * next(int(l.split()[1]) for l in open('/proc/self/status') if l.startswith('VmHWM'))
+
+go(32, sys.argv[1] + '/a.nii')
+before = peak()
+go(int(sys.argv[2]), sys.argv[1] + '/b.nii')
+print(before, peak())
+"""
+
+
+@pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
+def test_memory_is_that_of_a_slab(tmp_path):
+    """A volume of sixteen times the slices, 134 MB, takes no more."""
+    command = [sys.executable, '-c', PROGRAM, str(tmp_path), '512']
+    before, peak = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert (tmp_path / 'b.nii').stat().st_size > 4 * 256 * 256 * 512 and peak - before < 15e6, (before, peak)

@@ -1,0 +1,37 @@
+"""Objects of a scene on a grid."""
+
+import numpy as np
+import pytest
+
+from lingo_mi.projectors.objects import GridInCube
+from lingo_mi.projectors.sampling import on_grid
+
+LOW = np.array([-1.0, 2.0, 3.0])
+
+
+def grid(values, own=(1.0, 1.0, 1.0)):
+    return GridInCube.of(values, LOW, LOW + np.array(values.shape) * own, 'thing')
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_means_over_larger_voxels(axis):
+    """Three times as large along one axis, and no other axis is smoothed."""
+    values = np.random.default_rng(0).random((9, 9, 9))
+    step, shape = np.ones(3), [9, 9, 9]
+    step[axis], shape[axis] = 3, 3
+    found = on_grid(grid(values), LOW, step, tuple(shape))
+    expected = np.moveaxis(np.moveaxis(values, axis, 0).reshape(3, 3, 9, 9).mean(1), 0, axis)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_smaller_voxels_are_interpolated_within_the_box(axis):
+    """A ramp, held for half a voxel at its ends, and nothing outside."""
+    values = np.moveaxis(np.broadcast_to(np.arange(1.0, 6)[:, None, None], (5, 4, 3)), 0, axis)
+    step, corner, shape = np.ones(3), LOW.copy(), list(values.shape)
+    step[axis], shape[axis] = 0.5, 14
+    corner[axis] -= 1
+    found = np.moveaxis(on_grid(grid(values), corner, step, tuple(shape)), axis, 0)
+    at = (np.arange(14) + 0.5) / 2 - 1  # in voxels from the box's face
+    expected = np.where((at > 0) & (at < 5), np.interp(at - 0.5, np.arange(5), np.arange(1.0, 6)), 0)
+    np.testing.assert_allclose(found, np.broadcast_to(expected[:, None, None], found.shape), rtol=1e-5)

@@ -1,0 +1,114 @@
+"""The choice of settings by held-out views: what is held out, the score, and that each kind of scan gets what suits it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from helpers.grids import scan as small
+from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.phantoms import make
+from lingo_mi.projectors.grid import project
+from lingo_mi.reconstruction import ASDPOCS, Best
+from lingo_mi.reconstruction.best import error_map
+from lingo_mi.reconstruction.held_out import Score, split
+from lingo_mi.reconstruction.system import System
+from lingo_mi.scan import Scan
+
+
+def scanner(size, spacing):
+    return CircularGeometry(
+        DSO=1000.0, DSD=1500.0, nDetector=(40, 40), dDetector=4.0, nVoxel=size, dVoxel=spacing, angles=circular(20)
+    )
+
+
+def scanned(parts, photons=0.0):
+    """A scan on 24^3 voxels of the phantom foot on `parts` times as many, and the truth on the voxels."""
+    n = 24 * parts
+    fine = make('foot', n).data * np.float32(0.08)
+    views = project(fine, scanner((n,) * 3, 3 / parts))
+    if photons:
+        counts = np.random.default_rng(0).poisson(photons * np.exp(-views.astype(float)))
+        views = -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)
+    truth = fine.reshape(24, parts, 24, parts, 24, parts).mean((1, 3, 5))
+    return Scan(scanner((24,) * 3, 3.0), views), truth
+
+
+@pytest.mark.parametrize('views, held', [(4, [1]), (5, [2]), (10, [2, 7]), (25, [2, 7, 12, 17, 22])])
+def test_which_views_are_held_out(views, held):
+    geometry = small(n=views)
+    scan = Scan(geometry, np.arange(views)[:, None, None] + np.zeros((views, *geometry.nDetector)))
+    kept, out = split(scan, 5)
+    assert out.projections[:, 0, 0].tolist() == held
+    assert sorted([*kept.projections[:, 0, 0], *held]) == list(range(views))
+
+
+def test_too_few_views():
+    geometry = small(n=3)
+    with pytest.raises(InputError, match='needs at least 4, but the scan has 3'):
+        Best().run(Scan(geometry, np.ones((3, *geometry.nDetector))))
+
+
+def test_no_start():
+    geometry = small(n=5)
+    with pytest.raises(InputError, match='best starts from nothing'):
+        Best().run(Scan(geometry, np.ones((5, *geometry.nDetector))), start=np.ones(geometry.nVoxel))
+
+
+def test_the_score_is_the_error_of_the_volume_smooth_or_not():
+    """Errors of a tenth of the truth's norm, from smooth ones to independent voxels. Plain residuals hide the latter, which
+    cancel along the rays. Of an error of independent voxels, trilinear interpolation takes a third to a half away."""
+    scan, truth = scanned(1)
+    rng = np.random.default_rng(1)
+    x, y, _ = np.indices(truth.shape) - 11.5
+    measure, system, found, plain = Score(scan), System(scan), [], []
+    for smooth in (4, 2, 1, 0):
+        error = gaussian_filter(rng.normal(size=truth.shape), smooth, mode='constant') * (np.hypot(x, y) < 10)
+        volume = system.start(truth + error * (0.1 * np.linalg.norm(truth) / np.linalg.norm(error)))
+        found.append(measure(volume))
+        plain.append(system.residual(volume)[1])
+    assert 0.08 < min(found[:3]) and max(found) < 0.12 and 0.05 < found[3] < 0.067
+    assert plain[0] > 4 * plain[-1]
+    assert measure(system.start(truth)) < 1e-4  # float32
+
+
+def test_finer_voxels_for_finer_objects_only():
+    for parts in (1, 2):
+        scan, truth = scanned(parts)
+        found = Best(niter=8).run(scan)
+        assert found.plan[found.taken].finer == parts
+        assert found.volume.shape == truth.shape
+        assert psnr_3d(found.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+
+
+def test_noise_stops_it_early():
+    clean, noisy = (Best(niter=8).run(scanned(1, photons)[0]) for photons in (0, 300.0))
+    assert noisy.plan[0].niter < clean.plan[0].niter
+    scan, truth = scanned(1, 300.0)
+    assert psnr_3d(noisy.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+
+
+def test_the_plan_is_told_and_can_be_kept():
+    scan, _ = scanned(1)
+    found = Best(niter=2, finer=1).run(scan)
+    record, lines = found.record(), found.report().splitlines()
+    assert [line[0] for line in lines].index('*') == found.taken == record['taken']
+    assert len(lines) == len(record['tried']) == len(found.plan)
+    for tried in record['tried']:
+        assert tried['scores'][tried['niter'] - 1] == tried['score'] == min(tried['scores'])
+    again = Best(niter=2, finer=1).run(replace(scan))
+    np.testing.assert_array_equal(again.volume, found.volume)
+    np.testing.assert_array_equal(again.error, found.error)
+
+
+def test_the_map_of_errors():
+    volume = np.zeros((9, 9, 9), np.float32)
+    other = volume.copy()
+    other[4, 4, 4] = 1
+    found = error_map(volume, other)
+    assert found.dtype == np.float32 and found.argmax() == np.ravel_multi_index((4, 4, 4), found.shape)
+    assert abs((found**2).sum() - 1) < 1e-3 and not error_map(volume, volume).any()

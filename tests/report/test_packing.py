@@ -1,0 +1,80 @@
+"""Arrays as a page holds them: right to half a step, 0 kept as it is, within the budget."""
+
+import base64
+import gzip
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lingo_mi.report.packing import bits_within, pack, preview
+from lingo_mi.report.payload import slices
+
+
+def unpacked(packed):
+    """What `decode.js` does, step by step."""
+    low, high = np.frombuffer(gzip.decompress(base64.b64decode(packed.text)), np.uint8).reshape(2, -1).astype(int)
+    folded = low | high << 8
+    changes = (folded >> 1) ^ -(folded & 1)
+    return packed.low + packed.step * (np.cumsum(changes) & 0xFFFF).reshape(packed.shape, order='F')
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([8, 10, 12, 14, 16]), st.floats(-50, 50), st.floats(1e-6, 1e4))
+def test_values_are_right_to_half_a_step(seed, bits, low, size):
+    array = low + size * np.random.default_rng(seed).random((5, 4, 3))
+    packed = pack(array, low, low + size, bits)
+    assert packed.step <= size / (2**bits - 2) * 1.0001
+    assert np.abs(unpacked(packed) - array).max() <= packed.step * 0.501
+
+
+def test_nothing_stays_nothing():
+    array = np.array([-0.3, 0.0, 0.7])[:, None, None]
+    for bits in (8, 16):
+        assert abs(unpacked(pack(array, -0.3, 0.7, bits))[1, 0, 0]) < 1e-12
+
+
+def test_one_value():
+    assert (unpacked(pack(np.full((2, 2, 2), 3.0), 3.0, 3.0)) == 3).all()
+
+
+def test_bits_are_as_many_as_the_budget_allows():
+    rng = np.random.default_rng(0)
+    noise = rng.random((48, 48, 48)).astype(np.float32)
+    sizes = {bits: len(pack(noise, 0, 1, bits).text) for bits in (16, 12, 8)}
+    assert bits_within([noise], 0, 1, 1.05 * sizes[16]) == 16
+    assert bits_within([noise], 0, 1, 1.05 * sizes[12]) == 12
+    assert bits_within([noise], 0, 1, 0.5 * sizes[8]) is None
+
+
+def test_preview_is_the_mean_of_blocks():
+    volume = np.random.default_rng(0).random((9, 8, 4))
+    small, by = preview(volume, 9 * 8 * 4 // 8 + 1)
+    assert by == 2 and small.shape == (4, 4, 2)
+    np.testing.assert_allclose(small[1, 2, 0], volume[2:4, 4:6, :2].mean())
+    assert preview(volume)[1] == 1
+
+
+@pytest.mark.parametrize('size', [64, pytest.param(256, marks=pytest.mark.slow)])
+def test_the_worst_volume_stays_within_the_budget(size):
+    """Noise in reconstruction and truth; the budget is in proportion to 20 MB for 256^3."""
+    rng = np.random.default_rng(0)
+    budget, arrays = 20e6 * (size / 256) ** 3, {}
+    volumes = {name: rng.random((size, size, size), dtype=np.float32) for name in ('Reconstruction', 'Truth')}
+    known = slices(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
+    assert sum(len(a.text) for a in arrays.values()) <= 1.02 * budget and known['preview'] == 2
+    half = size // 2
+    assert known['shape'] == [half] * 3 and known['spacing'] == [2, 2, 2] and known['centre'] == [0, 0, 0]
+
+
+def test_budgets_leave_room():
+    """Of 30 MB: the volumes', the views', libraries, cloud and surfaces."""
+    from lingo_mi.report import payload, template
+
+    libraries = len(template._script())
+    cloud = 11 * payload.MOST_POINTS * 2 * 4 / 3
+    surfaces = 2 * (3 + 6) * payload.MOST_VERTICES * 2 * 4 / 3
+    assert payload.VOLUME_BYTES + payload.VIEW_BYTES + libraries + cloud + surfaces < 30e6
+    assert not re.search('</script', template._script())

@@ -1,0 +1,129 @@
+"""Results side by side: what the page holds, and what cannot be compared."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.browser import browser, opened, readout
+from helpers.script import run
+from lingo_mi.errors import InputError
+from lingo_mi.files.images import write_exr
+from lingo_mi.files.volumes import write_volume
+from lingo_mi.results.compare import compare_page
+from lingo_mi.results.stored import read_stored
+
+COMPARE = Path(__file__).parents[2] / 'scripts' / 'compare.py'
+SHAPE = 12, 10, 8
+
+
+def result(folder, seed, **numbers):
+    """A folder as `fit` writes it, but for what a comparison does not read."""
+    rng = np.random.default_rng(seed)
+    (folder / 'views').mkdir(parents=True)
+    write_volume(folder / 'volume.nii.gz', rng.random(SHAPE).astype(np.float32), 2.0, None, 'density per mm')
+    for i in range(3):
+        write_exr(folder / 'views' / f'000{i}.exr', rng.random((6, 7)).astype(np.float32))
+    metrics = dict(
+        psnr_3d=30.0 + seed, psnr_3d_r2=31.0, seconds_fit=10.0 + seed, gaussians=100 * (seed + 1), test_angles=[0.0, 20.0, 10.0],
+        settings=dict(iterations=5, lambda_tv=0.1 * seed), command=f'lingo-mi fit {seed}', iterations=5,
+    )  # fmt: skip
+    (folder / 'metrics.json').write_text(json.dumps(metrics | numbers))
+    return folder
+
+
+@pytest.fixture
+def pair(tmp_path):
+    return result(tmp_path / 'a', 0), result(tmp_path / 'b', 1)
+
+
+def cells(page, name):
+    row = re.search(rf'<tr><th scope="row">{re.escape(name)}</th>(.*?)</tr>', page)[1]
+    return re.findall('<td class="value">(.*?)</td>', row)
+
+
+def test_numbers_and_what_differs(pair):
+    page = compare_page([read_stored(p) for p in pair])
+    assert cells(page, 'PSNR 3D, peak the truth&#x27;s maximum') == ['30.00 dB', '★ 31.00 dB  (+1.00)']
+    assert cells(page, 'Time to fit') == ['★ 10.0 s', '11.0 s  (+1.0)']
+    assert cells(page, 'Gaussians') == ['100', '200  (+100)']  # neither is better
+    assert cells(page, 'PSNR 3D as in R2-Gaussian: peak 1') == ['31.00 dB', '31.00 dB']
+    assert cells(page, 'lambda_tv') == ['0', '0.1'] and '>iterations<' not in page
+    assert 'lingo-mi fit 0' in page and 'Make b again' in page
+
+
+def test_in_a_browser(pair, tmp_path):
+    """The values at the crosshair are those of the files, and differences those to the truth."""
+    truth = np.random.default_rng(9).random(SHAPE).astype(np.float32)
+    write_volume(tmp_path / 't.nii.gz', truth, 2.0, None, 'density per mm')
+    code, out, err = run(COMPARE, *pair, '--truth', tmp_path / 't.nii.gz', '--out', tmp_path / 'c.html', variant=False)
+    assert code == 0 and out.strip() == str(tmp_path / 'c.html'), err
+    with browser() as chromium, opened(chromium, (tmp_path / 'c.html').as_uri()) as page:
+        found = readout(page)
+        index = tuple(map(int, found['voxel'].split(', ')))
+        for path in pair:
+            value = read_stored(path).volume.data[index]
+            assert abs(float(found[path.name]) - value) < 1e-4
+            assert abs(float(found[f'Difference: {path.name} − Truth']) - (value - truth[index])) < 1e-4
+        page.keyboard.press('s')
+        assert page.locator('#slices canvas.picture').count() == 3 * 7
+        captions = page.locator('#views figcaption').all_text_contents()
+        assert captions == ['a', 'b', 'b − a']
+
+
+def test_a_volume_of_reconstruct_beside_a_fit(pair, tmp_path):
+    write_volume(tmp_path / 'x <b>.nii.gz', np.ones(SHAPE, np.float32), 2.0, None, 'density per mm')
+    page = compare_page([read_stored(pair[0]), read_stored(tmp_path / 'x <b>.nii.gz')])
+    assert 'x &lt;b&gt;' in page and 'x <b>' not in page
+    assert cells(page, 'Time to fit') == ['10.0 s', 'n/a']
+
+
+def test_views_of_other_angles_are_left_out(tmp_path):
+    pair = result(tmp_path / 'a', 0), result(tmp_path / 'b', 1, test_angles=[0.0, 20.0, 11.0])
+    assert 'id="array-views0"' not in compare_page([read_stored(p) for p in pair])
+
+
+def test_same_names_are_told_apart(tmp_path):
+    pair = result(tmp_path / '1' / 'foot', 0), result(tmp_path / '2' / 'foot', 1)
+    assert '<th scope="col">foot (2)</th>' in compare_page([read_stored(p) for p in pair])
+
+
+def test_other_grids(pair, tmp_path):
+    write_volume(tmp_path / 'x.nii.gz', np.ones((9, 9, 9), np.float32), 2.0, None, 'density per mm')
+    with pytest.raises(InputError, match='x: has 9 x 9 x 9 voxels of 2 x 2 x 2 mm, but a has 12 x 10 x 8'):
+        compare_page([read_stored(pair[0]), read_stored(tmp_path / 'x.nii.gz')])
+
+
+@pytest.mark.parametrize('text', ['', '[]', '{"test_angles": 5}', '{"test_angles": ["x"]}'])
+def test_damaged_numbers(pair, text):
+    (pair[0] / 'metrics.json').write_text(text)
+    with pytest.raises(InputError, match='metrics.json: is damaged'):
+        read_stored(pair[0])
+
+
+@pytest.mark.parametrize(
+    'change, message',
+    [
+        (lambda a, b, t: [a], 'a comparison is of 2 to 6 results, not of 1'),
+        (lambda a, b, t: [a, t], 'there is no result here'),
+        (lambda a, b, t: [a, t / 'none'], 'none'),
+        (lambda a, b, t: [a, b, '--out', t / 'x.png'], 'give a name that ends in .html'),
+        (lambda a, b, t: [a, b, '--out', a / 'metrics.json' / 'x.html'], 'x.html'),
+        (lambda a, b, t: [a, b, '--truth', t / 'none.nii.gz'], 'none.nii.gz'),
+    ],
+)
+def test_bad_input(pair, tmp_path, monkeypatch, change, message):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(COMPARE, *change(*pair, tmp_path), variant=False)
+    assert code == 2 and not out and err.startswith('error: ') and err.count('\n') == 1 and message in err
+    assert not (tmp_path / 'compare.html').exists()
+
+
+def test_nothing_is_replaced_without_force(pair, tmp_path):
+    (tmp_path / 'c.html').write_text('mine')
+    code, _, err = run(COMPARE, *pair, '--out', tmp_path / 'c.html', variant=False)
+    assert code == 2 and 'exists already' in err and (tmp_path / 'c.html').read_text() == 'mine'
+    assert run(COMPARE, *pair, '--out', tmp_path / 'c.html', '--force', variant=False)[0] == 0
+    assert '</html>' in (tmp_path / 'c.html').read_text()

@@ -1,0 +1,75 @@
+"""How cost grows: the stages run, the laws are what they must be, and the command writes what it says."""
+
+import contextlib
+import io
+import json
+import runpy
+import sys
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from helpers.script import FIT
+from lingo_mi.errors import InputError
+from lingo_mi.studies.growth import stages, sweep
+from lingo_mi.studies.growth.report import exponents, rows_of
+
+GROWTH = FIT.with_name('growth.py')
+pytestmark = pytest.mark.skipif(not Path('/proc/self/clear_refs').exists(), reason='asks Linux for its peak memory')
+
+
+@pytest.mark.parametrize('stage', stages.DEPENDS)
+def test_a_stage_runs(stage):
+    stages.prepare(stage, stages.Size(*stages.TINY))()
+
+
+def test_the_peak_is_that_of_the_arrays():
+    """The measures of quality hold two volumes and what one slab needs; a second measurement forgets the first."""
+    large = stages.measure('measure', stages.Size(96, 16, 2, 1), 0)
+    small = stages.measure('measure', stages.Size(24, 16, 2, 1), 0)
+    assert large['peak'] > 2 * 4 * 96**3 and small['peak'] < large['peak'] / 4
+
+
+def test_the_law():
+    rows = [dict(stage='FDK', axis='voxels', number=10**n, seconds=3 * 100.0**n, peak=7 * 10.0**n) for n in (1, 2, 3)]
+    assert sweep.exponent(rows, 'seconds') == pytest.approx(2) and sweep.exponent(rows, 'peak') == pytest.approx(1)
+    assert rows_of(rows[::-1], 'FDK', 'voxels') == rows
+    assert '| FDK | 2.00 (1.00) | – | – | – |' in exponents(rows)
+
+
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('voxels', 'views')})
+    monkeypatch.setattr(sweep, 'SIZES', dict(voxels=(8, 16, 24), views=(2, 4)))
+    monkeypatch.setattr(sweep, 'BASE', stages.Size(16, 16, 4, 100))
+    code, text, err = run_growth(tmp_path)
+    assert code == 0, err
+    found = json.loads((tmp_path / 'growth.json').read_text())
+    assert [(r['axis'], r['number']) for r in found] == [('voxels', 512), ('voxels', 4096), ('voxels', 13824)] + [
+        ('views', 2),
+        ('views', 4),
+    ]
+    assert all(row['seconds'] > 0 for row in found) and (tmp_path / 'growth.md').read_text() in text
+    assert (tmp_path / 'growth.png').stat().st_size > 10_000 and (tmp_path / 'growth.provenance.json').exists()
+    # What is stored is not measured again, and a stage that fails does not lose it.
+    monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('voxels', 'views'), 'voxelise': ('views',)})
+    monkeypatch.setattr(sweep, '_measured', mock.Mock(side_effect=InputError('voxelise: no')))
+    code, _, err = run_growth(tmp_path)
+    assert code == 2 and err.splitlines()[-1] == 'error: voxelise: no' and sweep._measured.call_count == 1
+    assert json.loads((tmp_path / 'growth.json').read_text()) == found
+    (tmp_path / 'growth.json').write_text('{"mine": 1}')
+    code, _, err = run_growth(tmp_path)
+    assert code == 2 and 'growth.json: holds no measurements' in err and err.count('\n') == 1
+
+
+def run_growth(folder):
+    """Exit code, standard output and standard error of `lingo-mi growth --out FOLDER`."""
+    out, err = io.StringIO(), io.StringIO()
+    argv = [str(GROWTH), '--out', str(folder)]
+    with mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            runpy.run_path(str(GROWTH), run_name='__main__')
+            code = 0
+        except SystemExit as stop:
+            code = stop.code
+    return code, out.getvalue(), err.getvalue()

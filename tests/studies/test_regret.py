@@ -1,0 +1,73 @@
+"""`lingo-mi regret`: its cells, that they are kept, the table, and bad input in one line."""
+
+import json
+import runpy
+import sys
+
+import numpy as np
+import pytest
+
+from helpers.script import FIT
+from lingo_mi.studies.regret import BEST, CLOUDS, VOXELS, Case, Study, noisy
+
+
+def regret(monkeypatch, capsys, *args):
+    """Exit code, standard output and standard error of `regret.py ARGS`."""
+    monkeypatch.setattr(sys, 'argv', ['regret.py', *map(str, args)])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(FIT.with_name('regret.py')), run_name='__main__')
+    return stop.value.code, *capsys.readouterr()
+
+
+def test_a_small_table(monkeypatch, capsys, tmp_path):
+    command = (
+        '--objects',
+        'foot',
+        '--finer',
+        1,
+        '--views',
+        6,
+        '--size',
+        12,
+        '--out',
+        tmp_path,
+        '--variant',
+        'llvm_ad_mono',
+    )
+    code, text, err = regret(monkeypatch, capsys, *command)
+    assert code == 0, err
+    study, case = Study(tmp_path, 12), Case('foot', 1, 6)
+    cells = {setting: study.get(case, setting) for setting in (*VOXELS, BEST)}
+    assert all(cell['psnr_3d'] > 15 and cell['seconds'] > 0 for cell in cells.values())
+    behind = max(cells[name]['psnr_3d'] for name in VOXELS) - cells[BEST]['psnr_3d']
+    row = (tmp_path / 'regret.md').read_text().splitlines()[-1]
+    assert row.startswith('| foot | x1 | 6 | no noise |') and f'| {behind:+.2f} |' in row and row in text
+    assert row.count('–') == len(CLOUDS)
+    assert json.loads((tmp_path / 'regret.provenance.json').read_text())['command'].split()[0].endswith('regret.py')
+    kept = study.path(case, 'refined')
+    kept.write_text(json.dumps(cells['refined'] | dict(psnr_3d=99.0)))
+    study.path(case, BEST).write_text('{')  # cut short: computed again
+    code, text, err = regret(monkeypatch, capsys, *command)
+    assert code == 0 and '99.00' in text and f'{cells[BEST]["psnr_3d"]:.2f} (' in text, err
+
+
+def test_noise_is_that_of_photons():
+    views = np.full((40, 40, 40), 2.0, np.float32)
+    found = noisy(views, 1000.0)
+    assert abs(found.std() / np.sqrt(np.exp(2.0) / 1000) - 1) < 0.05 and abs(found.mean() - 2) < 0.01
+    assert np.isfinite(noisy(views + 20, 1000.0)).all()
+
+
+@pytest.mark.parametrize(
+    'args, says',
+    [
+        (['--finer', 0], '--finer must be from 1 to 8'),
+        (['--views', 3], '--views must be from 4 to 5000'),
+        (['--size', 4], '--size must be from 12 to 512'),
+        (['--photons', -1], '--photons must be 0, or from 1'),
+        (['--objects', 'cat'], "object 'cat' is unknown"),
+    ],
+)
+def test_bad_input(monkeypatch, capsys, tmp_path, args, says):
+    code, _, err = regret(monkeypatch, capsys, '--out', tmp_path / 'new', *args)
+    assert code == 2 and says in err and err.count('\n') == 1 and not (tmp_path / 'new').exists()
