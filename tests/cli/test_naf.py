@@ -56,7 +56,7 @@ def test_files_and_summary(fitted):
     assert record['psnr_3d'] > 18 and record['psnr_2d'] > 20  # an empty volume has 10, the scan's mean everywhere 11
     assert record['gaussians'] == 0 and record['ipsd'] is None and f'{record["parameters"]:,} parameters' in out
     page = (folder / 'report.html').read_text()
-    assert 'Gaussians' not in page and 'IPSD' not in page and 'PSNR 3D' in page
+    assert 'Gaussians born' not in page and 'IPSD: mean' not in page and 'PSNR 3D' in page
 
 
 def test_mitsuba_sees_the_field_as_voxels(fitted):

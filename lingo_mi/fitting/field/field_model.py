@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.calibration.response.response import Response
 from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.network import Network
@@ -30,10 +31,11 @@ class FieldModel:
     geometry   of its scan, as given; defines the cube of the field and the default grid of `volume`
     unit       the fit's unit of density, 1/mm, which no density of the field exceeds (see `densities.largest_density`)
     effects    none: the field fits line integrals
+    response   none, for the same reason
     """
 
     effects: Effects | None = None
-    response: None = None  # nor does it find what a detector makes of them
+    response: Response | None = None
 
     def __init__(self, settings: Settings, geometry: Geometry, unit: float):
         self.settings, self.geometry, self.unit = settings, geometry, unit
@@ -77,7 +79,9 @@ class FieldModel:
                 progress(i + 1, len(geometry))
         return out.reshape(len(geometry), height, width) * np.float32(self.unit / g.scale)
 
-    expected = render
+    def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
+        """What the scan's detector is expected to measure in the views of a geometry: `render`."""
+        return self.render(state, geometry)
 
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray:
         """The field at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
