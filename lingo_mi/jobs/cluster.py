@@ -90,6 +90,8 @@ class Cluster:
                 future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
             with Progress('Jobs', sum(job.steps for job in jobs)) as bar:
                 _follow(by_name, events, tell, bar)
+            if self.client.status != 'running':
+                raise InputError('the scheduler has gone; start one, and run the same command again')
             self.client.unsubscribe_topic(topic)
         except KeyboardInterrupt:
             self._stop(futures, events)
