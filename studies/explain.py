@@ -93,6 +93,7 @@ def rows(dataset: Dataset, calibration: Calibration, progress: Callable[[str], N
 def cloud_rows(dataset: Dataset, progress: Callable[[str], None] = print, **settings) -> Iterable[Explained]:
     """Rows of fits that find the corrections with the cloud."""
     test = dataset.test
+    assert test is not None  # what rows are judged by
     for name, changes in WITH_CLOUD.items():
         progress(name)
         result = fit(dataset.train, 'fast', progress=False, **(settings | changes))

@@ -5,14 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import reading, replacing
 
-Column = tuple[str, Callable[[dict], str]]  # the title, and the cell of a row
+Column = tuple[str, Callable[[Any], str]]  # the title, and the cell of a row
 
 
-def table(columns: list[Column], rows: Iterable[dict], first: str | None = None) -> str:
+def table(columns: list[Column], rows: Iterable[Any], first: str | None = None) -> str:
     """A Markdown table. first   another title for the first column
 
     >>> print(table([('a', lambda r: r['a']), ('b', lambda r: f'{r["b"]:.1f}')], [dict(a='x', b=2)]))

@@ -55,9 +55,8 @@ class Stepper:
         scan = trusted(scan, settings)
         unit = density_unit(scan, settings)
         self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
-        self.unit, self.measured = unit, None
-        if self.model.response is not None:
-            self.measured = scan
+        self.unit = unit
+        self.measured = scan if self.model.response is not None else None
         self.forward = forward_model(settings)
         self.share: Any = None
         self.scattered: np.ndarray | None = None
@@ -169,6 +168,8 @@ class Stepper:
 
     def _line_integral_targets(self):
         """Give all views the line integrals that the response leaves of what was measured."""
+        if self.model.response is None or self.measured is None:
+            return
         undone = self.model.response.undone(self.measured.projections, self.geometry)
         scan = replace(self.measured, projections=undone)
         for targets, views in ((self.targets, scan), (self.coarse, scan.binned(2))):

@@ -61,4 +61,4 @@ class Curve(Part):
         return q + sum(x * q ** (k + 2) for k, x in enumerate(c))
 
     def _slope(self, q, c):
-        return 1 + sum(x * (k + 2) * q ** (k + 1) for k, x in enumerate(c))
+        return np.ones_like(q) + sum(x * (k + 2) * q ** (k + 1) for k, x in enumerate(c))

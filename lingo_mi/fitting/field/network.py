@@ -75,8 +75,8 @@ class Network:
         points   x, y, z, Float [N] each, in [0, 1]
         """
         self.encoding.data = values['features']
-        encoded = self.encoding(points)
-        inputs = mi.TensorXf(dr.ravel(encoded, order='C'), (self.inputs, dr.width(points)))
+        encoded: Any = dr.ravel(self.encoding(points), order='C')
+        inputs = mi.TensorXf(encoded, (self.inputs, dr.width(points)))
         hidden, begin = inputs, 0
         for i, (n, m) in enumerate(self.layers):
             bias = _block(values['network'], begin + n * m, 1, (m, 1))
