@@ -120,7 +120,8 @@ class Live:
         self._server.server_close()
 
     def _contents(self, snapshot: Snapshot) -> ReportData:
-        geometry, held_out = self.geometry, {}
+        geometry = self.geometry
+        held_out: dict[str, Any] = {}
         if snapshot.test is not None and snapshot.views is not None:
             held_out = dict(
                 views=snapshot.views,
