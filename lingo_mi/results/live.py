@@ -28,7 +28,7 @@ from lingo_mi.report.packing import preview
 from lingo_mi.report.payload import colour_maps, payload
 from lingo_mi.results.watch import Snapshot
 
-SHARE = 0.02  # of the time, that looking may take
+SHARE = 0.02  # of the fit's processor time, that looking may take
 MOST_VOXELS = 128**3  # of a volume in the page
 MILLISECONDS = 1000  # between two questions of the page
 PATIENCE = 10.0  # seconds after which a page that has not asked is gone; a finished fit waits no longer for it
@@ -50,7 +50,7 @@ class Live:
         self._data: ReportData | None = None
         self._skipped: Snapshot | None = None
         self._packed: tuple[int, dict] = (0, {})
-        self._began, self._spent, self._asked = time.perf_counter(), 0.0, -np.inf
+        self._began, self._spent, self._asked = time.process_time(), 0.0, -np.inf
         self._server = ThreadingHTTPServer(('127.0.0.1', 0), _handler(self))
         self._server.daemon_threads = True
         self._port = self._server.server_address[1]
@@ -95,17 +95,17 @@ class Live:
         """See `watch.Watcher`. The first look is for everybody, the others are for pages that still ask, within `SHARE`."""
         now = time.perf_counter()
         watching = now - self._asked < PATIENCE or self._number == 0
-        if not watching or self._spent > SHARE * (now - self._began) and self._number > 0:
+        if not watching or self._spent > SHARE * (time.process_time() - self._began) and self._number > 0:
             self._skipped = snapshot
             return
         self._show(snapshot)
 
     def _show(self, snapshot: Snapshot) -> None:
-        now, self._skipped = time.perf_counter(), None
+        began, self._skipped = time.thread_time(), None
         data = self._contents(snapshot)
         with self._lock:
             self._data, self._number = data, self._number + 1
-        self._spent += time.perf_counter() - now
+        self._spent += time.thread_time() - began
 
     def close(self, finished: bool) -> None:
         """See `watch.Watcher`. Waits a moment for a page that is open, so that it sees the end."""
@@ -121,7 +121,7 @@ class Live:
 
     def _contents(self, snapshot: Snapshot) -> ReportData:
         geometry = self.geometry
-        held_out: dict = {}
+        held_out: dict[str, Any] = {}
         if snapshot.test is not None and snapshot.views is not None:
             held_out = dict(
                 views=snapshot.views,
