@@ -188,9 +188,9 @@ class Study:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds, and the regret of `Best`."""
         names = VOXELS | CLOUDS
         lines = [
-            '| object | scanned | views | photons | '
+            '| object | scanned | views | photons | **best** | regret, dB | error map | '
             + ' | '.join(names.values())
-            + ' | **best** | regret, dB | error map |',
+            + ' |',
             '|---|---:|---:|---:|' + '---:|' * (len(names) + 3),
         ]
         for case in cases:
@@ -202,10 +202,9 @@ class Study:
             best = max((found['psnr_3d'] for found in fixed.values()), default=np.nan)
             photons = f'{case.photons:g}' if case.photons else 'no noise'
             lines.append(
-                f'| {case.object} | x{case.finer} | {case.views} | {photons} | '
-                + ' | '.join(cells)
-                + f' | {chosen["psnr_3d"]:.2f} ({chosen["seconds"]:.0f} s) | {best - chosen["psnr_3d"]:+.2f} '
-                + f'| {chosen["error_map"]:.2f} |'
+                f'| {case.object} | x{case.finer} | {case.views} | {photons} '
+                f'| {chosen["psnr_3d"]:.2f} ({chosen["seconds"]:.0f} s) | {best - chosen["psnr_3d"]:+.2f} '
+                f'| {chosen["error_map"]:.2f} | {" | ".join(cells)} |'
             )
         return '\n'.join(lines)
 
