@@ -59,7 +59,7 @@ sphinx_gallery_conf = {
     'examples_dirs': '../examples',
     'gallery_dirs': 'gallery',
     'filename_pattern': r'[/\\]' + ''.join(f'(?!{example})' for example in skipped) + r'\d\d_',
-    'capture_repr': (),
+    'capture_repr': ('_repr_html_',),  # scans and results show themselves, as in a notebook
     'download_all_examples': False,
     'show_memory': False,
     'write_computation_times': False,

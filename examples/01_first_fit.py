@@ -18,6 +18,7 @@ import lingo_mi as lm
 foot = lm.phantom('foot', size=64)
 data = lm.simulate(foot, views=25)
 print(data.train.projections.shape, 'to fit,', data.test.projections.shape, 'held out')
+data
 
 # %%
 # The fit
@@ -25,7 +26,7 @@ print(data.train.projections.shape, 'to fit,', data.test.projections.shape, 'hel
 # 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 1400 steps are usual; 250 are enough here.
 
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
-print(result)
+result
 
 # %%
 # What comes out

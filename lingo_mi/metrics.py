@@ -32,9 +32,8 @@ from lingo_mi.errors import InputError
 WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
-SLAB = (
-    2**23
-)  # values that are made float64 at once: the whole of a large volume, with its temporaries, takes ten times itself
+# Values that are made float64 at once: the whole of a large volume, with its temporaries, takes ten times itself.
+SLAB = 2**23
 
 
 def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
