@@ -247,7 +247,7 @@ def test_held_out_pixels_that_are_not_valid_do_not_count(scan):
 
     def measured(value):
         views = spoilt(scan, valid, value) * np.float32(1.01)
-        return quick_measure(dataset, 9)(SimpleNamespace(render=lambda state, geometry: views), None)
+        return quick_measure(dataset, 9)(SimpleNamespace(expected=lambda state, geometry: views), None)
 
     assert measured(0) == measured(1e6) and np.isfinite(measured(0)['psnr_2d'])
 

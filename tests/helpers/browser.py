@@ -1,6 +1,7 @@
 """A page in headless Chromium, driven by Playwright. Tests that need it are skipped, with a reason, where either is missing."""
 
 import contextlib
+import re
 import shutil
 
 import pytest
@@ -80,6 +81,8 @@ def opened(browser, address, dark=False, offline=True, ready=True):
 
 
 def readout(page, row='crosshair'):
-    """The texts of a row of the table below the slices, by the names of its columns."""
+    """The texts of a row of the table below the slices, by the names of its columns; the crosshair's once it has a place."""
+    if row == 'crosshair':
+        page.locator('.readout tr[data-row=crosshair] td[data-name=voxel]', has_text=re.compile(r'\d')).wait_for()
     cells = page.locator(f'.readout tr[data-row={row}] td')
     return {cell.get_attribute('data-name'): cell.text_content() for cell in cells.all()}

@@ -187,7 +187,7 @@ def test_a_lost_viewer_stops_nothing(data, monkeypatch):
 def test_the_page_follows_a_real_fit(scene, tmp_path):
     """Its last values are those of the volume that the fit writes."""
     with browser() as chromium:
-        process = fit_process(scene, '--iterations', 600, '-D', 'n_points=100', '--live', '--out', tmp_path / 'a')
+        process = fit_process(scene, '--iterations', 4000, '-D', 'n_points=100', '--live', '--out', tmp_path / 'a')
         address = None
         for line in process.stderr:
             if line.startswith('live: '):
@@ -199,7 +199,7 @@ def test_the_page_follows_a_real_fit(scene, tmp_path):
             page.locator('#live').filter(has_text='Step ').wait_for()
             page.wait_for_selector('#slices canvas.picture')
             first = page.locator('#live').text_content()
-            assert re.match(r'Step [\d,]+ of 600, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
+            assert re.match(r'Step [\d,]+ of 4,000, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
             page.locator('#live').filter(has_text='The fit is finished.').wait_for(timeout=120_000)
             page.locator('#curves').wait_for()
             page.evaluate('() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))')
