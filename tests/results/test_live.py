@@ -184,10 +184,11 @@ def test_a_lost_viewer_stops_nothing(data, monkeypatch):
     assert len(result) > 0
 
 
+@pytest.mark.slow  # a browser beside a fit: the page's steps have tests of their own
 def test_the_page_follows_a_real_fit(scene, tmp_path):
     """Its last values are those of the volume that the fit writes."""
     with browser() as chromium:
-        process = fit_process(scene, '--iterations', 4000, '-D', 'n_points=100', '--live', '--out', tmp_path / 'a')
+        process = fit_process(scene, '--iterations', 12_000, '-D', 'n_points=100', '--live', '--out', tmp_path / 'a')
         address = None
         for line in process.stderr:
             if line.startswith('live: '):
@@ -199,8 +200,8 @@ def test_the_page_follows_a_real_fit(scene, tmp_path):
             page.locator('#live').filter(has_text='Step ').wait_for()
             page.wait_for_selector('#slices canvas.picture')
             first = page.locator('#live').text_content()
-            assert re.match(r'Step [\d,]+ of 4,000, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
-            page.locator('#live').filter(has_text='The fit is finished.').wait_for(timeout=120_000)
+            assert re.match(r'Step [\d,]+ of 12,000, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
+            page.locator('#live').filter(has_text='The fit is finished.').wait_for(timeout=300_000)
             page.locator('#curves').wait_for()
             page.evaluate('() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))')
             assert all(url.startswith(address.split('?')[0]) for url in page.asked)
