@@ -4,6 +4,7 @@
 `assemble`   every kernel through NVIDIA's assembler: does it compile, how many registers, does it spill
 `work`       what is counted: one image of a cloud, its derivatives, a step of a fit
 `count`      instructions and memory sectors of that work
+`waits`      how often a step waits for the device, copies, loads and launches kernels
 `model`      the time on a graphics card that follows from the counts
 
 The stand-in is a program that runs a command with its driver. It is told what to do by environment variables: CUDA_ON_CPU_SM

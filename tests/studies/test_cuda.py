@@ -1,5 +1,6 @@
 """What is checked and counted of CUDA without a GPU: assembling, counting, the model, the page and the command."""
 
+import subprocess
 from collections import Counter
 from importlib import resources
 
@@ -8,7 +9,7 @@ import pytest
 from helpers.script import FIT, run
 from lingo_mi.errors import InputError
 from lingo_mi.gpu import GPU
-from lingo_mi.studies.cuda import assemble, model, report
+from lingo_mi.studies.cuda import assemble, model, report, waits
 from lingo_mi.studies.cuda.assemble import Kernel, assemble_all, find_ptxas
 from lingo_mi.studies.cuda.count import KINDS, _counts, difference
 from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
@@ -84,6 +85,38 @@ def test_difference_of_counts():
 
 
 # ---- the model -------------------------------------------------------------------------------------------------------
+
+
+LISTING = """      Type           Disp Enb Address            What
+1       breakpoint     keep y   0x00007ffff59a1f10 cuStreamSynchronize
+\tbreakpoint already hit {} times
+        ignore next 999999991 hits
+2       breakpoint     keep y   <PENDING>          cuEventSynchronize
+        ignore next 1000000000 hits
+7       breakpoint     keep y   <MULTIPLE>
+\tbreakpoint already hit 1 time
+7.1                         y   0x00007ffff59a2f10 cuLinkCreate_v2
+"""
+
+
+def test_calls_of_a_step(monkeypatch):
+    """The differences of what gdb lists after two runs."""
+    answers = iter(LISTING.format(hits) for hits in (9, 11))
+
+    def ran(command, **_):
+        assert command[:2] == ['PROGRAM', 'gdb'] and command[-1] in ('6', '7')
+        return subprocess.CompletedProcess(command, 0, f'[Inferior 1 exited normally]\nNum {next(answers)}', '')
+
+    monkeypatch.setattr(waits.subprocess, 'run', ran)
+    assert [*waits.of_a_step('PROGRAM', 'c.npz').values()] == [2, 0, 0, 0]
+
+
+def test_steps_that_do_not_end(monkeypatch):
+    monkeypatch.setattr(
+        waits.subprocess, 'run', lambda c, **_: subprocess.CompletedProcess(c, 0, 'Num 1', 'no such file')
+    )
+    with pytest.raises(InputError, match='c.npz: the steps did not end normally under gdb: no such file'):
+        waits.calls('PROGRAM', 'c.npz', 6)
 
 
 def test_times_of_a_kernel():
