@@ -142,7 +142,7 @@ class _Composite(dr.CustomOp):
         dr.make_opaque(upstream, slots)
         dr.eval(_backward(_Place(lists, *self.size), lists, self.packed, self.image, upstream, slots), slots)
         end = dr.gather(mi.UInt32, lists.ends, lists.rank)
-        begin = dr.select(lists.rank > 0, dr.gather(mi.UInt32, lists.ends, lists.rank - 1, lists.rank > 0), 0)
+        begin = dr.gather(mi.UInt32, lists.ends, lists.rank - 1, lists.rank > 0)  # 0 where masked
         moments = _add_up(begin, end, slots)
         self.set_grad_in('values', _by_values(self.values, moments))
 

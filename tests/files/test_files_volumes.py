@@ -498,6 +498,7 @@ def test_one_dicom_slice_takes_its_thickness(tmp_path):
         ({'SeriesInstanceUID': '9'}, '2 DICOM series'),
         ({'PixelSpacing': [1.0, 0.6]}, 'differs'),
         ({'Rows': 2}, 'differs'),
+        ({'NumberOfFrames': 2}, 'differs'),
         ({'ImageOrientationPatient': [0, 1, 0, 1, 0, 0]}, 'differs'),
         ({'ImagePositionPatient': None}, 'lacks geometry'),
         ({'BitsAllocated': 7}, 'unreadable pixels'),

@@ -1,11 +1,14 @@
 """Work shared out among teams of any width, in any number of shares: the same images and derivatives."""
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
 
+from lingo_mi.projectors import balance
 from lingo_mi.projectors.balance import Layout, Sharing, Work
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
@@ -79,6 +82,17 @@ def test_meshes(sharing):
     chords = np.maximum(inside[1] - inside[0], 0) * np.linalg.norm(direction, axis=1)
     assert chords.max() > 1
     np.testing.assert_allclose(found, chords, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize('test', [test_images, test_voxels, test_meshes])
+@pytest.mark.parametrize('capability', [80, 90])
+def test_layouts_of_a_gpu(capability, test, monkeypatch):
+    """Where lanes stand on a GPU, whatever this runs on."""
+    monkeypatch.setattr(balance, '_on_cpu', lambda: False)
+    monkeypatch.setattr(balance, 'gpu', lambda: SimpleNamespace(capability=capability))
+    monkeypatch.setattr(balance, 'resident_warps', lambda: 8)
+    assert Sharing().adding == (balance.PAIRS if capability == 90 else balance.EIGHTS)
+    test(Sharing(), *(['cone'] if test is test_images else []))
 
 
 def test_as_many_shares_as_asked():

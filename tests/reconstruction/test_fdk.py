@@ -149,6 +149,9 @@ def test_view_weights():
     np.testing.assert_allclose(full, np.pi / 8)
     np.testing.assert_allclose(view_weights(geometry(angles=circular(8, 180))), np.pi / 8)
     np.testing.assert_allclose(view_weights(geometry('parallel', circular(8))), np.pi / 8)
+    uneven = np.array([0.0, 0.5, 1.2, 2.0, 2.6])  # a parallel beam comes back to its first view after half a turn
+    gap = np.diff(uneven, append=np.pi)
+    np.testing.assert_allclose(view_weights(geometry('parallel', uneven)), (gap + np.roll(gap, 1)) / 2)
     limited = view_weights(geometry(angles=circular(9, 90)))
     np.testing.assert_allclose(limited, np.radians(10))
     np.testing.assert_allclose(view_weights(geometry(angles=[1.0])), np.pi)
