@@ -135,6 +135,7 @@ def brute_force(frames, found, points, misses, outside):
 def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     g, valid = scan.geometry, patches(scan)
     found = masks(spoilt(scan, valid, 1e9) * g.scale, 0.1, valid)
+    assert not (found.low | found.high)[~valid].any() and found.high[valid].any() and not found.high[valid].all()
     expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.scale, 0.1)
     assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
     frames, grid = g.normalised_rays(), (12, 12, 12)

@@ -16,7 +16,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import one_line, quiet, reading
 from lingo_mi.files.voxels import MOST_DEFLATED, read_exactly, require_claim
 
-_TO_MM = {'meter': 1000.0, 'mm': 1.0, 'micron': 1e-3, 'unknown': 1.0}
+_TO_MM = {'meter': 1000.0, 'micron': 1e-3}  # mm, and where no unit is told
 _LONGEST_HEADER = 540
 
 

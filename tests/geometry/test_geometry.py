@@ -9,7 +9,7 @@ from helpers.bodies import BODIES
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.geometry.trajectories import circular, helix, rotation, scanner_rays
+from lingo_mi.geometry.trajectories import circular, helix, rotation, scanner_rays, spread
 from lingo_mi.scan import Scan
 
 PANEL = dict(nDetector=(24, 30), dDetector=(2.5, 2.0))
@@ -129,6 +129,14 @@ def test_parallel_views_half_a_turn_apart_mirror_each_other():
     here, there = (BODIES.image(f, view, (24, 30)) for view in range(2))
     assert here.max() > 0.1
     np.testing.assert_allclose(there, here[:, ::-1], atol=1e-12)
+
+
+def test_views_spread_over_a_scan():
+    assert spread(100, 4).tolist() == [0, 25, 50, 75] and spread(8, 5).tolist() == [0, 1, 3, 4, 6]
+    assert spread(7, 1).tolist() == [0] and spread(3, 3).tolist() == [0, 1, 2]
+    for n in (0, 4):
+        with pytest.raises(InputError, match=f'{n} views were asked for, but the scan has 3'):
+            spread(3, n)
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
