@@ -50,7 +50,7 @@ def _htc(path, data, name):
         raise InputError(
             f'{path}: has {len(degrees)} angles for {len(sinogram)} rows of the sinogram; these must agree'
         )
-    if len(degrees) > 1 and np.isclose(degrees[-1] - degrees[0], 360):
+    if len(degrees) and np.isclose(degrees[-1] - degrees[0], 360):
         degrees, sinogram = degrees[:-1], sinogram[:-1]
     # Their source is at DSO (sin a, -cos a, 0) and their columns run along (cos a, sin a): ours at a - 90 degrees. The row is
     # as high as a pixel is wide; the slice is one voxel of the challenge's reference reconstructions.

@@ -213,7 +213,7 @@ def _pack(values):
     target, i = dr.empty(mi.Float, 8 * count), dr.arange(mi.UInt32, count)
     columns = (*(v + dr.zeros(mi.Float, count) for v in values), dr.zeros(mi.Float, count))
     for j in range(2):
-        dr.scatter(target, mi.Vector4f(*columns[4 * j : 4 * j + 4]), 2 * i + j, mode=dr.ReduceMode.Permute)
+        dr.scatter(target, mi.Vector4f(*columns[4 * j :][:4]), 2 * i + j, mode=dr.ReduceMode.Permute)
     dr.eval(target)
     return target
 

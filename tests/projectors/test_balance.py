@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lingo_mi.projectors import balance
+from lingo_mi.projectors import balance, depth
 from lingo_mi.projectors.balance import Layout, Sharing, Work
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
@@ -18,7 +18,7 @@ from lingo_mi.projectors.voxelize import Grid, voxelize
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases.clouds import scanner
 from lingo_mi.studies.hard_cases.measuring import on_device
-from lingo_mi.studies.oracle import Pose, random_cloud, relative
+from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
 
 # 2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors. A lane whose team is done
 # must divide by nothing: an integer division by zero ends the process.
@@ -93,6 +93,20 @@ def test_layouts_of_a_gpu(capability, test, monkeypatch):
     monkeypatch.setattr(balance, 'resident_warps', lambda: 8)
     assert Sharing().adding == (balance.PAIRS if capability == 90 else balance.EIGHTS)
     test(Sharing(), *(['cone'] if test is test_images else []))
+
+
+def test_parts_of_a_sum_on_a_gpu(monkeypatch):
+    """A deep pile is added in several images at once, which are added up: the same image, and each part counts."""
+    frames, shape = scanner('cone')
+    cloud, view = random_cloud(np.random.default_rng(1), 12), View.of(frames, 0, *shape)
+    many = Cloud(*(np.repeat(x, 40, 0) for x in (cloud.centre, cloud.scale, cloud.rotation, cloud.density)))
+    expected = 40 * oracle.line_integrals(cloud, Pose.of(frames, 0, *shape))
+    monkeypatch.setattr(balance, '_on_cpu', lambda: False)
+    monkeypatch.setattr(balance, 'gpu', lambda: SimpleNamespace(capability=80))
+    monkeypatch.setattr(balance, 'resident_warps', lambda: 8)
+    monkeypatch.setattr(depth, 'deep', lambda: 10)
+    found = line_integrals(*on_device(many), view, RenderOptions(6.0)).numpy()
+    assert relative(found, expected) < 1e-6
 
 
 def test_as_many_shares_as_asked():

@@ -10,7 +10,7 @@ from helpers.matrices import matrix
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.grid import project
-from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.joseph import Joseph, Stack
 
 
 def device_images(y):
@@ -126,3 +126,8 @@ def test_kernels_serve_any_views():
 def test_source_inside_the_volume_is_refused():
     with pytest.raises(InputError, match='inside'):
         Joseph(scan(DSO=15.0, DSD=300.0))
+
+
+def test_voxels_that_32_bits_cannot_count():
+    with pytest.raises(InputError, match='4294967296 voxels are too many for one volume: lower nVoxel'):
+        Stack(scan(nVoxel=(2**16, 2**16, 1)))

@@ -105,6 +105,15 @@ def test_the_plan_is_told_and_can_be_kept():
     np.testing.assert_array_equal(again.error, found.error)
 
 
+def test_progress_goes_on_to_the_last_step_but_one():
+    """Where trials take more steps than were foreseen, it waits there."""
+    told = []
+    count = Best._counter(lambda done, total, residual: told.append((done, total)), 4)
+    for _ in range(5):
+        count(1, 1, 0.5)
+    assert told == [(1, 4), (2, 4), (3, 4), (3, 4), (3, 4)]
+
+
 def test_the_map_of_errors():
     volume = np.zeros((9, 9, 9), np.float32)
     other = volume.copy()
