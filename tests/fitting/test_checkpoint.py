@@ -154,6 +154,14 @@ def test_altered_plain_values(whole, refused, tmp_path, name):
         assert f'{name} is missing' in line(path)
 
 
+def test_the_least_state_of_a_generator(whole, tmp_path):
+    _, content = whole
+    extra = json.loads(str(content['extra']))
+    extra['rng'] |= {'state': {'state': 0, 'inc': 0}, 'has_uint32': 0, 'uinteger': 0}
+    write_as_before(tmp_path / 'old.npz', content, extra)
+    assert checkpoint.load(tmp_path / 'old.npz')
+
+
 @pytest.mark.parametrize(
     'name, key, values',
     [
