@@ -41,7 +41,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             affine, description = np.array(header.get_best_affine(), float), ''
             if 'xyzt_units' in header:
                 to_mm = _TO_MM.get(str(header.get_xyzt_units()[0]), 1.0)
-                affine = np.diag([to_mm, to_mm, to_mm, 1.0]) @ affine
+                affine[:3] *= to_mm
                 description = bytes(header['descrip'].item()).decode('utf-8', 'replace')
         except OSError as error:
             if error.errno is not None:

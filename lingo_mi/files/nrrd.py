@@ -80,9 +80,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     sizes = whole('sizes', [0, 0, 0], 3)
     if min(sizes) < 1:
         fail(f'sizes must be 3 numbers from 1 on, not {shown(fields.get("sizes", ""))}')
-    if fields.get('endian', 'little').lower() not in ('little', 'big'):
+    endian = fields.get('endian', 'little').lower()
+    if endian not in ('little', 'big'):
         fail(f'endian must be little or big, not {shown(fields["endian"])}')
-    dtype = np.dtype(_NAMES[kind]).newbyteorder('>' if fields.get('endian', '').lower() == 'big' else '<')
+    dtype = np.dtype(_NAMES[kind]).newbyteorder('>' if endian == 'big' else '<')
     packing, skip = _PACKINGS[encoding], whole('byte skip', [0], 1)[0]
     if whole('line skip', [0], 1)[0] or skip < -1 or skip and packing:
         fail('line skip, and the byte skip of compressed voxels, must be 0')

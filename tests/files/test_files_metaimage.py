@@ -46,6 +46,12 @@ def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
     np.testing.assert_allclose(affine[:, 3], [7, 8, 9, 1])
 
 
+@pytest.mark.parametrize('word', ['True', 'true', 'T', '1'])
+def test_words_for_true(tmp_path, word):
+    data, _ = metaimage.read(written(tmp_path / 'v.mha', BinaryData=word))
+    np.testing.assert_array_equal(data, VALUES)
+
+
 @pytest.mark.parametrize('direction', ['TransformMatrix', 'Rotation', 'Orientation'])
 @pytest.mark.parametrize('place', ['Offset', 'Position', 'Origin'])
 def test_as_simpleitk_reads_it(tmp_path, direction, place):

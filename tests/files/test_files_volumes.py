@@ -102,6 +102,7 @@ def test_bad_values(tmp_path):
         (np.full(SHAPE, 1j), 'real numbers', {}),
         (COUNTS, 'do not look like Hounsfield', {'mu_water': 0.02}),
         (HU, 'mu_water must be', {'mu_water': -1}),
+        (HU, 'mu_water must be', {'mu_water': 0}),
         (COUNTS, 'spacing must be', {'spacing': (1, 2)}),
         (COUNTS, 'spacing must be', {'spacing': 0}),
     ):
@@ -173,6 +174,19 @@ def test_foreign_nifti(tmp_path, unit, mm):
     np.testing.assert_allclose(v.data, 0.02 * (1 + HU / 1000.0), rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(v.spacing, np.array([0.5, 1, 2.5]) * mm, rtol=1e-6)
     np.testing.assert_allclose(v.affine[:3], affine[:3] * mm, rtol=1e-6)
+
+
+@pytest.mark.parametrize('row, column, value', [(0, 3, np.nan), (1, 1, 0.0), (2, 2, np.inf)])
+def test_a_nifti_without_a_voxel_size_or_a_place(tmp_path, row, column, value):
+    import nibabel
+
+    affine = np.diag([*SPACING, 1.0])
+    affine[row, column] = value
+    image = nibabel.Nifti1Image(COUNTS, np.eye(4))
+    image.header.set_sform(affine, code=1)
+    path = tmp_path / 'v.nii'
+    path.write_bytes(image.header.binaryblock + bytes(4) + COUNTS.tobytes('F'))
+    refused(path, 'no valid voxel size')
 
 
 def test_bad_nifti(tmp_path):

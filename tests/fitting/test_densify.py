@@ -72,6 +72,15 @@ def test_clone_keeps_the_mass():
     np.testing.assert_array_equal(after.values['density'][:40][~chosen], state.values['density'][~chosen])
 
 
+def test_a_disc_as_large_as_allowed_is_split():
+    """Its third axis is not shrunk, but leaves its bound."""
+    state = state_of(np.random.default_rng(3), 4)
+    state.values['scale'][:, 2] = 1e3
+    after = split(state, np.ones(4, bool), SETTINGS, np.random.default_rng(5), flat=True)
+    assert np.isfinite(after.values['scale']).all()
+    assert activate(after, SETTINGS)[1][:, 2] == pytest.approx(0.99 * SETTINGS.bounds.scale_max, rel=1e-5)
+
+
 def test_mass_of_a_split():
     """R2's rule gives both halves half the density, and so 1 / 1.6^3 of the mass: a quarter in all."""
     state = state_of(np.random.default_rng(1), 30)

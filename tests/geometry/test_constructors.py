@@ -8,6 +8,7 @@ import pytest
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import astra, rtk
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.matrices import from_matrices, to_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, scanner_rays
 
@@ -253,6 +254,19 @@ def test_tigre_moves_the_object():
         here = g.rays().project([point + g.offOrigin], view)
         there = scanner().project([point + moves[view, ::-1]], view)
         np.testing.assert_allclose(here, there, atol=1e-9)
+
+
+@pytest.mark.parametrize('pixel', [1e-6, 1.0, 1e6])
+def test_matrices_of_a_parallel_beam_with_pixels_of_any_size(pixel):
+    rays = Geometry.parallel(**PARALLEL | dict(dDetector=pixel)).rays()
+    shape = (6, 8)
+    again = from_matrices(to_matrices(rays), shape, (pixel, pixel), True)
+    for name in ('source', 'u', 'v'):
+        np.testing.assert_allclose(getattr(again, name), getattr(rays, name), rtol=1e-9, atol=1e-9 * pixel)
+    bad = to_matrices(rays)
+    bad[:, 1] = bad[:, 0]
+    with pytest.raises(InputError, match='columns and rows along one direction'):
+        from_matrices(bad, shape, (pixel, pixel), True)
 
 
 def test_tigre_parallel_and_sizes():

@@ -95,10 +95,20 @@ def test_draw_repeats_only_when_it_must_and_evenly():
     assert len(draw(np.arange(10), 0, rng)[0]) == 0
 
 
+def test_points_stay_within_a_flat_volume():
+    """Half as wide and a quarter as high as deep: each point in its cell."""
+    geometry, _, projections = sphere_scan(0.2, centre=(0, 0, 0), nVoxel=(24, 48, 12))
+    cloud = initialise(Scan(geometry, projections), PAPER, np.random.default_rng(1))
+    assert cloud.info['repeats'] > 200
+    side = 2 * geometry.half / np.array(cloud.info['grid'])
+    assert (np.linalg.norm(cloud.points, axis=1) < 0.2 + np.linalg.norm(side)).all()
+
+
 def test_cloud_follows_the_paper():
     geometry, frames, projections = sphere_scan()
     cloud = initialise(Scan(geometry, projections), PAPER, np.random.default_rng(1))
     info, found = cloud.info, masks(projections)
+    assert info['method'] == 'lingo'
     assert info['P'] == occupancy(frames, found, geometry.half, geometry.nVoxel)
     assert info['S'] == max(info['P'] * 20, 1)
     grid = tuple(max(round(n / info['S']), 8) for n in geometry.nVoxel)
