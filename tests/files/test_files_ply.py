@@ -94,6 +94,7 @@ def edited(tmp_path, old=b'', new=b'', cut=None):
         (b'vertex 5', b'vertex x', None, "element 'vertex'"),
         (b'vertex 5', b'face 5', None, "element 'vertex'"),
         (b'end_header', b'element face 0\nend_header', None, "element 'vertex'"),
+        (b'end_header', 2000 * b'comment\n' + b'end_header', None, 'no end'),
     ],
 )
 def test_damaged_files(tmp_path, old, new, cut, match):

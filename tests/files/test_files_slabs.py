@@ -54,7 +54,7 @@ def test_nifti(tmp_path, name):
 @pytest.mark.parametrize('thickness', [64, 7, 1])
 def test_ome_zarr(tmp_path, thickness):
     zarr = pytest.importorskip('zarr')
-    g, v = geometry((140, 30, 40)), noise((140, 30, 40))
+    g, v = geometry((140, 30, 43)), noise((140, 30, 43))
     write_slabs(tmp_path / 'v.ome.zarr', g, slabs(v, thickness))
     group = zarr.open_group(str(tmp_path / 'v.ome.zarr'), mode='r')
     np.testing.assert_array_equal(np.asarray(group['0'][:]).transpose(2, 1, 0), v)

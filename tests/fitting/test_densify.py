@@ -72,11 +72,13 @@ def test_clone_keeps_the_mass():
     np.testing.assert_array_equal(after.values['density'][:40][~chosen], state.values['density'][~chosen])
 
 
-def test_a_disc_as_large_as_allowed_is_split():
+@pytest.mark.parametrize('divide', [split, halve])
+def test_a_disc_as_large_as_allowed_is_divided(divide):
     """Its third axis is not shrunk, but leaves its bound."""
     state = state_of(np.random.default_rng(3), 4)
     state.values['scale'][:, 2] = 1e3
-    after = split(state, np.ones(4, bool), SETTINGS, np.random.default_rng(5), flat=True)
+    random = [np.random.default_rng(5)] if divide is split else []
+    after = divide(state, np.ones(4, bool), SETTINGS, *random, flat=True)
     assert np.isfinite(after.values['scale']).all()
     assert activate(after, SETTINGS)[1][:, 2] == pytest.approx(0.99 * SETTINGS.bounds.scale_max, rel=1e-5)
 

@@ -263,6 +263,8 @@ def test_matrices_of_a_parallel_beam_with_pixels_of_any_size(pixel):
     again = from_matrices(to_matrices(rays), shape, (pixel, pixel), True)
     for name in ('source', 'u', 'v'):
         np.testing.assert_allclose(getattr(again, name), getattr(rays, name), rtol=1e-9, atol=1e-9 * pixel)
+    with pytest.raises(InputError, match='^towards must be made of numbers'):
+        from_matrices(to_matrices(rays), shape, (pixel, pixel), True, towards='x')
     bad = to_matrices(rays)
     bad[:, 1] = bad[:, 0]
     with pytest.raises(InputError, match='columns and rows along one direction'):

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
+from lingo_mi.errors import InputError
+from lingo_mi.fitting.checkpoint import load
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run
 from lingo_mi.results.measure import measure, summary
@@ -28,6 +30,16 @@ def test_a_result_without_a_scan(checkpoint, tmp_path):
     assert (found['seed'], found['views'], found['settings']['lambda_tv']) == (3, 3, SHORT.loss.lambda_tv)
     np.testing.assert_allclose(nibabel.load(tmp_path / 'volume.nii.gz').get_fdata(), fitted.volume(), rtol=1e-6)
     assert (tmp_path / 'result.xml').exists() and not (tmp_path / 'views').exists() and 'n/a' in summary(found)
+
+
+@pytest.mark.parametrize('array', ['share', 'scattered'])
+def test_effects_that_a_checkpoint_does_not_keep(checkpoint, monkeypatch, array):
+    """Old ones do not say whether there were any; their arrays do."""
+    state, extra, arrays = load(checkpoint)
+    del extra['effects']
+    monkeypatch.setattr('lingo_mi.fitting.fitted.checkpoint.load', lambda path: (state, extra, arrays | {array: 1}))
+    with pytest.raises(InputError, match='has modelled effects of its scan, which a checkpoint does not keep'):
+        Fitted.from_checkpoint(checkpoint)
 
 
 def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
