@@ -177,6 +177,7 @@ def test_intensity(tmp_path):
         ({'input': 'counts'}, 'input must be'),
         ({'input': 'intensity'}, 'needs I0'),
         ({'input': 'intensity', 'I0': -1}, 'I0 must be'),
+        ({'input': 'intensity', 'I0': 0}, 'I0 must be'),
         ({'rotdetector': [0, 0, 0]}, 'rotdetector is not'),
         ({'offdetector': [0, 0]}, 'offdetector is not'),
     ],
