@@ -25,10 +25,8 @@ def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: 
     if array.dtype.kind not in 'buif':
         raise InputError(f'{where}: holds {array.dtype} values; real numbers are needed')
     if ndim not in (None, array.ndim) or array.size == 0:
-        raise InputError(
-            f'{where}: has the shape {array.shape}, but a filled array of '
-            f'{"" if ndim is None else f"{ndim} "}dimensions is needed'
-        )
+        of = '' if ndim is None else f' of {ndim} dimensions'
+        raise InputError(f'{where}: has the shape {array.shape}, but a filled array{of} is needed')
     if not finite or array.dtype.kind != 'f':
         return array
     if not np.isfinite(array).all():
