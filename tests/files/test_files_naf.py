@@ -336,6 +336,7 @@ BAD = {
     'no views': (plain(train={'projections': np.ones((0, 4, 5)), 'angles': np.ones(0)}, numTrain=0), 'no views'),
     'angles count': (plain(train={'projections': NAN * 0 + 1, 'angles': np.arange(2.0)}), 'agree|NaN'),
     'numTrain': (plain(numTrain=7), 'agree'),
+    'numVal': (plain(numVal=7), 'agree'),
     'numTrain array': (plain(numTrain=np.ones(3)), 'must be one number'),
     'mode array': (plain(mode=np.ones(3)), 'mode must be'),
     'mode list': (plain(mode=['cone']), 'mode must be'),

@@ -154,6 +154,18 @@ def test_altered_plain_values(whole, refused, tmp_path, name):
         assert f'{name} is missing' in line(path)
 
 
+def test_a_history_of_one_gaussian(whole, tmp_path):
+    _, content = whole
+    extra = json.loads(str(content['extra']))
+    for count in (1, 0):
+        extra['history'][0]['gaussians'] = count
+        write_as_before(tmp_path / 'old.npz', content, extra)
+        if count:
+            checkpoint.load(tmp_path / 'old.npz')
+        else:
+            assert 'history has no Gaussians' in line(tmp_path / 'old.npz')
+
+
 def test_the_least_state_of_a_generator(whole, tmp_path):
     _, content = whole
     extra = json.loads(str(content['extra']))

@@ -234,7 +234,7 @@ def test_checkpoint_of_another_scan_is_refused(scan, stored):
         (replace(scan, geometry=replace(g, DSO=g.DSO * 0.9)), 'the geometry'),
         (replace(scan, projections=scan.projections * np.float32(1.01)), 'the projections'),
     ):
-        with pytest.raises(InputError, match=f'other values of .*{what}'):
+        with pytest.raises(InputError, match=f'other values of .*{what};'):
             run(other, settings, None, path=stored)
     almost = replace(scan, projections=scan.projections * np.float32(1 + 1e-6))  # simulated on another machine
     run(almost, settings, None, path=stored)

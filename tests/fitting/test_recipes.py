@@ -63,3 +63,9 @@ def test_the_recipes_that_the_published_tables_were_made_with():
 
 def as_stored(settings):
     return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.flat().items()}
+
+
+def test_rates_of_naf_fall_to_a_tenth():
+    """From 1e-3, as published."""
+    for name in ('features', 'network'):
+        assert settings_of('naf').flat()[f'rate_{name}'] == (1e-3, 1e-4)

@@ -535,6 +535,14 @@ def test_grid_outside_a_cube():
     refused('must fill an axis-aligned cube', dict(thing=dict(thing, to_world=transform().scale(0.7))))
 
 
+@pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
+def test_a_grid_turned_by_less_than_can_be_told(size):
+    """Ten thousandth parts of its size are, a hundred thousandth part is not."""
+    turned = [grid(values_of(), transform().scale(size).rotate([0, 0, 1], angle)) for angle in (5e-4, 0.05)]
+    render(load(dict(thing=turned[0])))
+    refused('must fill an axis-aligned cube', dict(thing=turned[1]))
+
+
 def test_homogeneous_sphere():
     refused("'thing' has a homogeneous medium, but is no mesh", dict(thing=dict(block(), type='sphere')))
 
