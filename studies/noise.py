@@ -57,15 +57,19 @@ class Case:
 
 
 class Study:
-    """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of `pixels` a side."""
+    """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of `pixels` a side.
 
-    def __init__(self, folder: Path, size: int = 64, pixels: int = 64):
-        self.folder, self.size, self.pixels = Path(folder), size, pixels
+    iterations   steps of a fit, at most
+    """
+
+    def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = FAST.iterations):
+        self.folder, self.size, self.pixels, self.iterations = Path(folder), size, pixels, iterations
         self.dataset = functools.lru_cache(1)(self._dataset)
 
     def path(self, case: Case, setting: str) -> Path:
         scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
-        return self.folder / scan / f'{setting}.json'
+        steps = '' if self.iterations == FAST.iterations else f'_{self.iterations}_steps'
+        return self.folder / f'{scan}{steps}' / f'{setting}.json'
 
     def get(self, case: Case, setting: str) -> dict | None:
         """A stored cell, or None where there is none that can be read."""
@@ -91,7 +95,7 @@ class Study:
 
     def _compute(self, case: Case, setting: str) -> dict:
         dataset = self.dataset(case)
-        settings = FAST.changed(**SETTINGS[setting])
+        settings = FAST.changed(iterations=self.iterations, **SETTINGS[setting])
 
         def measure(model, state):
             return dict(psnr_3d=psnr_3d(model.volume(state), dataset.volume))

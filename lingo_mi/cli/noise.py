@@ -32,6 +32,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--settings', nargs='+', choices=SETTINGS, default=list(SETTINGS), help='(default: all)')
     p.add_argument('--size', type=int, default=64, help='voxels along the longest side (default: 64)')
     p.add_argument('--pixels', type=int, default=64, help='of the panel, a side (default: 64)')
+    p.add_argument('--iterations', type=int, default=1400, metavar='N', help='steps of a fit, at most (default: 1400)')
     p.add_argument('--out', type=Path, default=Path('out/noise'), help='folder of the results')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
@@ -45,6 +46,7 @@ def main() -> None:
         ('--views', [args.views], 4, 5000),
         ('--size', [args.size], 12, 512),
         ('--pixels', [args.pixels], 12, 2048),
+        ('--iterations', [args.iterations], 50, 1_000_000),
     )
     for name, values, low, high in ranges:
         if not all(low <= value <= high for value in values):
@@ -56,7 +58,7 @@ def main() -> None:
 
     names = available(args.objects, print)
     require_writable(args.out, args.out, 'choose another --out')
-    study = Study(args.out, args.size, args.pixels)
+    study = Study(args.out, args.size, args.pixels, args.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
     table = args.out / 'noise.md'
     with locked(args.out):
