@@ -27,7 +27,7 @@ from lingo_mi.fitting import loop
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.metrics import psnr_3d
-from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scan import Scan
 from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.regret import simulated
 
@@ -38,6 +38,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     'noise': dict(stop='off', weights='noise'),
     'variance': dict(stop='off', weights='variance'),
 }
+
+WEIGHTS = dict(noise='weights 1 / s', variance='weights 1 / s^2')
 
 
 @dataclass(frozen=True)
@@ -94,16 +96,16 @@ class Study:
                     write_text(path, json.dumps(found) + '\n')
 
     def _compute(self, case: Case, setting: str) -> dict:
-        dataset = self.dataset(case)
+        scan, truth = self.dataset(case)
         settings = FAST.changed(iterations=self.iterations, **SETTINGS[setting])
 
         def measure(model, state):
-            return dict(psnr_3d=psnr_3d(model.volume(state), dataset.volume))
+            return dict(psnr_3d=psnr_3d(model.volume(state), truth))
 
         began = time.process_time()
-        cloud = initial_cloud(dataset.train, settings)
+        cloud = initial_cloud(scan, settings)
         with mock.patch.object(loop, 'measure_at', lambda iterations: range(EVERY, iterations + 1, EVERY)):
-            fitted = loop.run(dataset.train, settings, cloud, 0, measure)
+            fitted = loop.run(scan, settings, cloud, 0, measure)
         return dict(
             asdict(case),
             setting=setting,
@@ -116,35 +118,32 @@ class Study:
             provenance=provenance(),
         )
 
-    def _dataset(self, case: Case) -> Dataset:
+    def _dataset(self, case: Case) -> tuple[Scan, np.ndarray]:
         geometry, views, truth = simulated(case.object, self.size, self.pixels, case.views, case.finer)
         detector = Detector.of(**(Detector.DEFAULTS | dict(photons=case.photons)))
         counted = [detector.measure(np.exp(-view.astype(float)), i) for i, view in enumerate(views)]
-        return Dataset(Scan(geometry, np.stack(counted), effects=Effects(detector=detector)), None, truth)
+        return Scan(geometry, np.stack(counted), effects=Effects(detector=detector)), truth
 
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB of the volume (after so many steps)."""
-        lines = [
-            '| object | scanned | photons | all steps | best of all steps | **stopped** | behind the best '
-            '| weights 1 / s, all steps | at best | weights 1 / s^2, all steps | at best |',
-            '|---|---:|---:|' + '---:|' * 8,
-        ]
-        for case in cases:
-            found = {setting: cell for setting in SETTINGS if (cell := self.get(case, setting))}
+        cells = {case: {name: cell for name in SETTINGS if (cell := self.get(case, name))} for case in cases}
+        weighed = [name for name in WEIGHTS if any(name in found for found in cells.values())]
+        heads = ['all steps', 'best of all steps', '**stopped**', 'behind the best']
+        heads += [head for name in weighed for head in (f'{WEIGHTS[name]}, all steps', f'{WEIGHTS[name]}, best')]
+        lines = [f'| object | scanned | photons | {" | ".join(heads)} |', '|---|---:|---:|' + '---:|' * len(heads)]
+        for case, found in cells.items():
             if 'equal' not in found:
                 continue
-            top = _best(found['equal'])
-            stopped = _last(found['stopped']) if 'stopped' in found else None
-            cells = [
-                _shown(*_last(found['equal'])),
-                _shown(*top),
-                '–' if stopped is None else _shown(*stopped),
-                '–' if stopped is None else f'{top[0] - stopped[0]:+.2f}',
-            ]
-            for name in ('noise', 'variance'):
-                cells += [_shown(*of(found[name])) if name in found else '–' for of in (_last, _best)]
-            lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(cells)} |')
+            row, top = [_shown(*_last(found['equal'])), _shown(*_best(found['equal']))], _best(found['equal'])[0]
+            row += ['–', '–'] if 'stopped' not in found else _stopped(found['stopped'], top)
+            for name in weighed:
+                row += [_shown(*of(found[name])) if name in found else '–' for of in (_last, _best)]
+            lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(row)} |')
         return '\n'.join(lines)
+
+
+def _stopped(cell: dict, top: float) -> list[str]:
+    return [_shown(*_last(cell)), f'{top - _last(cell)[0]:+.2f}']
 
 
 def _last(cell: dict) -> tuple[float, int]:

@@ -92,10 +92,9 @@ class Search:
         """The state from which the fit of all views starts."""
         self.on, values, self.start = False, self.start, {}
         zeros = {k: np.zeros_like(v) for k, v in values.items()}
-        n = len(values['centre']) if self.settings.cloud else 0
-        return State(
-            values, zeros, {k: v.copy() for k, v in zeros.items()}, *np.zeros((2, n), np.float32), np.zeros(n, bool)
-        )
+        second = {k: v.copy() for k, v in zeros.items()}
+        none = np.zeros(len(values['centre']) if self.settings.cloud else 0, np.float32)
+        return State(values, zeros, second, none, none.copy(), none.astype(bool))
 
     @property
     def shown(self) -> dict:
