@@ -16,6 +16,8 @@ LABELS = {
     'psnr_2d': 'PSNR {:.2f} dB',
     'psnr_3d': '3D {:.2f} dB',
     'gaussians': '{:,} Gaussians',
+    'held_out': 'search: held-out error {:.4g}',
+    'stops_at': 'stops at step {:,}',
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal
 PAUSE = 1.0  # seconds between two plain lines at least, but for the last

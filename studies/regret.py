@@ -153,25 +153,8 @@ class Study:
     def _dataset(self, case: Case) -> Dataset:
         if case.object == MEASURED:
             return self._measured(case)
-        thing = load_object(case.object, self.size * case.finer)
-        truth = averaged(thing, self.size)
-        pixels = 5 * self.size // 3
-        pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
-        turn = 2 * np.pi * np.arange(case.views) / case.views
-        geometry = CircularGeometry(
-            DSO=1000.0,
-            DSD=1500.0,
-            nDetector=(pixels, pixels),
-            dDetector=(pixel, pixel),
-            nVoxel=thing.data.shape,
-            dVoxel=thing.spacing,
-            angles=turn,
-        )
-        views = grid.project(thing.data, geometry)
-        unit = np.float32(LARGEST / views.max())
-        views = noisy(views * unit, case.photons) if case.photons else views * unit
-        on_voxels = geometry.with_volume(truth.data.shape, truth.spacing)
-        return Dataset(Scan(on_voxels, views), None, truth.data * unit)
+        geometry, views, truth = simulated(case.object, self.size, 5 * self.size // 3, case.views, case.finer)
+        return Dataset(Scan(geometry, noisy(views, case.photons) if case.photons else views), None, truth)
 
     def _measured(self, case: Case) -> Dataset:
         if case.finer != 1 or case.photons:
@@ -207,6 +190,31 @@ class Study:
                 f'| {chosen["error_map"]:.2f} | {" | ".join(cells)} |'
             )
         return '\n'.join(lines)
+
+
+def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tuple[Geometry, np.ndarray, np.ndarray]:
+    """A cone-beam scan over a full turn of one of `studies.tables.objects`: geometry, line integrals [view, v, u] up to LARGEST,
+    and true volume.
+
+    size     voxels along the longest side
+    pixels   along the sides of the panel, which is twice as wide as the object
+    finer    how many times as many voxels are scanned along each side
+    """
+    thing = load_object(name, size * finer)
+    truth = averaged(thing, size)
+    pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
+    geometry = CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(pixels, pixels),
+        dDetector=(pixel, pixel),
+        nVoxel=thing.data.shape,
+        dVoxel=thing.spacing,
+        angles=2 * np.pi * np.arange(views) / views,
+    )
+    line_integrals = grid.project(thing.data, geometry)
+    unit = np.float32(LARGEST / line_integrals.max())
+    return geometry.with_volume(truth.data.shape, truth.spacing), line_integrals * unit, truth.data * unit
 
 
 def noisy(views: np.ndarray, photons: float, seed: int = 0) -> np.ndarray:

@@ -91,7 +91,8 @@ def fit(
 
             def report(iteration, **fields):
                 bar.update(iteration, **fields)
-                watch.step(iteration, fields['loss'], fields['gaussians'])
+                if 'held_out' not in fields:  # the search shows nothing of the fit
+                    watch.step(iteration, fields['loss'], fields['gaussians'])
                 check()
 
             measure = quick_measure(dataset, look=watch.look if watch.watchers else None)

@@ -212,7 +212,7 @@ class Result:
     def __repr__(self) -> str:
         size = sum(v.size for v in self.fitted.state.values.values())
         what = f'{len(self):,} Gaussians' if self.settings.cloud else f'a field of {size:,} parameters'
-        return f'Result({self.recipe}: {what} after {self.settings.iterations} iterations, {self.seconds:.0f} s)'
+        return f'Result({self.recipe}: {what} after {self.fitted.steps} iterations, {self.seconds:.0f} s)'
 
     def _repr_html_(self) -> str:
         measured, geometry = self._measured, self.fitted.geometry

@@ -7,7 +7,7 @@
     lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot/result.xml --views 100
     lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot/result.xml
     lingo-mi reconstruct x3d_foot --projections large.npy --algorithm fdk --slab 64 --out large.ome.zarr
-    lingo-mi reconstruct x3d_foot --algorithm best --views 25
+    lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
 The input is what `lingo-mi fit` takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
 are rendered from it, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
@@ -17,7 +17,8 @@ cloud was fitted to, by refined or an iterative algorithm, from the cloud's own 
 has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
 its largest density for full scale, then with 1.
 best chooses its settings by measured views that it holds out, and needs no cloud. What it tried is printed, and written beside
-the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is least certain.
+the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is least certain, and is a layer of the page that
+--report writes.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 
@@ -36,6 +37,7 @@ import numpy as np
 from lingo_mi.cli.common import (
     Parser,
     check_input,
+    command_line,
     definitions,
     input_arguments,
     read_input,
@@ -45,7 +47,7 @@ from lingo_mi.cli.common import (
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import optional, write_text
+from lingo_mi.file_access import optional, require_writable, write_text
 from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
@@ -54,6 +56,8 @@ from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, 
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_signal
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
 from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
@@ -96,6 +100,12 @@ def arguments() -> argparse.Namespace:
         metavar='N',
         help='hold N slices of the volume in memory at once (fdk and voxelize; default: all)',
     )
+    p.add_argument(
+        '--report',
+        type=Path,
+        metavar='F.html',
+        help="a page with the volume's slices, the truth if known, and the map of errors",
+    )
     p.add_argument('--force', action='store_true', help='replace an earlier volume')
     p.add_argument(
         '--seed',
@@ -133,11 +143,22 @@ def beside(out: Path) -> tuple[Path, Path]:
     return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{out.name.removeprefix(name)}')
 
 
+def check_page(path: Path, force: bool) -> None:
+    """Raises InputError where the page cannot be written, or would spoil a file."""
+    if path.suffix.lower() not in ('.html', '.htm'):
+        raise InputError(f'{path}: a report is a page; give a --report that ends in .html')
+    if path.is_symlink() or path.exists() and not force:
+        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --report')
+    require_writable(path.parent, path, 'choose another --report')
+
+
 def check_arguments(args: argparse.Namespace) -> None:
     """Raises InputError where the arguments contradict each other."""
     check_input(args)
     if args.seed is not None and args.seed < 0:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if args.slab is not None and args.report is not None:
+        raise InputError('--report needs the whole volume: leave out --slab')
     if args.slab is not None and (args.slab < 1 or args.algorithm not in ('fdk', 'voxelize')):
         raise InputError('--slab is a number of slices from 1 on, for --algorithm fdk and voxelize')
     if args.algorithm == 'best' and (args.complete or args.start):
@@ -191,6 +212,8 @@ def main() -> None:
     if args.algorithm == 'best':
         for path in beside(out):
             writable_file(path, args.force)
+    if args.report is not None:
+        check_page(args.report, args.force)
     with writing_file(out):
         reconstruct_into(out, args, algorithm, effects, {k: v for k, v in defined.items() if k in own})
 
@@ -257,11 +280,33 @@ def reconstruct_into(
     if dataset.volume is not None:
         print(volume_quality(found.metrics(dataset.volume)))
     print(out)
+    if args.report is not None:
+        write_page(args.report, found, dataset.volume, args)
+        print(args.report)
     if isinstance(found, Chosen):
         print(found.report())
         plan, error = beside(out)
         write_text(plan, json.dumps(found.record(), indent=1) + '\n')
         replace(found, volume=found.error).save(error, force=True)
+
+
+def write_page(path: Path, found: Reconstruction, truth: np.ndarray | None, args: argparse.Namespace) -> None:
+    """Write the page of a reconstruction."""
+    geometry = found.geometry
+    numbers = found.metrics(truth) if truth is not None else {}
+    data = ReportData(
+        title=f'{Path(args.scene).stem}, {args.algorithm}',
+        metrics=numbers | dict(method=args.algorithm, views=len(geometry), seconds=found.seconds),
+        volume=found.volume,
+        truth=truth,
+        spacing=geometry.dVoxel,
+        centre=geometry.offOrigin,
+        scanner=geometry,
+        error_map=found.error if isinstance(found, Chosen) else None,
+        command=command_line(),
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, report_page(data))
 
 
 def write_in_slabs(out: Path, scan: Scan, slabs: Iterator[np.ndarray], args: argparse.Namespace) -> None:

@@ -7,9 +7,11 @@ import math
 import numpy as np
 
 from lingo_mi.errors import InputError
+from lingo_mi.fitting.measured import knows_noise
 from lingo_mi.fitting.models import forward_model, parameter_shapes
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.memory import room
+from lingo_mi.reconstruction.held_out import LEAST_VIEWS
 from lingo_mi.scan import Scan
 
 FIELD_BYTES = 32  # for each parameter of a neural field: its moments, its derivatives and copies of these
@@ -21,16 +23,17 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
 
     The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
     no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. Settings in units of the
-    scene's radius are converted to lengths. Those of a neural field stay as they are.
+    scene's radius are converted to lengths. `stop` is decided. Those of a neural field stay as they are.
 
-    Raises InputError if the source is inside the volume, for a step of more views than the scan has, and for more Gaussians at
-    the start, or a larger field, than this process has memory for.
+    Raises InputError if the source is inside the volume, for stop=on where views cannot be held out, for a step of more views
+    than the scan has, and for more Gaussians at the start, or a larger field, than this process has memory for.
     """
     g = scan.geometry
     if settings.batch > len(scan):
         raise InputError(
             f'batch is the number of views in a step: at most the {len(scan)} of the scan, not {settings.batch}'
         )
+    settings = settings.changed(stop='on' if _stops(settings, scan) else 'off')
     if not settings.cloud:
         needed = FIELD_BYTES * sum(n for n, _ in parameter_shapes(settings, 0).values())
         if needed > (has := room()):
@@ -60,3 +63,16 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     if largest <= bounds.scale_min:
         raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
     return settings.changed(scale_max=min(bounds.scale_max, largest))
+
+
+def _stops(settings: Settings, scan: Scan) -> bool:
+    """Whether a fit of the scan is to stop early, by views that are held out."""
+    free = max(settings.adam.rate_pose) > 0 and settings.calibration.pose_motion == 'view'
+    why = None
+    if len(scan) < LEAST_VIEWS:
+        why = f'needs at least {LEAST_VIEWS}, but the scan has {len(scan)}'
+    elif free:
+        why = 'cannot know their poses: take pose_motion=smooth'
+    if settings.stopping.stop == 'on' and why:
+        raise InputError(f'stop=on holds views out, and {why}, or leave it out')
+    return settings.stopping.stop == 'on' or settings.stopping.stop == 'auto' and not why and knows_noise(scan)

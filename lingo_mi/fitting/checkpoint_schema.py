@@ -9,6 +9,9 @@ array.order                   whole numbers [K], views that come next
 array.average.*               like values.*, where the fit averages
 array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], where the fit corrects poses
 array.response.*              float64 [rows, numbers], where the fit finds a response: air, gain
+array.search.*                where the fit searches for the step to stop at: float64 rows [any] and errors [looks], whole numbers
+                              iterations [looks] and kept [1]; start.*, like values.*, until the search has ended. Views then
+                              are those that the search sees
 array.share                   float32 [N], where the fit models two materials
 array.scattered               float64 [2, views, rows, columns], where it models scatter
 extra                         text: plain values as JSON, named in `_PLAIN`
@@ -24,11 +27,19 @@ import numpy as np
 from lingo_mi.calibration.response.part import SMOOTH
 from lingo_mi.errors import InputError, shown
 from lingo_mi.fitting.models import parameter_shapes
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.settings import HELD_OUT, Settings
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.held_out import LEAST_VIEWS, held_out_views
 from lingo_mi.scene.description import NAMES, read_scanner
 
 VERSION = 1  # of the checkpoints written now; those of earlier programs have neither a version nor a checksum
+_SEARCH = 'array.search.'
+_NEVER_NEGATIVE = (
+    'gradient',
+    'seen',
+    'array.poses.steps',
+    *(_SEARCH + name for name in ('rows', 'errors', 'iterations', 'kept')),
+)
 _OF_EFFECTS = 'array.share', 'array.scattered'  # not every effect has both
 
 
@@ -46,7 +57,12 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
     """Raises InputError, which says what is wrong, unless the arrays of a checkpoint, by name, and its plain values belong to a
     fit that can go on."""
     settings = _require_plain(extra)
-    expected = _expected(settings, extra['views'], arrays['born'].size if 'born' in arrays else 0)
+    searching = any(name.startswith(_SEARCH + 'start.') for name in arrays)
+    if searching and settings.stopping.stop == 'on' and extra['views'] >= LEAST_VIEWS:
+        views = extra['views'] - len(held_out_views(extra['views'], HELD_OUT))
+    else:
+        views = extra['views']
+    expected = _expected(settings, views, arrays['born'].size if 'born' in arrays else 0, searching)
     allowed = dict(expected)
     if not extra.get('effects', True):
         allowed = {name: v for name, v in expected.items() if name not in _OF_EFFECTS}
@@ -56,6 +72,8 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
         raise InputError(f'{shown(name)} does not belong there')
     for name, array in arrays.items():
         _require_array(name, array, *allowed[name])
+    if settings.stopping.stop == 'on':
+        _require_search(arrays, settings, extra['iteration'], searching)
     held = len(arrays['born']), len(arrays['array.initial'])
     if settings.cloud:
         _require(min(held) > 0, 'it holds no Gaussian')
@@ -63,17 +81,17 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
         _require(held == (0, 0), 'it holds Gaussians, but it is of a neural field')
     order, steps = arrays['array.order'], arrays.get('array.poses.steps')
     _require(
-        not len(order) or order.min() >= 0 and order.max() < extra['views'] and len(np.unique(order)) == len(order),
+        not len(order) or order.min() >= 0 and order.max() < views and len(np.unique(order)) == len(order),
         'array.order holds views twice, or some that the scan has not',
     )
-    made = extra['iteration'] * settings.batch
+    made = extra['iteration'] * min(settings.batch, views)
     _require(
         steps is None or steps.max() <= made == steps.sum(),
         f'array.poses.steps does not add up to the {made} that were made',
     )
 
 
-def _expected(settings: Settings, views: int, count: int) -> dict[str, tuple[str, tuple]]:
+def _expected(settings: Settings, views: int, count: int, searching: bool) -> dict[str, tuple[str, tuple]]:
     """Type, as NumPy spells it, and shape of every array by name; None is any length."""
     shapes = parameter_shapes(settings, count)
     found: dict[str, tuple[str, tuple]] = {'born': ('bool', (count,)), 'array.order': ('int', (None,))}
@@ -89,7 +107,28 @@ def _expected(settings: Settings, views: int, count: int) -> dict[str, tuple[str
     varies = dict(air=settings.calibration.fit_air, gain=settings.calibration.fit_gain)
     rows = dict(view=views, smooth=min(SMOOTH, views - 1) + 1)
     found |= {f'array.response.{k}': ('float64', (rows[x], 1)) for k, x in varies.items() if x != 'off'}
+    if settings.stopping.stop == 'on':
+        found |= {f'{_SEARCH}{k}': ('float64', (None,)) for k in ('rows', 'errors')}
+        found |= {f'{_SEARCH}iterations': ('int', (None,)), f'{_SEARCH}kept': ('int', (1,))}
+        if searching:
+            found |= {f'{_SEARCH}start.{k}': ('float32', (None, *shape[1:])) for k, shape in shapes.items()}
     return found
+
+
+def _require_search(arrays: dict[str, np.ndarray], settings: Settings, iteration: int, searching: bool):
+    """Raises InputError unless what the search has seen belongs together."""
+    looks, kept = arrays[f'{_SEARCH}iterations'].tolist(), int(arrays[f'{_SEARCH}kept'][0])
+    seen = looks == sorted(set(looks)) and len(arrays[f'{_SEARCH}errors']) == len(looks)
+    seen = seen and (kept in looks and 0 < looks[0] if looks else searching and kept == 0)
+    seen = seen and (len(arrays[f'{_SEARCH}rows']) > 0) == bool(looks)
+    if searching:
+        start = {k: arrays[f'{_SEARCH}start.{k}'] for k in parameter_shapes(settings, 0)}
+        shapes = parameter_shapes(settings, len(start['centre']) if settings.cloud else 0)
+        seen = seen and all(start[k].shape == shape for k, shape in shapes.items())
+        seen = seen and (not looks or looks[-1] <= iteration)
+    _require(seen, 'the arrays array.search do not belong together')
+    _require(searching or iteration <= kept, "iteration is beyond the search's")
+    _require(not looks or looks[-1] <= settings.iterations, "the search is beyond the settings' iterations")
 
 
 def _require_array(name: str, array: np.ndarray, kind: str, shape: tuple):
@@ -98,7 +137,7 @@ def _require_array(name: str, array: np.ndarray, kind: str, shape: tuple):
         wanted = ', '.join('n' if n is None else str(n) for n in shape)
         raise InputError(f'{name} must be {kind} [{wanted}], not {shown(array.dtype)} {list(array.shape)}')
     _require(array.dtype.kind != 'f' or np.isfinite(array).all(), f'{name} holds NaN or infinity')
-    never_negative = name in ('gradient', 'seen', 'array.poses.steps') or '.second' in f'.{name}'
+    never_negative = name in _NEVER_NEGATIVE or '.second' in f'.{name}'
     _require(not never_negative or not array.size or array.min() >= 0, f'{name} holds negative numbers')
 
 

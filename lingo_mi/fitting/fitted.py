@@ -10,7 +10,7 @@ import numpy as np
 
 from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import average, checkpoint
+from lingo_mi.fitting import average, checkpoint, stopping
 from lingo_mi.fitting.checkpoint_schema import geometry_of, settings_of
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.kinds import Model, model_of
@@ -34,6 +34,7 @@ class Fitted:
     history     measurements over time: iteration, seconds, loss, gaussians, and the results of the fit's `measure`
     seconds     spent in steps, including those before an interruption
     info        data on the initial cloud (`InitialCloud.info`)
+    search      what views that were held out said (`stopping.Search.record`); None without a search for the step to stop at
 
     Example:
 
@@ -51,11 +52,17 @@ class Fitted:
     history: list[dict] = field(default_factory=list)
     seconds: float = 0.0
     info: dict = field(default_factory=dict)
+    search: dict | None = None
 
     @property
     def settings(self) -> Settings:
         """Settings as used, with the bounds that the scan sets."""
         return self.model.settings
+
+    @property
+    def steps(self) -> int:
+        """Steps of the fit: fewer than the settings' iterations where it has stopped early."""
+        return self.search['kept'] if self.search else self.settings.iterations
 
     @property
     def geometry(self) -> Geometry:
@@ -125,6 +132,10 @@ class Fitted:
         if 'unit' not in extra:
             raise InputError(f'{path}: is no checkpoint of a fit by this version of lingo_mi; fit again')
         settings, geometry = settings_of(extra), geometry_of(extra)
+        try:
+            search = stopping.stored(arrays)
+        except InputError as error:
+            raise InputError(f'{path}: {error}') from None
         if effects is None and extra.get('effects', bool(arrays.keys() & {'share', 'scattered'})):
             raise InputError(
                 f'{path}: the fit has modelled effects of its scan, which a checkpoint does not keep: give them too, '
@@ -140,4 +151,4 @@ class Fitted:
             model.response.restore(arrays)
         history = [current_names(entry) for entry in extra['history']]
         seed, seconds, info = (extra[name] for name in ('seed', 'seconds', 'info'))
-        return cls(model, state, arrays['initial'], poses, seed, history, seconds, info)
+        return cls(model, state, arrays['initial'], poses, seed, history, seconds, info, search)

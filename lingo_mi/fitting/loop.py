@@ -18,6 +18,7 @@ from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model, stepper_of
 from lingo_mi.fitting.resume import require_same_fit
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.stopping import Search
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.metrics import current_names
 from lingo_mi.scan import Scan
@@ -39,9 +40,11 @@ def run(
     initial    the initial cloud; None: continue from `path`, with the same steps as without the interruption. The fit may
                then have more iterations than the checkpoint's, if it is `resume.extensible`
     seed       for the views' order, the total variation's cubes and splits; of a neural field, parameters, rays and samples
-    measure    called as measure(model, state) at a few iterations; returns numbers for the history
+    measure    called as measure(model, state) at a few iterations; returns numbers for the history. Not while the fit searches
+               for the step to stop at (setting `stop`)
     progress   called as progress(iterations done, loss=, gaussians=, **last measurement) between steps; gaussians is None for
-               a neural field. The state is then consistent: if it raises KeyboardInterrupt, a checkpoint is written
+               a neural field; during a search held_out= is its error so far. The state is then consistent: if it raises
+               KeyboardInterrupt, a checkpoint is written
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is created
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
@@ -52,7 +55,7 @@ def run(
     if begin is None:
         raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
     settings = bounded(settings, scan)
-    stepper = stepper_of(scan, settings)
+    search = Search(scan, settings) if settings.stopping.stop == 'on' else None
     rng = np.random.default_rng(seed)
     average = Average(settings.adam.average)
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
@@ -64,13 +67,21 @@ def run(
         iteration, seconds, info = (extra[k] for k in ('iteration', 'seconds', 'info'))
         history = [current_names(entry) for entry in extra['history']]
         state = DeviceState(host)
+        if search is not None:
+            search.restore(arrays)
+        stepper = search.stepper() if search and search.on else stepper_of(scan, settings)
         stepper.restore(arrays)
         average.restore(arrays)
     else:
         points, order = begin.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0.0, [], dict(begin.info)
-        state = DeviceState(stepper.start(begin, rng))
-    marks = set(measure_at(settings.iterations))
+        stepper = stepper_of(scan, settings)
+        host = stepper.start(begin, rng)
+        if search is not None:
+            stepper, host = search.begin(host, seed)
+        state = DeviceState(host)
+    last = search.kept if search and not search.on else settings.iterations
+    marks = {*measure_at(settings.iterations), last}
     clock = saved = time.perf_counter()
 
     def store():
@@ -91,21 +102,33 @@ def run(
                     effects=stepper.model.effects is not None,
                     **scanned,
                 ),
-                dict(initial=points, order=np.array(order, int)) | stepper.arrays() | average.arrays(),
+                dict(initial=points, order=np.array(order, int))
+                | stepper.arrays()
+                | average.arrays()
+                | (search.arrays() if search else {}),
             )
 
-    while iteration < settings.iterations:
+    while iteration < last or search and search.on:
+        if search and search.on and search.over:  # begin anew, with all views
+            stepper, state = stepper_of(scan, settings), DeviceState(search.end())
+            rng, order, iteration, last = np.random.default_rng(seed), [], 0, search.kept
+            marks.add(last)
+            average.restart()
         # Before a step, so never after the last one. A longer fit that continues from there does it first.
         if renewed := stepper.renewed(state, iteration, rng):
             state = renewed
             average.restart()
-        while len(order) < settings.batch:  # every view once before any view twice
-            order += rng.permutation(len(scan)).tolist()
-        views, rest = order[: settings.batch], order[settings.batch :]
+        batch = stepper.settings.batch
+        while len(order) < batch:  # every view once before any view twice
+            order += rng.permutation(len(stepper.geometry)).tolist()
+        views, rest = order[:batch], order[batch:]
         loss = stepper.step(state, views, iteration, rng)
         order, iteration = rest, iteration + 1
         average.add(state)
-        if iteration in marks:
+        if search and search.on:
+            if search.due(iteration):
+                search.look(iteration, stepper, average.of(state))
+        elif iteration in marks:
             dr.sync_thread()
             value = float(loss[0])
             if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not finite would silently vanish
@@ -118,9 +141,10 @@ def run(
             clock = time.perf_counter()  # excludes the time of `measure`
         if progress is not None:
             measured = history[-1].items() if history else ()
-            last = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
+            shown = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
+            shown |= search.shown if search else {}
             try:
-                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state) or None, **last)
+                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state) or None, **shown)
             except KeyboardInterrupt:
                 store()
                 raise
@@ -131,7 +155,8 @@ def run(
     dr.sync_thread()
     store()
     seconds += time.perf_counter() - clock
-    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info)
+    found = search.record() if search else None
+    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info, found)
 
 
 def measure_at(iterations: int) -> list[int]:

@@ -14,7 +14,8 @@ from lingo_mi.fitting.settings import Settings
 
 def extensible(settings: Settings) -> bool:
     """Whether a longer fit repeats the steps of a shorter one, so that it can continue from its checkpoint."""
-    return settings.decay_steps > 0 and settings.coarse_share == 0 and settings.adam.average == 0
+    plain = settings.coarse_share == 0 and settings.adam.average == 0 and settings.stopping.stop == 'off'
+    return plain and settings.decay_steps > 0
 
 
 def require_same_fit(extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:

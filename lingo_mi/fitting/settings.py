@@ -18,6 +18,7 @@ from lingo_mi.projectors import cutoff
 
 INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid'), 'field': ('network',)}  # by the setting `render`
 # Ranges end where float32 or the time of a fit does, far beyond what is of use.
+HELD_OUT = 5  # one view in so many, of the search for the step to stop at
 MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
 
 
@@ -95,7 +96,7 @@ class LossSettings:
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
     weights            'equal'; or 'noise' (own): rendered and measured pixels are divided by the standard deviation of their
-                       noise (from the scan's `ct_detector`) before comparison
+                       noise (from the scan's `ct_detector`) before comparison; or 'variance' (own): by its square
     loss_scale         'none'; 'dynamic': the paper's factor T_g + 1 / (4 T_g) on the whole loss; 'statistic': the same
                        factor on the densification statistic only (Adam cancels a constant factor of the loss)
     """
@@ -116,7 +117,10 @@ class LossSettings:
             self.lambda_l1 + self.lambda_ssim + self.lambda_gradient > 0,
             'one of lambda_l1, lambda_ssim and lambda_gradient must be above 0: nothing else compares with the projections',
         )
-        _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
+        _require(
+            self.weights in ('equal', 'noise', 'variance'),
+            f"weights is 'equal', 'noise' or 'variance', not {self.weights!r}",
+        )
         _require(
             self.loss_scale in ('none', 'dynamic', 'statistic'),
             f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}",
@@ -203,6 +207,29 @@ class CalibrationSettings:
 
 
 @dataclass(frozen=True)
+class StoppingSettings:
+    """When a fit stops (own; see `lingo_mi.fitting.stopping`).
+
+    stop               'off': after `iterations`; 'on': at the step from which a first fit, the search, predicts views that it
+                       does not see no better; 'auto': 'on' where the scan says how many photons a pixel counts, else 'off'
+    stop_every         iterations between two looks at these views
+    stop_patience      iterations without a better prediction, after which the search ends, at least `stop_every`
+    """
+
+    stop: str = 'off'
+    stop_every: int = 50
+    stop_patience: int = 150
+
+    def __post_init__(self):
+        _require(self.stop in ('off', 'on', 'auto'), f"stop is 'off', 'on' or 'auto', not {shown(self.stop)}")
+        require_ranges(self, stop_every=(1, MOST_STEPS), stop_patience=(1, MOST_STEPS))
+        _require(
+            self.stop_patience >= self.stop_every,
+            f'stop_patience must be at least stop_every, {self.stop_every}, not {self.stop_patience}',
+        )
+
+
+@dataclass(frozen=True)
 class DensificationSettings:
     """Adaptive density control (see `lingo_mi.fitting.densify`). Lengths are in the normalised frame; for `alpha`, `split_size`
     and `prune_size` are in units of the scene's radius.
@@ -274,7 +301,7 @@ class Settings:
     batch              views per step
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
-    start, model, neural, loss, adam, calibration, densification, bounds
+    start, model, neural, loss, adam, calibration, stopping, densification, bounds
                        the parts, each with its own documentation
 
     Raises InputError for a value out of its range, and for contradictory values.
@@ -291,6 +318,7 @@ class Settings:
     loss: LossSettings = field(default_factory=LossSettings)
     adam: AdamSettings = field(default_factory=AdamSettings)
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    stopping: StoppingSettings = field(default_factory=StoppingSettings)
     densification: DensificationSettings = field(default_factory=DensificationSettings)
     bounds: ScaleBounds = field(default_factory=ScaleBounds)
 

@@ -52,12 +52,14 @@ def on_grid(
         and np.allclose(own, step, rtol=1e-4)
     ):
         return values
-    ratio = np.asarray(step) / own
-    if (ratio > 1).any():
-        values = uniform_filter(values, np.maximum(1, np.round(ratio)).astype(int).tolist(), mode='nearest')
     # Voxel centres in the object's own voxels; those outside its box are empty.
     at = [((corner[k] + (np.arange(shape[k]) + 0.5) * step[k]) - low[k]) / own[k] - 0.5 for k in range(3)]
     inside = [(a >= -0.5) & (a <= n - 0.5) for a, n in zip(at, values.shape)]
+    over = np.maximum(1, np.round(np.asarray(step) / own)).astype(int)
+    if (over > 1).any():
+        even = 1 - over % 2  # the mean over voxels i - n / 2 to i + n / 2 - 1, whose middle is i - 1 / 2, stands at i
+        values = uniform_filter(np.pad(values, [(0, e) for e in even], mode='edge'), over.tolist(), mode='nearest')
+        at = [a + e / 2 for a, e in zip(at, even)]
     found = map_coordinates(values, np.meshgrid(*at, indexing='ij'), order=1, mode='nearest')
     return found * (inside[0][:, None, None] & inside[1][:, None] & inside[2])
 

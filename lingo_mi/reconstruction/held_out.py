@@ -39,9 +39,14 @@ def split(scan: Scan, every: int) -> tuple[Scan, Scan]:
             f'best holds views out to choose by, and needs at least {LEAST_VIEWS}, but the scan has {len(scan)}: '
             'take another algorithm'
         )
-    every = min(every, len(scan) - 1)
-    held = np.arange(every // 2, len(scan) - 1, every)
+    held = held_out_views(len(scan), every)
     return scan.subset(np.setdiff1d(np.arange(len(scan)), held)), scan.subset(held)
+
+
+def held_out_views(count: int, every: int) -> np.ndarray:
+    """Which of `count` views, at least four, are held out."""
+    every = min(every, count - 1)
+    return np.arange(every // 2, count - 1, every)
 
 
 @dataclass
@@ -74,6 +79,13 @@ class Trial:
         return dict(setting=self.name, finer=self.finer, niter=self.niter, score=self.score, scores=self.scores)
 
 
+def power(rows: np.ndarray) -> np.ndarray:
+    """|spectrum|^2 |w| of rows of a detector [..., u], float64 [..., frequency]."""
+    spectrum = np.fft.rfft(rows, 2 * rows.shape[-1])  # padded, since a row ends and does not repeat
+    frequency = np.maximum(np.arange(spectrum.shape[-1]), 0.25)  # the mean of |w| in the bin about 0
+    return np.abs(spectrum) ** 2 * frequency
+
+
 class Score:
     """|A x - b| / |b| of held-out views, both weighted by the square root of the frequency along the rows.
 
@@ -95,10 +107,7 @@ class Score:
         return self._norm(evaluated(self.b - self.A.forward(x, self.views)[0])) / self.all
 
     def _norm(self, images: mi.Float) -> float:
-        size = 2 * self.shape[1]  # padded, since a row ends and does not repeat
-        spectrum = np.fft.rfft(images.numpy().reshape(self.shape), size, axis=1)
-        frequency = np.maximum(np.arange(spectrum.shape[1]), 0.25)  # the mean of |w| in the bin about 0
-        return float(np.sqrt((np.abs(spectrum) ** 2 * frequency[:, None]).mean()))
+        return float(np.sqrt(power(images.numpy().reshape(self.shape).swapaxes(1, 2)).mean()))
 
 
 class Watch:

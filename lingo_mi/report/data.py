@@ -22,6 +22,7 @@ class ReportData:
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
+    error_map       how far off the volume may be, 1/mm (`reconstruction.best.error_map`), not negative, as `volume`; or None
     centre          of the volume, (x, y, z), mm
     views           [n, v, u] rendered held-out views: line integrals ln(I0/I)
     views_truth     [n, v, u] the same views as measured, or None
@@ -55,6 +56,7 @@ class ReportData:
     cloud_quaternions: np.ndarray | None = None
     scanner: Geometry | None = None
     command: str = ''
+    error_map: np.ndarray | None = None
     history: list[dict] = field(init=False)
 
     def __post_init__(self):
@@ -80,6 +82,7 @@ class ReportData:
         if self.volume is not None:
             object.__setattr__(self, 'shape', self.volume.shape)
             fix('truth', self.volume.shape)
+            fix('error_map', self.volume.shape)
         for name, n in (('spacing', 3), ('centre', 3), ('pixel', 2)):
             fix(name, (n,))
         fix('views', (None,) * 3)

@@ -65,12 +65,17 @@ QUALITY = {
     'gaussians': Number('Gaussians', '', ',d', 'The size of the cloud at the end.'),
     'seconds_init': Number('Time to initialise', 's', '.2f', 'From projections to the initial cloud.'),
     'seconds_fit': Number('Time to fit', 's', '.1f', 'All steps, without the measurements in between.'),
-    'ms_per_iteration': Number('Time per iteration', 'ms', '.2f', 'The time to fit, divided by the iterations.'),
+    'ms_per_iteration': Number(
+        'Time per iteration', 'ms', '.2f', 'The time to fit, divided by the iterations, those of a search included.'
+    ),
 }  # fmt: skip
 SETTINGS = {
     'method': Number('Method', '', '', 'The recipe of settings that the fit began from.'),
     'views': Number('Views used', '', '', 'Projections that the fit has seen.'),
     'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
+    'stopping': Number(
+        'Early stop', '', '', 'Views that were held out told after which step more of them no longer helped.'
+    ),
     'seed': Number('Seed', '', '', 'Of every random choice; the same seed gives the same result.'),
     'variant': Number('Mitsuba variant', '', '', 'CPU or GPU.'),
     'versions': Number('Versions', '', '', 'The software that computed this result.'),
@@ -84,7 +89,16 @@ HEADLINE = {
     'iterations': '{} iterations',
     'seconds_fit': 'fit {}',
 }
-LISTED = {'history', 'files', 'settings', 'initial', 'angles', 'test_angles', 'command'}  # shown in other ways
+LISTED = {
+    'history',
+    'search',
+    'files',
+    'settings',
+    'initial',
+    'angles',
+    'test_angles',
+    'command',
+}  # shown in other ways
 
 
 def headline(metrics: dict) -> str:

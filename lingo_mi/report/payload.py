@@ -15,6 +15,7 @@ from lingo_mi.report.planes import grey_range, planes, richest
 MOST_PIXELS = 60 * 256**2  # of all held-out views in a page, each of rendered and measured
 VOLUME_BYTES, VIEW_BYTES = 19e6, 6e6  # as text; with libraries, cloud and surfaces a page stays below 30 MB
 SURFACE_VOXELS, MOST_VERTICES = 112, 60_000
+MAP_BITS = 8  # of a map of errors, which ranks voxels: no more than its colours
 
 Arrays = dict[str, Packed]
 
@@ -33,6 +34,8 @@ def payload(data: ReportData, surfaces: bool = True) -> tuple[dict, Arrays]:
         known['slices'] = slices(
             volumes, data.spacing, data.centre, arrays, 'Truth' if data.truth is not None else None
         )
+        if data.error_map is not None:
+            known['slices'] |= error_maps({'Error map': data.error_map}, known['slices'], arrays)
     if data.views is not None:
         images = {'Rendered': data.views}
         if data.views_truth is not None:
@@ -87,6 +90,19 @@ def slices(
         volumes=[dict(name=name, array=f'volume{i}') for i, name in enumerate(small)],
         reference=list(small).index(reference) if reference else None,
     )
+
+
+def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict:
+    """Maps of errors [x, y, z], not negative, on the grid of the volumes, by name; each with its own scale.
+
+    known   of these volumes, as `slices` gives it
+    """
+    for i, values in enumerate(maps.values()):
+        small = preview(np.asarray(values, np.float32), MOST_VOXELS)[0]
+        while small.size > np.prod(known['shape']):  # previews have been made smaller
+            small = preview(values, small.size // 8)[0]
+        arrays[f'map{i}'] = pack(small, 0.0, float(small.max()), MAP_BITS)
+    return dict(maps=[dict(name=name, array=f'map{i}') for i, name in enumerate(maps)])
 
 
 def views(

@@ -11,7 +11,7 @@ from lingo_mi.errors import InputError, brief
 from lingo_mi.files.volumes import Volume
 from lingo_mi.report import template
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text
-from lingo_mi.report.payload import Arrays, colour_maps, slices, views
+from lingo_mi.report.payload import Arrays, colour_maps, error_maps, slices, views
 from lingo_mi.results.stored import Stored
 
 LOWER_IS_BETTER = 'ipsd', 'ipsd_reverse', 'seconds_init', 'seconds_fit', 'ms_per_iteration'
@@ -47,6 +47,13 @@ def compare_page(results: list[Stored], truth: Volume | None = None, title: str 
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]
         data = {name: volume.data for name, volume in volumes.items()}
         known['slices'] = slices(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)
+        maps = {
+            f'Error map: {name}': r.error_map.data
+            for name, r in zip(names, results)
+            if r.error_map is not None and r.error_map.data.shape == first.data.shape
+        }
+        if maps:
+            known['slices'] |= error_maps(maps, known['slices'], arrays)
     shown = {name: r for name, r in zip(names, results) if r.views is not None}
     if len(shown) > 1 and _same_views(list(shown.values())):
         one = next(iter(shown.values()))

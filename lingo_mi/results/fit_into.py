@@ -48,7 +48,8 @@ def fit_into(
 
         def report(iteration, **fields):
             progress(iteration, **fields)
-            watch.step(iteration, fields['loss'], fields['gaussians'])
+            if 'held_out' not in fields:  # the search shows nothing of the fit
+                watch.step(iteration, fields['loss'], fields['gaussians'])
             check()
 
         look = quick_measure(dataset, look=watch.look if watchers else None)

@@ -84,11 +84,12 @@ def measure(fitted: Fitted, test: Scan | None = None, truth: np.ndarray | None =
         ssim_3d_r2=of(metrics.ssim_3d_r2, volume, truth),
         **_of_gaussians(fitted),
         parameters=sum(v.size for v in fitted.state.values.values()),
-        iterations=fitted.settings.iterations,
+        iterations=fitted.steps,
         seconds_init=fitted.info.get('seconds', 0.0),
         seconds_fit=fitted.seconds,
-        ms_per_iteration=1e3 * fitted.seconds / fitted.settings.iterations,
+        ms_per_iteration=1e3 * fitted.seconds / _steps_made(fitted),
         history=fitted.history,
+        **({} if fitted.search is None else dict(stopping=fitted.search['said'], search=fitted.search)),
     )
     return Measured(numbers, volume, truth, test, views)
 
@@ -106,6 +107,11 @@ def _of_gaussians(fitted: Fitted) -> dict:
     )
 
 
+def _steps_made(fitted: Fitted) -> int:
+    """Steps of the fit and of the search before it."""
+    return fitted.steps + (fitted.search['iterations'][-1] if fitted.search else 0)
+
+
 def summary(result: dict) -> str:
     """The main numbers of a result, one line each."""
     return '\n'.join(
@@ -115,6 +121,7 @@ def summary(result: dict) -> str:
             f'{fitted_to(result)} after {result["iterations"]} iterations of '
             f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
             f'{result["seconds_fit"]:.0f} s to fit',
+            *([f'                {result["stopping"]}'] if 'stopping' in result else []),
         ]
     )
 

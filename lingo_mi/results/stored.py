@@ -26,6 +26,7 @@ class Stored:
     volume    its density; None for a recipe without
     views     float32 [view, v, u], rendered held-out views; None if there are none
     angles    [view] degrees
+    error_map  the file V-error.nii.gz beside a volume V.nii.gz, as `reconstruct --algorithm best` writes it; None: there is none
     """
 
     name: str
@@ -33,6 +34,7 @@ class Stored:
     volume: Volume | None = None
     views: np.ndarray | None = None
     angles: list[float] = field(default_factory=list)
+    error_map: Volume | None = None
 
 
 def read_stored(path: PathLike | str) -> Stored:
@@ -44,7 +46,10 @@ def read_stored(path: PathLike | str) -> Stored:
     """
     path = as_path('path', path)
     if path.is_file():
-        return Stored(path.name.removesuffix('.gz').rsplit('.', 1)[0], volume=read_volume(path))
+        name = path.name.removesuffix('.gz').rsplit('.', 1)[0]
+        beside = path.with_name(f'{name}-error{path.name.removeprefix(name)}')
+        error_map = read_volume(beside) if beside.is_file() else None
+        return Stored(name, volume=read_volume(path), error_map=error_map)
     numbers = path / METRICS
     with reading(path, folder=True):
         if not numbers.exists():

@@ -90,7 +90,8 @@ def test_the_volume_is_the_algorithms(scene, dataset, tmp_path):
 def test_best(scene, dataset, tmp_path):
     out, plan, error = (tmp_path / name for name in ('v.nii.gz', 'v-plan.json', 'v-error.nii.gz'))
     command = (scene, '--algorithm', 'best', '--out', out, '-D', 'niter=2', '-D', 'finer=1')
-    code, text, err = run(RECONSTRUCT, *command)
+    code, text, err = run(RECONSTRUCT, *command, '--report', tmp_path / 'v.html')
+    assert '"name":"Error map"' in (page := (tmp_path / 'v.html').read_text()) and 'v.nii.gz' in page
     assert code == 0 and 'best of 8 views' in text and '(100%)' in err, err
     found = Best(niter=2, finer=1).run(dataset.train)
     np.testing.assert_array_equal(load(out), found.volume)

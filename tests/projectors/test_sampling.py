@@ -13,15 +13,27 @@ def grid(values, own=(1.0, 1.0, 1.0)):
     return GridInCube.of(values, LOW, LOW + np.array(values.shape) * own, 'thing')
 
 
+@pytest.mark.parametrize('over', [2, 3, 4])
 @pytest.mark.parametrize('axis', [0, 1, 2])
-def test_means_over_larger_voxels(axis):
-    """Three times as large along one axis, and no other axis is smoothed."""
-    values = np.random.default_rng(0).random((9, 9, 9))
-    step, shape = np.ones(3), [9, 9, 9]
-    step[axis], shape[axis] = 3, 3
+def test_means_over_larger_voxels(axis, over):
+    """Several times as large along one axis, and no other axis is smoothed."""
+    values = np.random.default_rng(0).random((12, 12, 12))
+    step, shape = np.ones(3), [12, 12, 12]
+    step[axis], shape[axis] = over, 12 // over
     found = on_grid(grid(values), LOW, step, tuple(shape))
-    expected = np.moveaxis(np.moveaxis(values, axis, 0).reshape(3, 3, 9, 9).mean(1), 0, axis)
+    expected = np.moveaxis(np.moveaxis(values, axis, 0).reshape(-1, over, 12, 12).mean(1), 0, axis)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize('over', [2, 3, 4])
+def test_means_lie_in_the_middle_of_their_voxels(over):
+    """Of a symmetric object, on a grid that is symmetric about it but ends between its voxels, also at its faces."""
+    half = np.random.default_rng(1).random((5, 1, 1))
+    values = np.concatenate([half, half[::-1]])
+    corner, step = LOW + np.array([(10 - 5 * over) / 2, 0, 0]), np.array([over, 1.0, 1.0])
+    found = on_grid(grid(values), corner, step, (5, 1, 1)).ravel()
+    np.testing.assert_allclose(found, found[::-1], rtol=1e-6)
+    assert found[2] > 0
 
 
 @pytest.mark.parametrize('axis', [0, 1, 2])

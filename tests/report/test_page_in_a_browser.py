@@ -188,6 +188,24 @@ def test_layers_curtain_and_side_by_side(page):
     assert picture() in seen
 
 
+def test_the_map_of_errors_is_a_layer_of_its_own_scale(chromium, tmp_path):
+    wrong = np.random.default_rng(3).random(SHAPE) * 1e-3
+    with opened(chromium, write_report(tmp_path, content(error_map=wrong)).as_uri()) as page:
+        press(page, '5')
+        assert page.locator('#slices button[aria-pressed=true]').first.text_content() == '5 Error map'
+        found, index = readout(page), at(page)
+        assert abs(float(found['Error map']) - wrong[index]) < 1e-3 / 255
+        assert float(page.locator('#slices .scales b').all_text_contents()[-1]) == pytest.approx(wrong.max(), rel=0.01)
+        colours = page.evaluate(
+            """() => { const c = document.querySelector('[data-axis="2"]');
+              const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+              return new Set(Array.from({ length: d.length / 4 }, (_, i) => d.slice(4 * i, 4 * i + 3).join())).size; }"""
+        )
+        assert colours > 100  # its own scale: on that of the density it would be all but black
+        press(page, '1', 'c', 's')
+        assert page.locator('#slices canvas.picture').count() == 15
+
+
 def test_window_level_and_zoom(page):
     def picture():
         settled(page)
@@ -295,12 +313,13 @@ def test_contrast(chromium, address, dark):
     [
         dict(truth=None, views_truth=None),
         dict(views=None, views_truth=None, cloud_centres=None, metrics={}),
+        dict(truth=None, views=None, views_truth=None, cloud_centres=None, metrics={}, error_map=np.zeros(SHAPE)),
         dict(volume=None, truth=None, shape=SHAPE),
         dict(volume=np.zeros((9, 9, 9)), truth=np.zeros((9, 9, 9))),
         dict(volume=np.ones((24, 20, 1)), truth=None, views=np.ones((3, 1, 18)), views_truth=np.ones((3, 1, 18)),
              views_angles=np.arange(3.0)),
     ],
-    ids=['measured', 'volume-only', 'no-volume', 'blank', 'fan-beam'],
+    ids=['measured', 'volume-only', 'blank-map', 'no-volume', 'blank', 'fan-beam'],
 )  # fmt: skip
 def test_what_is_missing_is_left_out(chromium, tmp_path, changes):
     data = content(**changes)

@@ -80,6 +80,17 @@ def test_a_volume_of_reconstruct_beside_a_fit(pair, tmp_path):
     assert cells(page, 'Time to fit') == ['10.0 s', 'n/a']
 
 
+def test_the_map_of_errors_beside_a_volume(pair, tmp_path):
+    for name in ('x.nii.gz', 'x-error.nii.gz'):
+        write_volume(tmp_path / name, np.ones(SHAPE, np.float32), 2.0, None, 'density per mm')
+    page = compare_page([read_stored(pair[0]), read_stored(tmp_path / 'x.nii.gz')])
+    assert '"name":"Error map: x"' in page and page.count('id="array-map') == 1
+    write_volume(tmp_path / 'x-error.nii.gz', np.ones((9, 9, 9), np.float32), 2.0, None, 'density per mm')
+    assert 'id="array-map' not in compare_page(
+        [read_stored(pair[0]), read_stored(tmp_path / 'x.nii.gz')]
+    )  # another grid
+
+
 def test_views_of_other_angles_are_left_out(tmp_path):
     pair = result(tmp_path / 'a', 0), result(tmp_path / 'b', 1, test_angles=[0.0, 20.0, 11.0])
     assert 'id="array-views0"' not in compare_page([read_stored(p) for p in pair])

@@ -17,6 +17,7 @@ from lingo_mi.fitting.field.field_model import FieldModel
 from lingo_mi.fitting.field.rays import pixels_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.projectors.grid import view_table
 from lingo_mi.projectors.upload import uploaded
@@ -33,6 +34,11 @@ class FieldStepper:
     """
 
     poses = None
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of the scan."""
+        return self.scan.geometry
 
     def __init__(self, scan: Scan, settings: Settings):
         """Raises InputError for an empty scan."""

@@ -8,6 +8,7 @@ class Slices {
   constructor(root, known, arrays, maps) {
     Object.assign(this, { root, known, maps });
     this.volumes = known.volumes.map((v) => ({ name: v.name, array: arrays[v.array] }));
+    this.errorMaps = (known.maps || []).map((m) => ({ name: m.name, array: arrays[m.array] }));
     this.layers = this.listLayers();
     this.at = [...known.start];
     this.window = [...known.window];
@@ -48,6 +49,7 @@ class Slices {
         out.push({ name: (kind === 'difference' ? 'Difference' : 'Error') + plain, kind, of, to });
       }
     }
+    this.errorMaps.forEach((m, of) => out.push({ name: m.name, kind: 'map', of }));
     return out;
   }
 
@@ -91,7 +93,8 @@ class Slices {
     const step0 = this.volumes[0].array.step;
     const preview = known.preview > 1 ? ` A preview: each voxel here is the mean of ${known.preview}³ of the volume's.` : '';
     const compared = this.layers.some((l) => l.kind === 'difference') ? ' Difference: red is too dense, blue too thin.' : '';
-    this.note = text('p', `Axes are the scanner's, in mm; z is the axis of rotation. Values are stored in steps of ${step0.toExponential(1)} per mm.${compared}${preview}`, { class: 'note' });
+    const mapped = this.errorMaps.length ? ' Error map: bright where the volume is least certain; it ranks voxels, and is not the size of their errors.' : '';
+    this.note = text('p', `Axes are the scanner's, in mm; z is the axis of rotation. Values are stored in steps of ${step0.toExponential(1)} per mm.${compared}${mapped}${preview}`, { class: 'note' });
     this.root.replaceChildren(bar, this.grid, places, this.scales, scroll, this.note);
     this.arrange(0);
   }
@@ -235,6 +238,7 @@ class Slices {
 
   value(layer, index) {
     const { kind, of, to } = this.layers[layer];
+    if (kind === 'map') return valueAt(this.errorMaps[of].array, index);
     const value = valueAt(this.volumes[of].array, index);
     if (kind === 'density') return value;
     const difference = value - valueAt(this.volumes[to].array, index);
@@ -357,6 +361,12 @@ class Slices {
         scaleBar(this.maps.error, 'error', 0, this.largest),
       );
     }
+    if (this.errorMaps.length) {
+      // One scale for all maps, each with codes of its own.
+      const top = Math.max(...this.errorMaps.map(({ array }) => array.low + array.step * array.codes.reduce((a, b) => Math.max(a, b), 0)));
+      this.colours.map = this.errorMaps.map(({ array }) => pixelsOfCodes(this.maps.error, array, 0, top));
+      this.scales.append(scaleBar(this.maps.error, 'error map', 0, top));
+    }
   }
 
   // A slice of a layer as a small canvas of one pixel a voxel, top row first.
@@ -371,8 +381,8 @@ class Slices {
     if (!panel.image) panel.image = pen.createImageData(columns, rows);
     const pixels = new Uint32Array(panel.image.data.buffer);
     const { kind, of, to } = this.layers[layer];
-    const colours = this.colours[kind];
-    const a = this.volumes[of].array.codes;
+    const colours = kind === 'map' ? this.colours.map[of] : this.colours[kind];
+    const a = (kind === 'map' ? this.errorMaps : this.volumes)[of].array.codes;
     const b = to === undefined ? null : this.volumes[to].array.codes;
     let k = 0;
     for (let row = rows - 1; row >= 0; row--) {

@@ -1,0 +1,158 @@
+"""What an early stop and weights of the pixels are worth to a fit of noisy projections.
+
+A cell is one fit of one scan by the recipe `fast`: a JSON file, written atomically. A stored cell is not computed again.
+
+    study = Study(Path('out/noise'))
+    study.compute_missing([Case('foot', photons=1000)])
+    print(study.table([Case('foot', photons=1000)]))
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects
+from lingo_mi.file_access import write_text
+from lingo_mi.fitting import loop
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.recipes import FAST
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.scan import Scan
+from lingo_mi.studies.provenance import provenance
+from lingo_mi.studies.regret import simulated
+
+EVERY = 50  # steps between two looks at the volume
+SETTINGS: dict[str, dict[str, Any]] = {
+    'equal': dict(stop='off'),
+    'stopped': dict(stop='on'),
+    'noise': dict(stop='off', weights='noise'),
+    'variance': dict(stop='off', weights='variance'),
+}
+
+WEIGHTS = dict(noise='weights 1 / s', variance='weights 1 / s^2')
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan.
+
+    object    one of `studies.tables.objects`, scanned over a full turn
+    photons   a pixel in the open beam
+    finer     how many times as many voxels are scanned along each side
+    views     fitted
+    """
+
+    object: str
+    photons: float
+    finer: int = 2
+    views: int = 25
+
+
+class Study:
+    """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of `pixels` a side.
+
+    iterations   steps of a fit, at most
+    """
+
+    def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = FAST.iterations):
+        self.folder, self.size, self.pixels, self.iterations = Path(folder), size, pixels, iterations
+        self.dataset = functools.lru_cache(1)(self._dataset)
+
+    def path(self, case: Case, setting: str) -> Path:
+        scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
+        steps = '' if self.iterations == FAST.iterations else f'_{self.iterations}_steps'
+        return self.folder / f'{scan}{steps}' / f'{setting}.json'
+
+    def get(self, case: Case, setting: str) -> dict | None:
+        """A stored cell, or None where there is none that can be read."""
+        try:
+            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
+        except (FileNotFoundError, ValueError):
+            return None
+        return found if isinstance(found, dict) and {'steps', 'psnr_3d'} <= found.keys() else None
+
+    def compute_missing(
+        self, cases: Iterable[Case], settings: Iterable[str], say: Callable[[str], object] = lambda line: None
+    ) -> None:
+        """Compute and store the cells that are missing. settings: names of SETTINGS."""
+        for case in cases:
+            for setting in settings:
+                if self.get(case, setting) is None:
+                    found = self._compute(case, setting)
+                    last, best = found['psnr_3d'][-1], max(found['psnr_3d'])
+                    say(f'{case}, {setting}: {last:.2f} dB after {found["steps"][-1]} steps, at best {best:.2f}')
+                    path = self.path(case, setting)
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    write_text(path, json.dumps(found) + '\n')
+
+    def _compute(self, case: Case, setting: str) -> dict:
+        scan, truth = self.dataset(case)
+        settings = FAST.changed(iterations=self.iterations, **SETTINGS[setting])
+
+        def measure(model, state):
+            return dict(psnr_3d=psnr_3d(model.volume(state), truth))
+
+        began = time.process_time()
+        cloud = initial_cloud(scan, settings)
+        with mock.patch.object(loop, 'measure_at', lambda iterations: range(EVERY, iterations + 1, EVERY)):
+            fitted = loop.run(scan, settings, cloud, 0, measure)
+        return dict(
+            asdict(case),
+            setting=setting,
+            steps=[entry['iteration'] for entry in fitted.history],
+            psnr_3d=[entry['psnr_3d'] for entry in fitted.history],
+            search=fitted.search,
+            seconds=time.process_time() - began,
+            size=self.size,
+            pixels=self.pixels,
+            provenance=provenance(),
+        )
+
+    def _dataset(self, case: Case) -> tuple[Scan, np.ndarray]:
+        geometry, views, truth = simulated(case.object, self.size, self.pixels, case.views, case.finer)
+        detector = Detector.of(**(Detector.DEFAULTS | dict(photons=case.photons)))
+        counted = [detector.measure(np.exp(-view.astype(float)), i) for i, view in enumerate(views)]
+        return Scan(geometry, np.stack(counted), effects=Effects(detector=detector)), truth
+
+    def table(self, cases: Iterable[Case]) -> str:
+        """The Markdown table of the cells that are there, a row a case: dB of the volume (after so many steps)."""
+        cells = {case: {name: cell for name in SETTINGS if (cell := self.get(case, name))} for case in cases}
+        weighed = [name for name in WEIGHTS if any(name in found for found in cells.values())]
+        heads = ['all steps', 'best of all steps', '**stopped**', 'behind the best']
+        heads += [head for name in weighed for head in (f'{WEIGHTS[name]}, all steps', f'{WEIGHTS[name]}, best')]
+        lines = [f'| object | scanned | photons | {" | ".join(heads)} |', '|---|---:|---:|' + '---:|' * len(heads)]
+        for case, found in cells.items():
+            if 'equal' not in found:
+                continue
+            row, top = [_shown(*_last(found['equal'])), _shown(*_best(found['equal']))], _best(found['equal'])[0]
+            row += ['–', '–'] if 'stopped' not in found else _stopped(found['stopped'], top)
+            for name in weighed:
+                row += [_shown(*of(found[name])) if name in found else '–' for of in (_last, _best)]
+            lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(row)} |')
+        return '\n'.join(lines)
+
+
+def _stopped(cell: dict, top: float) -> list[str]:
+    return [_shown(*_last(cell)), f'{top - _last(cell)[0]:+.2f}']
+
+
+def _last(cell: dict) -> tuple[float, int]:
+    return cell['psnr_3d'][-1], cell['steps'][-1]
+
+
+def _best(cell: dict) -> tuple[float, int]:
+    return max(zip(cell['psnr_3d'], cell['steps']))
+
+
+def _shown(dB: float, steps: int) -> str:
+    return f'{dB:.2f} ({steps})'
