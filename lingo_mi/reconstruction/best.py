@@ -21,6 +21,7 @@ from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan
 
 START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
 PLAIN, REFINED, SMOOTHED = 'asd-pocs', 'refined', 'refined, smooth'
@@ -67,8 +68,8 @@ class Best(Algorithm):
 
     1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
        are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
-    2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector) are
-       tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits them, and more total
+    2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
+       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits them, and more total
        variation is tried.
     3. The setting that predicts the views best, with its number of passes, is applied to all views.
 
@@ -198,11 +199,11 @@ def refine(
     """
     fine = replace(scan, geometry=Refined(finer=finer).grid(scan.geometry))
     start = _parts(start, finer)
-    algorithm = Refined(niter=niter, seed=seed)
+    algorithm = replace(Refined(niter=niter, seed=seed).on_measured(), lmbda=LMBDA, lmbda_red=LMBDA_RED)
     if smooth:
         algorithm = replace(algorithm, alpha=SMOOTH)
     weights, blur = structure(start), excess_width(fine.geometry)
-    return algorithm.on_measured().run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
+    return algorithm.run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
