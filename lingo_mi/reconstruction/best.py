@@ -69,8 +69,8 @@ class Best(Algorithm):
     1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
        are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
     2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
-       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits them, and more total
-       variation is tried.
+       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits
+       them, and more total variation is tried.
     3. The setting that predicts the views best, with its number of passes, is applied to all views.
 
     Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks; the result is
