@@ -22,7 +22,8 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import render_objects, take_scan
 
 # Small, so that a fit takes about a minute.
-SETTINGS = FAST.changed(iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
+# Stopped nowhere: what an effect costs is told after the same steps.
+SETTINGS = FAST.changed(stop='off', iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
 FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
 
 
