@@ -32,6 +32,31 @@ class Packed:
         return dict(shape=list(self.shape), low=self.low, step=self.step)
 
 
+class Arrays(dict[str, Packed]):
+    """The arrays of a page by name. Given those of an earlier state of it, what has not changed since is not packed again."""
+
+    def __init__(self, earlier: Arrays | None = None):
+        super().__init__()
+        self._given: dict[str, tuple[np.ndarray, float, float, int]] = {}
+        self._earlier = {} if earlier is None else {name: (earlier._given[name], p) for name, p in earlier.items()}
+
+    def scale(self, name: str, low: float, high: float) -> tuple[float, float]:
+        """The range to pack an array with: [low, high], or the one of before where that holds it and is not too wide."""
+        if name not in self._earlier:
+            return low, high
+        least, most = self._earlier[name][0][1:3]
+        if least <= low and high <= most <= low + 2 * (high - low):
+            return least, most
+        return low, high + (high - low) / 4  # values of a fit go on growing
+
+    def add(self, name: str, array: np.ndarray, low: float, high: float, bits: int = 16) -> None:
+        """Pack an array (see `pack`), unless it was the same before."""
+        self._given[name] = array, low, high, bits
+        given, packed = self._earlier.get(name, (None, None))
+        same = given is not None and given[1:] == (low, high, bits) and np.array_equal(given[0], array)
+        self[name] = packed if same and packed is not None else pack(array, low, high, bits)
+
+
 def pack(array: np.ndarray, low: float, high: float, bits: int = 16, level: int = 5) -> Packed:
     """An array whose values lie in [low, high], the first axis the fastest; `low` is a code, and so is 0 if low <= 0 <= high."""
     low, step = _scale(low, high, bits)

@@ -12,7 +12,7 @@ from lingo_mi.output_folder import PAGE, PICTURE
 from lingo_mi.report import figures, template
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, headline
-from lingo_mi.report.payload import payload
+from lingo_mi.report.payload import colour_maps, history, payload
 
 
 def write_report(folder: PathLike | str, data: ReportData) -> Path:
@@ -33,6 +33,7 @@ def write_report(folder: PathLike | str, data: ReportData) -> Path:
 def report_page(data: ReportData) -> str:
     """The page of a report, as text."""
     known, arrays = payload(data)
+    known |= dict(colours=colour_maps(), history=history(data.history))
     command = template.code('Make it again', data.command) if data.command else ''
     return template.page(data.title, headline(data.metrics), _numbers(data), command, known, arrays)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
-from lingo_mi.report.packing import MOST_VOXELS, Packed, bits_within, pack, preview
+from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, preview
 from lingo_mi.report.planes import grey_range, planes, richest
 
 MOST_PIXELS = 60 * 256**2  # of all held-out views in a page, each of rendered and measured
@@ -17,16 +18,15 @@ VOLUME_BYTES, VIEW_BYTES = 19e6, 6e6  # as text; with libraries, cloud and surfa
 SURFACE_VOXELS, MOST_VERTICES = 112, 60_000
 MAP_BITS = 8  # of a map of errors, which ranks voxels: no more than its colours
 
-Arrays = dict[str, Packed]
 
-
-def payload(data: ReportData, surfaces: bool = True) -> tuple[dict, Arrays]:
-    """What the scripts know of a report, and its arrays by name.
+def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = None) -> tuple[dict, Arrays]:
+    """What the scripts know of a report beside colours and history, and its arrays by name.
 
     surfaces   whether surfaces of the volume are among them, which take a second
+    earlier    the arrays of an earlier state of the same page; those that are the same still are taken from there
     """
-    arrays: Arrays = {}
-    known: dict[str, Any] = dict(colours=colour_maps(), history=[_finite(entry) for entry in data.history])
+    arrays = Arrays(earlier)
+    known: dict[str, Any] = {}
     if data.volume is not None:
         volumes = {'Reconstruction': data.volume}
         if data.truth is not None:
@@ -58,33 +58,29 @@ def slices(
 
     reference   the volume that the others are compared with
     """
-    most = MOST_VOXELS
-    low = min(float(v.min()) for v in volumes.values())
-    high = max(float(v.max()) for v in volumes.values())
-    while True:
-        small = {name: preview(np.asarray(v, np.float32), most) for name, v in volumes.items()}
-        bits = bits_within([v for v, _ in small.values()], low, high, budget)
-        if bits is not None or most < 64**3:
-            break
-        most //= 8
-    shown, factor = next(iter(small.values()))
+
+    def candidates():
+        for most in (MOST_VOXELS // 8**k for k in range(4)):
+            small = {name: preview(np.asarray(v, np.float32), most) for name, v in volumes.items()}
+            yield next(iter(small.values()))[1], {name: v for name, (v, _) in small.items()}
+
+    factor, small = _add('volume', candidates(), arrays, budget)
+    shown = next(iter(small.values()))
     old = next(iter(volumes.values())).shape
     by = [min(factor, n) for n in old]
     step = [float(s * b) for s, b in zip(spacing, by)]
     # Blocks begin at the first voxel; voxels left over at the far end are not shown.
     middle = [float(c + (n * b - m) * s / 2) for c, n, b, m, s in zip(centre, shown.shape, by, old, spacing)]
-    for i, (volume, _) in enumerate(small.values()):
-        arrays[f'volume{i}'] = pack(volume, low, high, bits or 8)
-    chosen = small[reference][0] if reference else shown
-    axes = planes(shown.shape)
-    window = grey_range(np.concatenate([np.take(chosen, richest(chosen, a), a).ravel() for a in axes]))
+    chosen = small[reference] if reference else shown
+    axes, start = planes(shown.shape), [richest(chosen, axis) for axis in range(3)]
+    window = grey_range(np.concatenate([np.take(chosen, start[axis], axis).ravel() for axis in axes]))
     return dict(
         shape=list(shown.shape),
         spacing=step,
         centre=middle,
         preview=factor,
         axes=axes,
-        start=[richest(chosen, axis) for axis in range(3)],
+        start=start,
         window=[float(x) for x in window],
         unit='1/mm',
         volumes=[dict(name=name, array=f'volume{i}') for i, name in enumerate(small)],
@@ -101,7 +97,7 @@ def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict
         small = preview(np.asarray(values, np.float32), MOST_VOXELS)[0]
         while small.size > np.prod(known['shape']):  # previews have been made smaller
             small = preview(values, small.size // 8)[0]
-        arrays[f'map{i}'] = pack(small, 0.0, float(small.max()), MAP_BITS)
+        arrays.add(f'map{i}', small, 0.0, float(small.max()), MAP_BITS)
     return dict(maps=[dict(name=name, array=f'map{i}') for i, name in enumerate(maps)])
 
 
@@ -118,35 +114,56 @@ def views(
     reference   the images that the others are compared with
     """
     first = next(iter(images.values()))
-    count, by = len(first), 1
-    while count * (first.shape[1] // by) * (first.shape[2] // by) > MOST_PIXELS and min(first.shape[1:]) // by >= 256:
-        by += 1
-    while True:
-        size = max(1, (first.shape[1] // by) * (first.shape[2] // by))
-        count = min(len(first), max(1, MOST_PIXELS // size))
-        order = np.argsort(np.asarray(angles), kind='stable')[np.arange(count) * len(first) // count]
-        small = {name: _binned(v[order], by) for name, v in images.items()}
-        low = min(float(v.min()) for v in small.values())
-        high = max(float(v.max()) for v in small.values())
-        # Packed as [u, v, view]: neighbours in a row are most alike.
-        turned = {name: np.ascontiguousarray(v.transpose(2, 1, 0)) for name, v in small.items()}
-        bits = bits_within(list(turned.values()), low, high, budget)
-        if bits is not None or min(first.shape[1:]) // (by + 1) < 16:
-            break
-        by += 1
-    for i, image in enumerate(turned.values()):
-        arrays[f'views{i}'] = pack(image, low, high, bits or 8)
-    shown = next(iter(small.values()))
+    least = 1
+    while first.size // least**2 > MOST_PIXELS and min(first.shape[1:]) // least >= 256:
+        least += 1
+
+    def candidates():
+        for n in (least, *range(least + 1, min(first.shape[1:]) // 16 + 1)):
+            size = max(1, (first.shape[1] // n) * (first.shape[2] // n))
+            count = min(len(first), max(1, MOST_PIXELS // size))
+            order = np.argsort(np.asarray(angles), kind='stable')[np.arange(count) * len(first) // count]
+            # Packed as [u, v, view]: neighbours in a row are most alike.
+            turned = {k: np.ascontiguousarray(_binned(v[order], n).transpose(2, 1, 0)) for k, v in images.items()}
+            yield (n, order), turned
+
+    (by, order), turned = _add('views', candidates(), arrays, budget)
+    last = next(reversed(turned.values()))
     return dict(
-        shape=list(shown.shape),
+        shape=list(last.shape[::-1]),
         pixel=[float(p * by) for p in pixel],
         total=len(first),
         binning=by,
         angles=[float(np.asarray(angles)[i]) for i in order],
-        window=[float(x) for x in grey_range(next(reversed(small.values())))],
-        images=[dict(name=name, array=f'views{i}') for i, name in enumerate(small)],
-        reference=list(small).index(reference) if reference else None,
+        window=[float(x) for x in grey_range(last)],
+        images=[dict(name=name, array=f'views{i}') for i, name in enumerate(turned)],
+        reference=list(turned).index(reference) if reference else None,
     )
+
+
+def _add(name: str, candidates: Iterable[tuple[Any, dict[str, np.ndarray]]], arrays: Arrays, budget: float) -> tuple:
+    """Pack arrays, with one scale, as `name0`, `name1`, ...: the first candidate that stays within `budget` bytes, or the last.
+
+    candidates   what says how they were made, and the arrays, the largest first
+
+    Returns that candidate.
+    """
+    for candidate in candidates:
+        found = candidate[1]
+        low = min(float(v.min()) for v in found.values())
+        low, high = arrays.scale(f'{name}0', low, max(float(v.max()) for v in found.values()))
+        bits = bits_within(list(found.values()), low, high, budget)
+        if bits is not None:
+            break
+    for i, array in enumerate(found.values()):
+        arrays.add(f'{name}{i}', array, low, high, bits or 8)
+    return candidate
+
+
+def history(entries: Iterable[dict]) -> list[dict]:
+    """The numbers of a history that JSON has."""
+    numbers = int, float, np.number
+    return [{k: float(v) for k, v in e.items() if isinstance(v, numbers) and np.isfinite(v)} for e in entries]
 
 
 def colour_maps() -> dict[str, str]:
@@ -193,7 +210,7 @@ def _cloud(data: ReportData, arrays: Arrays) -> dict:
 
     def add(name, values):
         values = np.asarray(values)[keep]
-        arrays[name] = pack(values, float(values.min()), float(values.max()))
+        arrays.add(name, values, float(values.min()), float(values.max()))
 
     add('centres', centres)
     add('densities', density)
@@ -231,8 +248,8 @@ def _surfaces(data: ReportData, arrays: Arrays) -> list[dict]:
         first = np.asarray(data.centre) - np.asarray(data.shape) * np.asarray(data.spacing) / 2
         points = first + (vertices - 0.5) * factors * np.asarray(data.spacing)
         key = f'surface{len(out)}'
-        arrays[key + 'points'] = pack(points, float(points.min()), float(points.max()))
-        arrays[key + 'faces'] = pack(faces.astype(float), 0, 65535)
+        arrays.add(key + 'points', points, float(points.min()), float(points.max()))
+        arrays.add(key + 'faces', faces.astype(float), 0, 65535)
         out.append(dict(name=name, level=least, array=key))
     return out
 
@@ -243,8 +260,3 @@ def _binned(images: np.ndarray, by: int) -> np.ndarray:
         return images
     n, rows, columns = images.shape[0], images.shape[1] // by, images.shape[2] // by
     return images[:, : rows * by, : columns * by].reshape(n, rows, by, columns, by).mean((2, 4))
-
-
-def _finite(entry: dict) -> dict:
-    """The numbers of an entry that JSON has."""
-    return {k: float(v) for k, v in entry.items() if isinstance(v, (int, float, np.number)) and np.isfinite(v)}

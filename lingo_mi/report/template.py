@@ -10,7 +10,7 @@ from functools import cache
 from importlib.resources import files
 from string import Template
 
-from lingo_mi.report.payload import Arrays
+from lingo_mi.report.packing import Arrays
 
 STYLES = 'vendor/uPlot.min.css', 'page.css'
 LIBRARIES = 'vendor/uPlot.iife.min.js', 'vendor/three.min.js'

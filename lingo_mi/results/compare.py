@@ -11,7 +11,8 @@ from lingo_mi.errors import InputError, brief
 from lingo_mi.files.volumes import Volume
 from lingo_mi.report import template
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text
-from lingo_mi.report.payload import Arrays, colour_maps, error_maps, slices, views
+from lingo_mi.report.packing import Arrays
+from lingo_mi.report.payload import colour_maps, error_maps, slices, views
 from lingo_mi.results.stored import Stored
 
 LOWER_IS_BETTER = 'ipsd', 'ipsd_reverse', 'seconds_init', 'seconds_fit', 'ms_per_iteration'
@@ -31,7 +32,7 @@ def compare_page(results: list[Stored], truth: Volume | None = None, title: str 
     if not 2 <= len(results) <= MOST:
         raise InputError(f'a comparison is of 2 to {MOST} results, not of {len(results)}')
     names = _names(results)
-    arrays: Arrays = {}
+    arrays = Arrays()
     known: dict[str, Any] = dict(colours=colour_maps(), history=[])
     volumes = {name: r.volume for name, r in zip(names, results) if r.volume is not None}
     if truth is not None and volumes:

@@ -1,14 +1,13 @@
 """A fit as a page that grows while it runs, served to this machine alone.
 
 The server listens on 127.0.0.1, on a port that the system chooses. It answers only requests that name it so and carry the token
-of its address. Arrays are made into text in the server's threads, when a page asks for them: without one it costs next to
-nothing.
+of its address. A state is made when a page asks for it, so that without one it costs next to nothing, and as often as `SHARE`
+allows. A page is told what it does not know yet: new entries of the history, and arrays that have changed.
 """
 
 from __future__ import annotations
 
 import hmac
-import json
 import secrets
 import sys
 import threading
@@ -24,13 +23,14 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.progress import clock
 from lingo_mi.report import template
 from lingo_mi.report.data import ReportData
-from lingo_mi.report.packing import preview
-from lingo_mi.report.payload import colour_maps, payload
+from lingo_mi.report.packing import Arrays, preview
+from lingo_mi.report.payload import colour_maps, history, payload
 from lingo_mi.results.watch import Snapshot
 
-SHARE = 0.02  # of the fit's processor time, that looking may take
+SHARE = 0.015  # of the fit's processor time, that a page may take until the end, whose state is shown in any case
 MOST_VOXELS = 128**3  # of a volume in the page
 MILLISECONDS = 1000  # between two questions of the page
+MOST_ENTRIES = 2000  # of the history
 PATIENCE = 10.0  # seconds after which a page that has not asked is gone; a finished fit waits no longer for it
 
 
@@ -46,11 +46,15 @@ class Live:
         self._token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
         self._history: list[dict] = []
+        self._thinned = 0  # how often the history was
         self._line, self._number, self._done, self._end_seen = 'The fit begins.', 0, False, threading.Event()
         self._data: ReportData | None = None
-        self._skipped: Snapshot | None = None
-        self._packed: tuple[int, dict] = (0, {})
-        self._began, self._spent, self._asked = time.process_time(), 0.0, -np.inf
+        self._waiting: Snapshot | None = None  # the latest, until it is shown
+        self._packed: tuple[int, dict, Arrays] = 0, {}, Arrays()
+        self._changed: dict[str, int] = {}  # the state that brought each array as it is
+        self._packing = threading.Lock()
+        self._truth: tuple[np.ndarray, np.ndarray] | None = None  # as given, and smaller
+        self._began, self._spent, self._latest, self._asked = time.process_time(), 0.0, 0.0, -np.inf
         self._server = ThreadingHTTPServer(('127.0.0.1', 0), _handler(self))
         self._server.daemon_threads = True
         self._port = self._server.server_address[1]
@@ -74,7 +78,6 @@ class Live:
 
     def step(self, entry: dict, total: int) -> None:
         """See `watch.Watcher`."""
-        known = {k: v for k, v in entry.items() if v is not None}
         first = self._history[0] if self._history else dict(iteration=0, seconds=0.0)  # a resumed fit begins later
         steps, seconds = entry['iteration'] - first['iteration'], entry['seconds'] - first['seconds']
         left = seconds * (total - entry['iteration']) / max(1, steps)
@@ -85,36 +88,46 @@ class Live:
         ]
         parts.append(f'{clock(left)} left' if entry['iteration'] < total else f'done in {clock(entry["seconds"])}')
         with self._lock:
-            self._history.append(known)
-            if len(self._history) > 2000:  # every second one of the earlier half, but for what was measured
-                half = self._history[:1000]
-                self._history[:1000] = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
+            self._history += history([entry])
+            if len(self._history) > MOST_ENTRIES:  # every second one of the earlier half, but for what was measured
+                half = self._history[: MOST_ENTRIES // 2]
+                kept = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
+                self._history[: MOST_ENTRIES // 2] = kept
+                self._thinned += 1
             self._line = ', '.join(parts) + '.'
+        self._show_if_due()
 
     def look(self, snapshot: Snapshot) -> None:
-        """See `watch.Watcher`. The first look is for everybody, the others are for pages that still ask, within `SHARE`."""
-        now = time.perf_counter()
-        watching = now - self._asked < PATIENCE or self._number == 0
-        if not watching or self._spent > SHARE * (time.process_time() - self._began) and self._number > 0:
-            self._skipped = snapshot
+        """See `watch.Watcher`. It is shown as soon as a page is there and `SHARE` allows it, unless a later one comes first."""
+        self._waiting = snapshot
+        self._show_if_due()
+
+    def _show_if_due(self) -> None:
+        if self._waiting is None or not self._watched():
             return
-        self._show(snapshot)
+        budget = SHARE * (time.process_time() - self._began)
+        if self._number == 0 or self._spent + self._latest <= budget:
+            self._show(self._waiting)
+
+    def _watched(self) -> bool:
+        return time.perf_counter() - self._asked < PATIENCE
 
     def _show(self, snapshot: Snapshot) -> None:
-        began, self._skipped = time.thread_time(), None
+        began, self._waiting = time.process_time(), None  # of all threads: a volume is made by those of Dr.Jit
         data = self._contents(snapshot)
         with self._lock:
             self._data, self._number = data, self._number + 1
-        self._spent += time.thread_time() - began
+            self._latest = time.process_time() - began
+            self._spent += self._latest
 
     def close(self, finished: bool) -> None:
         """See `watch.Watcher`. Waits a moment for a page that is open, so that it sees the end."""
-        if finished and self._skipped is not None and time.perf_counter() - self._asked < PATIENCE:
-            self._show(self._skipped)
+        if finished and self._waiting is not None and self._watched():
+            self._show(self._waiting)
         with self._lock:
             self._done = True
             self._line += ' The fit is finished.' if finished else ' The fit was stopped.'
-        if time.perf_counter() - self._asked < PATIENCE:
+        if self._watched():
             self._end_seen.wait(PATIENCE)
         self._server.shutdown()
         self._server.server_close()
@@ -133,7 +146,10 @@ class Live:
         if volume is not None:
             small, _ = preview(volume, MOST_VOXELS)
             if snapshot.measured is not None:
-                truth, _ = preview(snapshot.measured[1], MOST_VOXELS)
+                given = snapshot.measured[1]
+                if self._truth is None or self._truth[0] is not given:
+                    self._truth = given, preview(given, MOST_VOXELS)[0]
+                truth = self._truth[1]
             spacing = np.asarray(geometry.sVoxel) / small.shape
             volume = small
         centres, scales, quaternions, density = snapshot.gaussians
@@ -165,36 +181,54 @@ class Live:
     def page(self) -> str:
         """The page, still without anything to show."""
         known = dict(colours=colour_maps(), history=[], live=dict(milliseconds=MILLISECONDS))
-        return template.page(self.title, 'a fit that is running', '', '', known, {}, live=True)
+        return template.page(self.title, 'a fit that is running', '', '', known, Arrays(), live=True)
 
-    def state(self, seen: int) -> dict:
-        """What a page that has seen so many states does not know yet."""
+    def state(self, seen: int, place: str) -> dict:
+        """What a page does not know yet.
+
+        seen    the number of the state that it has seen last
+        place   how far it has the history, as it was told (`history.place`)
+        """
         with self._lock:
             self._asked = time.perf_counter()
-            data, number = self._data, self._number
-            out: dict[str, Any] = dict(number=number, line=self._line, done=self._done, history=[*self._history])
-        if data is not None and number != seen:
-            out |= self._texts(number, data)
-        return out
+            number, thinned = self._number, str(self._thinned)
+            cut, _, known = place.partition('.')
+            whole = not (cut == thinned and known.isdecimal() and len(known) < 10)
+            told = dict(
+                whole=whole,
+                entries=self._history[0 if whole else int(known) :],
+                place=f'{thinned}.{len(self._history)}',
+            )
+            out: dict[str, Any] = dict(number=number, line=self._line, done=self._done, history=told)
+        return out if number in (0, seen) else out | self._news(seen)
 
     def sent(self, state: dict) -> None:
         """A page has this state now."""
         if state['done']:
             self._end_seen.set()
 
-    def _texts(self, number: int, data: ReportData) -> dict:
+    def spent(self, seconds: float) -> None:
+        """Processor time that a question has taken."""
         with self._lock:
-            made, texts = self._packed
-        if made != number:
-            began = time.thread_time()
-            known, arrays = payload(data, surfaces=False)
-            del known['history'], known['colours']
-            known['arrays'] = {name: packed.head() for name, packed in arrays.items()}
-            texts = dict(known=known, texts={name: packed.text for name, packed in arrays.items()})
+            self._spent += seconds
+
+    def _news(self, seen: int) -> dict:
+        """The latest state: what the scripts know of it, and the arrays that have changed since state `seen`."""
+        with self._packing:
             with self._lock:
-                self._packed = number, texts
-                self._spent += time.thread_time() - began
-        return texts
+                number, data = self._number, self._data
+            made, known, arrays = self._packed
+            if made != number and data is not None:
+                began, before = time.thread_time(), arrays
+                known, arrays = payload(data, surfaces=False, earlier=before)
+                known['arrays'] = {name: packed.head() for name, packed in arrays.items()}
+                self._changed |= {name: number for name, packed in arrays.items() if before.get(name) is not packed}
+                self._packed = number, known, arrays
+                with self._lock:
+                    self._latest += time.thread_time() - began
+            known_to_page = seen if seen <= number else 0
+            new = {name: packed.text for name, packed in arrays.items() if self._changed[name] > known_to_page}
+            return dict(number=number, known=known, texts=new)
 
 
 def _handler(live: Live) -> type[BaseHTTPRequestHandler]:
@@ -202,6 +236,11 @@ def _handler(live: Live) -> type[BaseHTTPRequestHandler]:
         timeout = 10
 
         def do_GET(self):
+            began = time.thread_time()
+            self._respond()
+            live.spent(time.thread_time() - began)
+
+        def _respond(self):
             address = urlsplit(self.path)
             asked = parse_qs(address.query)
             if not live.allowed(self.headers.get('Host', ''), asked.get('token', [''])[0]):
@@ -213,8 +252,9 @@ def _handler(live: Live) -> type[BaseHTTPRequestHandler]:
             if address.path != '/state':
                 return self._answer(404, 'text/plain', 'there is nothing here\n')
             seen = asked.get('seen', ['0'])[0]
-            state = live.state(int(seen) if seen.isdecimal() and len(seen) < 10 else 0)
-            self._answer(200, 'application/json', json.dumps(state))
+            number = int(seen) if seen.isdecimal() and len(seen) < 10 else 0
+            state = live.state(number, asked.get('history', [''])[0])
+            self._answer(200, 'application/json', template.as_json(state))
             live.sent(state)
 
         def _answer(self, code, kind, text):

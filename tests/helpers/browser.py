@@ -56,8 +56,13 @@ def browser():
 
 
 @contextlib.contextmanager
-def opened(browser, address, dark=False, offline=True, ready=True):
-    """A page, its network off, that must leave no error and no warning in the console, and ask for nothing else."""
+def opened(browser, address, dark=False, offline=True, ready=True, first=''):
+    """A page, its network off, that must leave no error and no warning in the console, and ask for nothing else.
+
+    first   a script that runs before those of the page
+
+    `page.said` are the errors and warnings so far, `page.asked` the addresses that it has asked for.
+    """
     said, asked = [], []
     scheme = 'dark' if dark else 'light'
     context = browser.new_context(offline=offline, viewport=dict(width=1280, height=900), color_scheme=scheme)
@@ -70,10 +75,11 @@ def opened(browser, address, dark=False, offline=True, ready=True):
         )
         page.on('pageerror', lambda error: said.append(str(error)))
         page.on('request', lambda request: asked.append(request.url))
+        page.add_init_script(first)
         page.goto(address)
         if ready:
             page.wait_for_selector('html[data-ready]')
-        page.asked = asked
+        page.asked, page.said = asked, said
         yield page
         assert said == []
     finally:

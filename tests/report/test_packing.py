@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lingo_mi.report.packing import bits_within, pack, preview
+from lingo_mi.report.packing import Arrays, bits_within, pack, preview
 from lingo_mi.report.payload import slices
 
 
@@ -61,7 +61,7 @@ def test_preview_is_the_mean_of_blocks():
 def test_the_worst_volume_stays_within_the_budget(size):
     """Noise in reconstruction and truth; the budget is in proportion to 20 MB for 256^3."""
     rng = np.random.default_rng(0)
-    budget, arrays = 20e6 * (size / 256) ** 3, {}
+    budget, arrays = 20e6 * (size / 256) ** 3, Arrays()
     volumes = {name: rng.random((size, size, size), dtype=np.float32) for name in ('Reconstruction', 'Truth')}
     known = slices(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
     assert sum(len(a.text) for a in arrays.values()) <= 1.02 * budget and known['preview'] == 2

@@ -88,6 +88,28 @@ def test_it_opens_from_disk_and_asks_for_nothing(page, address):
     assert page.locator('pre').text_content() == f'fit {MARKUP}' and page.locator('img').count() == 0
 
 
+def test_a_part_that_cannot_be_shown_leaves_the_others_alone(chromium, address):
+    with opened(chromium, address, first='IntersectionObserver = undefined') as page:
+        assert page.locator('#space').text_content().startswith('In spaceThis part could not be shown: ')
+        assert page.locator('#slices canvas.picture').count() == 3 and page.locator('#curves .chart').count() == 3
+        assert [said.split(':')[0] for said in page.said] == ['space could not be shown']
+        page.said.clear()
+
+
+WITHOUT_WEBGL = """const { getContext } = HTMLCanvasElement.prototype;
+HTMLCanvasElement.prototype.getContext = function (kind, ...given) {
+  return kind.startsWith('webgl') ? null : getContext.call(this, kind, ...given);
+};"""
+
+
+def test_a_browser_without_webgl(chromium, address):
+    with opened(chromium, address, first=WITHOUT_WEBGL) as page:
+        page.locator('#space').scroll_into_view_if_needed()
+        page.locator('#space', has_text='This browser has no WebGL').wait_for()
+        assert page.locator('#slices canvas.picture').count() == 3
+        page.said.clear()  # three.js says it too
+
+
 def test_a_script_that_is_not_its_own_is_refused(chromium, data, tmp_path):
     """The page's policy holds even where markup would come through."""
     path = write_report(tmp_path, data)

@@ -2,19 +2,21 @@
 
 import http.client
 import json
+import queue
 import re
 import threading
 import time
 import warnings
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 import lingo_mi as lm
 from helpers.browser import browser, opened, readout
-from helpers.script import fit_process
-from lingo_mi.results.live import Live
+from lingo_mi.results.live import SHARE, Live
 from lingo_mi.results.watch import Watch, watched
 
 SMALL = dict(n_points=300, iterations=60)
@@ -36,6 +38,7 @@ def data():
 def live(data):
     page = Live(data.train.geometry, '<b>title')
     yield page
+    page._asked = -np.inf  # nobody is there to see the end
     page.close(True)
 
 
@@ -184,30 +187,162 @@ def test_a_lost_viewer_stops_nothing(data, monkeypatch):
     assert len(result) > 0
 
 
-@pytest.mark.slow  # a browser beside a fit: the page's steps have tests of their own
-def test_the_page_follows_a_real_fit(scene, tmp_path):
-    """Its last values are those of the volume that the fit writes."""
-    with browser() as chromium:
-        process = fit_process(scene, '--iterations', 12_000, '-D', 'n_points=100', '--live', '--out', tmp_path / 'a')
-        address = None
-        for line in process.stderr:
-            if line.startswith('live: '):
-                address = line.split()[1]
+def snapshot(data, shift=0.0, truth=True):
+    """A look at a fit that has no fit."""
+    volume = data.volume + np.float32(shift)
+    views = data.test.projections + np.float32(shift)
+    rng = np.random.default_rng(0)
+    cloud = rng.random((30, 3)), rng.random((30, 3)) + 0.1, rng.normal(0, 1, (30, 4)), rng.random(30)
+    measured = (volume, data.volume) if truth else None
+    return SimpleNamespace(test=data.test, views=views, measured=measured, volume=volume, gaussians=cloud)
+
+
+def entry(iteration, **more):
+    return dict(iteration=iteration, seconds=iteration / 10, loss=1 / iteration, gaussians=30, **more)
+
+
+def asked(live, seen=0, place=''):
+    """What the page is told."""
+    status, _, text = get(live, f'/state?{token(live)}&seen={seen}&history={place}')
+    assert status == 200
+    return json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
+
+
+def test_a_page_is_told_what_it_does_not_know(live, data):
+    """New entries of the history; of the arrays those that have changed, so the truth once."""
+    asked(live)
+    live.step(entry(1), 100)
+    live.look(snapshot(data))
+    live.step(entry(2, psnr_2d=float('nan'), psnr_3d=None), 100)
+    first = asked(live)
+    assert [e['iteration'] for e in first['history']['entries']] == [1, 2] and first['history']['whole']
+    assert 'psnr_2d' not in first['history']['entries'][1]
+    names = {'volume0', 'volume1', 'views0', 'views1', 'centres', 'densities', 'scales', 'quaternions'}
+    assert first['number'] == 1 and set(first['texts']) == set(first['known']['arrays']) == names
+    place = first['history']['place']
+    again = asked(live, 1, place)
+    assert again['history']['entries'] == [] and 'texts' not in again and 'known' not in again
+    live.step(entry(3), 100)
+    live._show(snapshot(data, -0.001 * data.volume.max()))
+    news = asked(live, 1, place)
+    assert [e['iteration'] for e in news['history']['entries']] == [3] and not news['history']['whole']
+    # The first state's range has no room for values below 0, so that all volumes are packed anew; from then on it has.
+    live._show(snapshot(data, -0.0005 * data.volume.max()))
+    news = asked(live, 2, news['history']['place'])
+    assert set(news['texts']) == {'volume0', 'views0'} and set(news['known']['arrays']) == names
+    assert set(asked(live, 1)['texts']) == {'volume0', 'volume1', 'views0', 'views1'}
+    assert set(asked(live)['texts']) == set(asked(live, 99)['texts']) == names
+
+
+def test_a_history_that_is_thinned_is_told_as_a_whole(live, monkeypatch):
+    monkeypatch.setattr('lingo_mi.results.live.MOST_ENTRIES', 10)
+    for i in range(1, 9):
+        live.step(entry(i), 100)
+    place = asked(live)['history']['place']
+    for i in range(9, 15):
+        live.step(entry(i, **(dict(psnr_2d=30.0) if i == 9 else {})), 100)
+    told = asked(live, 0, place)['history']
+    iterations = [e['iteration'] for e in told['entries']]
+    assert told['whole'] and iterations == sorted(set(iterations)) and 9 in iterations and iterations[-1] == 14
+    assert len(iterations) <= 10
+    for bad in ('x', '1', '1.x', '.', '1.-1', '9.99999999999999', '%00'):
+        assert asked(live, 0, bad)['history']['whole'], bad
+
+
+def test_looking_takes_its_share_and_no_more(live, data, monkeypatch):
+    """Nothing where nobody looks; the first state at once; later ones within the share, which the first one counts in."""
+    clock = SimpleNamespace(now=live._began)
+    monkeypatch.setattr('lingo_mi.results.live.time.process_time', lambda: clock.now)
+    contents = live._contents
+    monkeypatch.setattr(live, '_contents', lambda seen: (setattr(clock, 'now', clock.now + 3.0), contents(seen))[1])
+    live.look(snapshot(data))
+    assert live._number == 0
+    asked(live)
+    live.step(entry(1), 10_000)  # not a new look: the one before, for the page that has come since
+    assert live._number == 1
+    for _ in range(1000):
+        clock.now += 1.0
+        live.look(snapshot(data))
+    assert 3.0 * live._number <= SHARE * (clock.now - live._began) < 3.0 * (live._number + 2)
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as found:
+        yield found
+
+
+def wait_for_quiet(page):
+    """Until all parts have been made and drawn."""
+    page.locator('#main[aria-busy=false]').wait_for()
+    page.evaluate('() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))')
+
+
+def test_a_part_that_fails_is_said_once_and_the_page_goes_on(chromium, live, data):
+    """The line and the other parts; the state is not asked for again."""
+    with opened(chromium, live.address, offline=False, first='IntersectionObserver = undefined') as page:
+        for i in (1, 2, 3):
+            live.step(entry(i), 3)
+            live._show(snapshot(data, i * 0.001))
+            page.locator('#live').filter(has_text=f'Step {i} of 3').wait_for()
+            while not any(f'seen={i}&' in url for url in page.asked):  # the next question
+                page.wait_for_timeout(100)
+        wait_for_quiet(page)
+        assert [said.split(':')[0] for said in page.said] == ['space could not be shown']
+        page.said.clear()
+        assert page.locator('#curves .chart').count() == 2
+        value = data.volume[tuple(int(n) for n in readout(page)['voxel'].split(', '))] + 0.003
+        assert abs(float(readout(page)['Reconstruction']) - value) < 1e-4 * value
+
+
+def test_a_fit_that_does_not_answer(chromium, data):
+    live = Live(data.train.geometry)
+    faster = 'const later = setTimeout; setTimeout = (act, wait) => later(act, wait / 20)'
+    with opened(chromium, live.address, offline=False, first=faster) as page:
+        live.step(entry(1), 3)
+        page.locator('#live').filter(has_text='Step 1 of 3').wait_for()
+        live._server.shutdown()
+        live._server.server_close()
+        page.locator('#live').filter(has_text='The fit does not answer any more').wait_for()
+        assert all('ERR_CONNECTION' in said for said in page.said) and len(page.said) == 5
+        page.said.clear()
+
+
+def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
+    """Its last values are those of the volume that the fit gives. The fit waits at its first step until the page has said it."""
+    pages, said, results = queue.Queue(), threading.Event(), []
+    monkeypatch.setattr(Live, 'announce', lambda page: pages.put(page))
+    step = Live.step
+
+    def waiting(page, entry, total):
+        step(page, entry, total)
+        for _ in range(1200):
+            if said.wait(0.05):
                 break
-        rest = threading.Thread(target=process.stderr.read, daemon=True)
-        rest.start()
-        with opened(chromium, address, offline=False) as page:
-            page.locator('#live').filter(has_text='Step ').wait_for()
-            page.wait_for_selector('#slices canvas.picture')
-            first = page.locator('#live').text_content()
-            assert re.match(r'Step [\d,]+ of 12,000, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
-            page.locator('#live').filter(has_text='The fit is finished.').wait_for(timeout=300_000)
-            page.locator('#curves').wait_for()
-            page.evaluate('() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))')
-            assert all(url.startswith(address.split('?')[0]) for url in page.asked)
-            found = readout(page)
-        assert process.wait(timeout=120) == 0
-        rest.join()
-    volume = lm.load_result(tmp_path / 'a').volume()
+            page._show_if_due()
+
+    monkeypatch.setattr(Live, 'step', waiting)
+    variant = mi.variant()
+
+    def run():
+        mi.set_variant(variant)  # of each thread
+        results.append(fit(data, live=True))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    address = pages.get(timeout=60).address
+    with opened(chromium, address, offline=False) as page:
+        page.locator('#live').filter(has_text='Step ').wait_for()
+        page.wait_for_selector('#slices canvas.picture')
+        first = page.locator('#live').text_content()
+        assert re.match(r'Step \d+ of 60, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
+        said.set()
+        page.locator('#live').filter(has_text='The fit is finished.').wait_for()
+        wait_for_quiet(page)
+        assert page.locator('#curves').is_visible() and page.locator('#space').is_visible()
+        assert all(url.startswith(address.split('?')[0]) for url in page.asked)
+        found = readout(page)
+    thread.join(60)
+    volume = results[0].volume()
     value = volume[tuple(int(n) for n in found['voxel'].split(', '))]
     assert abs(float(found['Reconstruction']) - value) < 1e-4 * volume.max() and value > 0.01

@@ -29,9 +29,14 @@ function lineChart(root, label, x, lines, { height = 170, log = false } = {}) {
       })),
     ],
   };
-  root.replaceChildren();
-  const plot = new uPlot(options, [x, ...lines.map((l) => l.values)], root);
-  Object.assign(root, { tabIndex: 0, plot });
+  const values = [x, ...lines.map((l) => l.values)];
+  const kind = JSON.stringify(options);
+  if (root.kind === kind) root.plot.setData(values);
+  else {
+    root.plot?.destroy();
+    Object.assign(root, { tabIndex: 0, kind, plot: new uPlot(options, values, root) });
+  }
+  const { plot } = root;
   root.setAttribute('role', 'application');
   root.setAttribute('aria-roledescription', 'chart');
   root.setAttribute('aria-label', `${lines.map((l) => l.name).join(', ')} against ${label}; arrow keys read the values`);
@@ -57,6 +62,8 @@ class Curves {
     bar.append(pick);
     this.charts = element('div');
     this.table = element('details');
+    this.table.append(text('summary', 'As a table'));
+    this.table.addEventListener('toggle', () => this.fillTable());
     this.root.replaceChildren(bar, this.charts, this.table);
     this.paint();
     let width = 0;
@@ -85,9 +92,17 @@ class Curves {
       const log = keys[0] === 'loss' && Math.min(...values) > 0 && Math.max(...values) > 10 * Math.min(...values);
       lineChart(this.charts.children[i], label, x, lines, { log });
     });
+    this.entries = entries;
+    this.columns = ['iteration', 'seconds', ...rows.flat()];
+    this.fillTable();
+  }
+
+  // Rows only while they can be seen: those of a long fit are many.
+  fillTable() {
+    if (!this.table.open) return;
+    const { entries, columns } = this;
     const made = element('table');
     const head = element('tr');
-    const columns = ['iteration', 'seconds', ...rows.flat()];
     head.append(...columns.map((c) => text('th', NAMES[c] || c, { scope: 'col' })));
     made.append(head);
     for (const entry of entries) {
@@ -95,6 +110,6 @@ class Curves {
       row.append(...columns.map((c) => text('td', c in entry ? shown(entry[c], c === 'iteration' || c === 'gaussians' ? 1 : 0) : '–')));
       made.append(row);
     }
-    this.table.replaceChildren(text('summary', 'As a table'), made);
+    this.table.replaceChildren(this.table.firstChild, made);
   }
 }

@@ -12,26 +12,51 @@ async function start() {
     arrays[name] = await decode(head, holder.textContent);
     holder.remove();
   }
-  show(known, arrays, maps);
+  await show(known, arrays, maps);
   document.documentElement.dataset.ready = 'yes';
-  if (known.live) follow(known.live, maps);
+  if (known.live) await follow(known.live, maps);
 }
 
-// Each part on its own: one that a browser cannot show leaves the others alone.
-function show(known, arrays, maps) {
+// The parts that something new is known of, one a frame. One that cannot be shown leaves the others alone.
+async function show(known, arrays, maps) {
   const make = {
     slices: () => new Slices(body('slices'), known.slices, arrays, maps),
     views: () => new Views(body('views'), known.views, arrays, maps),
     curves: () => new Curves(body('curves'), known.history),
     space: () => new Space(body('space'), known.space, arrays, maps),
   };
-  const given = { slices: known.slices, views: known.views, curves: known.history.length > 1, space: known.space };
+  const given = { slices: known.slices, views: known.views, curves: known.history?.length > 1 && known.history, space: known.space };
   for (const [name, build] of Object.entries(make)) {
     if (!given[name]) continue;
     document.getElementById(name).hidden = false;
-    if (parts[name]) parts[name].replace(name === 'curves' ? known.history : known[name], arrays);
-    else parts[name] = build();
+    await attempt(name, () => {
+      if (parts[name]) parts[name].replace(given[name], arrays);
+      else parts[name] = build();
+    });
+    if (!parts[name]) body(name).replaceChildren(text('p', `This part could not be shown: ${failed.get(name)}.`, { class: 'note' }));
+    await frame();
   }
+}
+
+const failed = new Map();
+
+// What an act gives; where it fails, that is said on the console, once for each name.
+async function attempt(name, act) {
+  try {
+    return await act();
+  } catch (error) {
+    if (!failed.has(name)) console.error(`${name} could not be shown:`, error);
+    failed.set(name, error.message);
+    return undefined;
+  }
+}
+
+// Until a picture may be drawn; a page that nobody sees draws none, so not for long.
+function frame() {
+  return new Promise((done) => {
+    requestAnimationFrame(done);
+    setTimeout(done, 100);
+  });
 }
 
 function body(name) {

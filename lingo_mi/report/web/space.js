@@ -9,15 +9,6 @@ class Space {
     this.note = text('p', '', { class: 'note' });
     root.replaceChildren(this.bar, this.stage, this.note);
     this.draw = onceAFrame(() => this.paint());
-    try {
-      this.renderer = new THREE.WebGLRenderer({ antialias: true });
-    } catch {
-      this.stage.remove();
-      this.note.textContent = 'This browser has no WebGL, so that the cloud cannot be shown in 3D.';
-      return;
-    }
-    this.stage.append(this.renderer.domElement);
-    this.renderer.domElement.setAttribute('aria-hidden', 'true');
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(35, 1, 1, 1e6);
     this.camera.up.set(0, 0, 1);
@@ -25,24 +16,31 @@ class Space {
     const light = new THREE.DirectionalLight(0xffffff, 1.6);
     light.position.set(-1, 1, 2);
     this.camera.add(light);
-    this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
+    this.controls = new THREE.OrbitControls(this.camera, this.stage);
     this.controls.addEventListener('change', this.draw);
     this.fill(arrays);
     this.listen();
     this.look();
     new ResizeObserver(this.draw).observe(this.stage);
+    // WebGL starts when the scene comes into sight: without a GPU that takes a second or more.
+    new IntersectionObserver((found) => {
+      this.seen = found[found.length - 1].isIntersecting;
+      this.draw();
+    }, { rootMargin: '200px' }).observe(this.stage);
   }
 
   replace(known, arrays) {
     this.known = known;
-    if (this.renderer) this.fill(arrays);
+    this.fill(arrays);
   }
 
   fill(arrays) {
     const { known } = this;
     for (const part of this.parts ? Object.values(this.parts) : []) {
       this.scene.remove(part);
-      part.geometry?.dispose();
+      part.geometry.dispose();
+      part.material.dispose();
+      part.dispose?.();
     }
     this.parts = {};
     this.said = [];
@@ -52,18 +50,16 @@ class Space {
     this.parts.Volume = lines(boxEdges(known.low, known.high), 0x8fa0b5);
     const start = { Points: true, Volume: true, Scanner: false };
     if (!known.cloud && (known.surfaces || []).length) start[known.surfaces[0].name] = true;
-    this.bar.replaceChildren();
     for (const [name, part] of Object.entries(this.parts)) {
       part.visible = this.shownAs[name] ?? start[name] ?? false;
+      this.make(part);
       this.scene.add(part);
-      this.bar.append(button(name, part.visible, (made) => {
-        part.visible = this.shownAs[name] = !part.visible;
-        made.setAttribute('aria-pressed', String(part.visible));
-        if (name === 'Scanner') this.look();
-        this.draw();
-      }));
     }
-    this.note.textContent = this.said.join(' ');
+    const names = Object.keys(this.parts);
+    if (names.join() !== [...this.bar.children].map((b) => b.textContent).join()) {
+      this.bar.replaceChildren(...names.map((name) => button(name, this.parts[name].visible, (made) => this.toggle(name, made))));
+    }
+    if (!this.failed) this.note.textContent = this.said.join(' ');
     this.draw();
   }
 
@@ -84,21 +80,28 @@ class Space {
     shape.setAttribute('color', new THREE.BufferAttribute(colour, 3));
     this.parts.Points = new THREE.Points(shape, new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }));
     if (cloud.ellipsoids) {
-      const ball = new THREE.IcosahedronGeometry(1, 1);
-      const material = new THREE.MeshLambertMaterial();
-      const many = new THREE.InstancedMesh(ball, material, count);
-      const matrix = new THREE.Matrix4();
-      for (let i = 0; i < count; i++) {
-        const at = (array, n) => Array.from({ length: n }, (_, k) => valueAt(array, i + count * k));
-        const size = at(scales, 3).map(Math.exp);
-        matrix.compose(new THREE.Vector3().fromArray(place, 3 * i), new THREE.Quaternion(...at(quaternions, 4)).normalize(), new THREE.Vector3(...size));
-        many.setMatrixAt(i, matrix);
-        many.setColorAt(i, new THREE.Color().fromArray(colour, 3 * i));
-      }
+      const many = new THREE.InstancedMesh(new THREE.IcosahedronGeometry(1, 1), new THREE.MeshLambertMaterial(), count);
+      many.userData.make = () => placeEllipsoids(many, place, colour, scales, quaternions);
       this.parts.Ellipsoids = many;
     }
     const some = cloud.total > count ? `${count.toLocaleString('en')} of ${cloud.total.toLocaleString('en')} Gaussians, chosen at random` : `${count.toLocaleString('en')} Gaussians`;
     this.said.push(`${some}, coloured by ${cloud.unit} from 0 (dark) to ${shown(cloud.top, cloud.top / 1000)} (bright); ellipsoids are one standard deviation.`);
+  }
+
+  toggle(name, made) {
+    const part = this.parts[name];
+    part.visible = this.shownAs[name] = !part.visible;
+    this.make(part);
+    made.setAttribute('aria-pressed', String(part.visible));
+    if (name === 'Scanner') this.look();
+    this.draw();
+  }
+
+  // What is not made before it is seen.
+  make(part) {
+    if (!part.visible || !part.userData.make) return;
+    part.userData.make();
+    delete part.userData.make;
   }
 
   addSurface(surface, arrays, i) {
@@ -173,9 +176,11 @@ class Space {
   }
 
   paint() {
-    if (!this.renderer) return;
+    if (this.failed) return;
     const width = Math.max(1, this.stage.clientWidth);
     const height = Math.max(1, Math.round(Math.min(width * 0.8, 620)));
+    this.stage.style.height = `${height}px`;
+    if (!this.seen || !this.start()) return;
     const ratio = Math.min(2, window.devicePixelRatio || 1);
     if (this.width !== width || this.ratio !== ratio) {
       Object.assign(this, { width, ratio });
@@ -186,6 +191,35 @@ class Space {
     }
     this.renderer.setClearColor(new THREE.Color(colourOf('--stage')));
     this.renderer.render(this.scene, this.camera);
+  }
+
+  // Whether there is WebGL.
+  start() {
+    if (this.renderer) return true;
+    try {
+      this.renderer = new THREE.WebGLRenderer({ antialias: true });
+    } catch {
+      this.failed = true;
+      this.bar.remove();
+      this.stage.remove();
+      this.note.textContent = 'This browser has no WebGL, so that the cloud cannot be shown in 3D.';
+      return false;
+    }
+    this.stage.append(this.renderer.domElement);
+    this.renderer.domElement.setAttribute('aria-hidden', 'true');
+    return true;
+  }
+}
+
+function placeEllipsoids(many, place, colour, scales, quaternions) {
+  const { count } = many;
+  const matrix = new THREE.Matrix4();
+  for (let i = 0; i < count; i++) {
+    const at = (array, n) => Array.from({ length: n }, (_, k) => valueAt(array, i + count * k));
+    const size = at(scales, 3).map(Math.exp);
+    matrix.compose(new THREE.Vector3().fromArray(place, 3 * i), new THREE.Quaternion(...at(quaternions, 4)).normalize(), new THREE.Vector3(...size));
+    many.setMatrixAt(i, matrix);
+    many.setColorAt(i, new THREE.Color().fromArray(colour, 3 * i));
   }
 }
 
