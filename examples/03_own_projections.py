@@ -12,10 +12,11 @@ arrays, or stored as `scan.npy` with the geometry in `scan.yml` beside it.
 import tempfile
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 import lingo_mi as lm
+
+# sphinx_gallery_thumbnail_path = 'figures/inspect.png'
 
 angles = np.radians(np.arange(30) * 12.0)
 geometry = lm.Geometry.cone(
@@ -32,6 +33,7 @@ counts = np.random.default_rng(0).poisson(I0 * np.exp(-exact))
 valid = counts > 0
 projections = np.log(I0 / np.maximum(counts, 1))
 scan = lm.Scan(geometry, projections, valid)
+scan
 
 # %%
 # Fit 24 of the views and look at the six that are left.
@@ -39,17 +41,7 @@ scan = lm.Scan(geometry, projections, valid)
 data = lm.Dataset(scan.subset(np.arange(30) % 5 != 4), scan.subset(np.arange(30) % 5 == 4))
 result = lm.fit(data, 'fast', iterations=300, n_points=4000)
 print(f'held-out views: {result.metrics()["psnr_2d"]:.1f} dB')
-
-rendered = result.render(data.test.geometry)
-volume = result.volume()
-fig, axes = plt.subplots(1, 3, figsize=(10, 3.2), layout='constrained')
-for axis, image, title in zip(axes, (data.test.projections[0], rendered[0]), ('held-out view', 'rendered')):
-    shown = axis.imshow(image, cmap='gray', vmin=0, vmax=rendered[0].max())
-    axis.set(title=title, xticks=[], yticks=[])
-fig.colorbar(shown, ax=axes[:2], label='line integral')
-shown = axes[2].imshow(volume[:, :, 24].T, origin='lower', cmap='gray', vmin=0, vmax=0.02)
-axes[2].set(title='slice of the volume', xticks=[], yticks=[])
-fig.colorbar(shown, ax=axes[2], label='attenuation [1/mm]')
+result
 
 # %%
 # As files: an array, and the geometry in TIGRE's names. Angles are in degrees in files.

@@ -29,6 +29,7 @@ geometry = lm.Geometry.cone(
 )
 data = lm.simulate(foot, geometry)
 result = lm.fit(data, 'fast', iterations=300, n_points=3000)
+data
 
 # %%
 # Five volumes of the same ten views. `start=result` hands the cloud's own volume over.

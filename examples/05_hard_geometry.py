@@ -21,6 +21,7 @@ angles = np.linspace(-2 * np.pi, 2 * np.pi, count, endpoint=False)
 scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(6, 6))
 grid = dict(nVoxel=foot.data.shape, dVoxel=foot.spacing)
 told = lm.Geometry.helix(**scanner, **grid, angles=angles, pitch=60)
+told
 
 # %%
 # What it really does: every view is turned and shifted a little. What all views have in common is taken off, for that is a

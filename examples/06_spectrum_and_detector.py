@@ -18,6 +18,7 @@ import lingo_mi as lm
 data = lm.simulate('effects/hardening', parameters=dict(pixels=72, pixel_size=4, voxels=48, voxel_size=160 / 48))
 spectrum = data.train.effects.tube.spectrum
 print(f'mean energy of the photons {spectrum.mean:.0f} keV')
+data
 
 # %%
 # One fit takes the projections for line integrals, as if photons had one energy; the other models the spectrum.

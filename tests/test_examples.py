@@ -1,5 +1,6 @@
 """Every example runs, with short fits: the gallery of the documentation runs them in full."""
 
+import ast
 import runpy
 import warnings
 from pathlib import Path
@@ -13,13 +14,18 @@ EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('[0-9]*.py'))
 NEEDS = {'06_spectrum_and_detector': ('spekpy', 'xraylib'), '07_pytorch': ('torch',)}
 
 
+def is_name(node):
+    """Whether a statement is a name alone, which a notebook shows."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
+
+
 def test_there_are_examples():
     assert len(EXAMPLES) >= 8
 
 
 @pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
 def test_example(path, variant, monkeypatch, tmp_path):
-    """Without an error, with a picture, and without a warning of matplotlib or NumPy."""
+    """Without an error, with something to see in each, and without a warning of matplotlib or NumPy."""
     for module in NEEDS.get(path.stem, ()):
         found = pytest.importorskip(module)
         if module == 'torch' and variant.startswith('cuda') and not found.cuda.is_available():
@@ -33,6 +39,8 @@ def test_example(path, variant, monkeypatch, tmp_path):
     pyplot.close('all')
     with warnings.catch_warnings():
         warnings.simplefilter('error', RuntimeWarning)
-        runpy.run_path(str(path), run_name='__main__')
-    assert pyplot.get_fignums(), 'an example shows something'
+        names = runpy.run_path(str(path), run_name='__main__')
+    shown = [names[node.value.id] for node in ast.parse(path.read_text(encoding='utf-8')).body if is_name(node)]
+    assert all('<figure' in display or '<svg' in display for display in (found._repr_html_() for found in shown))
+    assert shown or pyplot.get_fignums(), 'an example shows something'
     pyplot.close('all')
