@@ -17,7 +17,7 @@ class Space {
     light.position.set(-1, 1, 2);
     this.camera.add(light);
     this.controls = new THREE.OrbitControls(this.camera, this.stage);
-    this.controls.addEventListener('change', this.draw);
+    this.controls.addEventListener('change', () => this.move());
     this.fill(arrays);
     this.listen();
     this.look();
@@ -81,7 +81,10 @@ class Space {
     this.parts.Points = new THREE.Points(shape, new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }));
     if (cloud.ellipsoids) {
       const many = new THREE.InstancedMesh(new THREE.IcosahedronGeometry(1, 1), new THREE.MeshLambertMaterial(), count);
-      many.userData.make = () => placeEllipsoids(many, place, colour, scales, quaternions);
+      many.userData.make = () => {
+        if (this.software && count > 10_000) many.geometry = new THREE.IcosahedronGeometry(1, 0);
+        placeEllipsoids(many, place, colour, scales, quaternions);
+      };
       this.parts.Ellipsoids = many;
     }
     const some = cloud.total > count ? `${count.toLocaleString('en')} of ${cloud.total.toLocaleString('en')} Gaussians, chosen at random` : `${count.toLocaleString('en')} Gaussians`;
@@ -181,7 +184,8 @@ class Space {
     const height = Math.max(1, Math.round(Math.min(width * 0.8, 620)));
     this.stage.style.height = `${height}px`;
     if (!this.seen || !this.start()) return;
-    const ratio = Math.min(2, window.devicePixelRatio || 1);
+    const coarse = this.software && this.moving;
+    const ratio = Math.min(2, window.devicePixelRatio || 1) * (coarse ? 0.5 : 1);
     if (this.width !== width || this.ratio !== ratio) {
       Object.assign(this, { width, ratio });
       this.renderer.setPixelRatio(ratio);
@@ -190,7 +194,22 @@ class Space {
       this.camera.updateProjectionMatrix();
     }
     this.renderer.setClearColor(new THREE.Color(colourOf('--stage')));
+    const { Points, Ellipsoids } = this.parts;
+    const shown = [Points?.visible, Ellipsoids?.visible];
+    if (coarse && Ellipsoids?.visible) [Points.visible, Ellipsoids.visible] = [true, false];
     this.renderer.render(this.scene, this.camera);
+    if (Ellipsoids) [Points.visible, Ellipsoids.visible] = shown;
+  }
+
+  // Without a GPU, what turns is drawn with half as many pixels a side, and ellipsoids as points; all of it when it stands still.
+  move() {
+    this.moving = true;
+    clearTimeout(this.still);
+    this.still = setTimeout(() => {
+      this.moving = false;
+      this.draw();
+    }, 200);
+    this.draw();
   }
 
   // Whether there is WebGL.
@@ -205,6 +224,9 @@ class Space {
       this.note.textContent = 'This browser has no WebGL, so that the cloud cannot be shown in 3D.';
       return false;
     }
+    const gl = this.renderer.getContext();
+    const info = gl.getExtension('WEBGL_debug_renderer_info');
+    this.software = Boolean(info) && /swiftshader|llvmpipe|software|basic render/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
     this.stage.append(this.renderer.domElement);
     this.renderer.domElement.setAttribute('aria-hidden', 'true');
     return true;
