@@ -36,10 +36,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
     'equal': dict(stop='off'),
     'stopped': dict(stop='on'),
     'noise': dict(stop='off', weights='noise'),
-    'variance': dict(stop='off', weights='variance'),
 }
 
-WEIGHTS = dict(noise='weights 1 / s', variance='weights 1 / s^2')
+WEIGHTED = 'noise'
 
 
 @dataclass(frozen=True)
@@ -127,17 +126,17 @@ class Study:
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB of the volume (after so many steps)."""
         cells = {case: {name: cell for name in SETTINGS if (cell := self.get(case, name))} for case in cases}
-        weighed = [name for name in WEIGHTS if any(name in found for found in cells.values())]
+        weighed = any(WEIGHTED in found for found in cells.values())
         heads = ['all steps', 'best of all steps', '**stopped**', 'behind the best']
-        heads += [head for name in weighed for head in (f'{WEIGHTS[name]}, all steps', f'{WEIGHTS[name]}, best')]
+        heads += ['weights 1 / s, all steps', 'weights 1 / s, best'] * weighed
         lines = [f'| object | scanned | photons | {" | ".join(heads)} |', '|---|---:|---:|' + '---:|' * len(heads)]
         for case, found in cells.items():
             if 'equal' not in found:
                 continue
             row, top = [_shown(*_last(found['equal'])), _shown(*_best(found['equal']))], _best(found['equal'])[0]
             row += ['–', '–'] if 'stopped' not in found else _stopped(found['stopped'], top)
-            for name in weighed:
-                row += [_shown(*of(found[name])) if name in found else '–' for of in (_last, _best)]
+            if weighed:
+                row += [_shown(*of(found[WEIGHTED])) if WEIGHTED in found else '–' for of in (_last, _best)]
             lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(row)} |')
         return '\n'.join(lines)
 

@@ -5,7 +5,7 @@
 
 Simulated scans are cone beams over a full turn, with 4 as the largest line integral, of objects on --finer times as many voxels
 a side as are reconstructed. The recipe is fast: all its steps, with the volume compared with the truth every 50; stopped by views
-that it holds out; and with pixels weighed by the noise's standard deviation or variance. Each fit is stored when it is done; the
+that it holds out; and with pixels weighed by the noise's standard deviation. Each fit is stored when it is done; the
 same command goes on after an interruption. The table, as Markdown, is renewed after each, with its provenance.
 """
 
@@ -18,7 +18,7 @@ from lingo_mi.file_access import require_writable, write_text
 from lingo_mi.folder_lock import locked
 from lingo_mi.runtime import use_variant
 
-SETTINGS = 'equal', 'stopped', 'noise', 'variance'
+SETTINGS = 'equal', 'stopped', 'noise'
 
 
 def arguments() -> argparse.Namespace:

@@ -28,8 +28,7 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
     A weight is 1 / (standard deviation of the pixel's noise), so that all weighted pixels have the same noise. (Its square is
     the weight of penalised weighted least squares: Sauer and Bouman, IEEE Trans. Signal Process. 41, 1993.) The noise is
     computed from the mean signal of 3 x 3 valid pixels: from the pixel alone, a pixel that is dark by chance would weigh less
-    than a bright one. The weights are scaled to keep the largest projection, to which SSIM's constants refer. With
-    weights='variance' they are that square, for photons alone exp(-p), and their mean is 1.
+    than a bright one. The weights are scaled to keep the largest projection, to which SSIM's constants refer.
 
     Raises InputError for a scan with neither a photon count nor a bit depth.
     """
@@ -37,17 +36,12 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
         return None
     detector = scan.effects.detector if scan.effects else None
     if not (detector and (detector.photons or detector.bits)):
-        raise InputError(
-            f'weights={settings.loss.weights} needs a ct_detector with photons or bits in the scene, or leave it out'
-        )
+        raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
     p = scan.projections
     valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
     size: Any = 0, 3, 3  # SciPy declares one number
     light, share = (ndimage.uniform_filter(a, size, mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
     weights = 1 / detector.deviation(light / np.maximum(share, 0.1))
-    if settings.loss.weights == 'variance':
-        weights = weights**2
-        return (weights / weights.mean()).astype(np.float32)
     return (weights * (p.max() / (weights * p).max())).astype(np.float32)
 
 

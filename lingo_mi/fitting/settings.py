@@ -96,7 +96,7 @@ class LossSettings:
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
     weights            'equal'; or 'noise' (own): rendered and measured pixels are divided by the standard deviation of their
-                       noise (from the scan's `ct_detector`) before comparison; or 'variance' (own): by its square
+                       noise (from the scan's `ct_detector`) before comparison
     loss_scale         'none'; 'dynamic': the paper's factor T_g + 1 / (4 T_g) on the whole loss; 'statistic': the same
                        factor on the densification statistic only (Adam cancels a constant factor of the loss)
     """
@@ -117,10 +117,7 @@ class LossSettings:
             self.lambda_l1 + self.lambda_ssim + self.lambda_gradient > 0,
             'one of lambda_l1, lambda_ssim and lambda_gradient must be above 0: nothing else compares with the projections',
         )
-        _require(
-            self.weights in ('equal', 'noise', 'variance'),
-            f"weights is 'equal', 'noise' or 'variance', not {self.weights!r}",
-        )
+        _require(self.weights in ('equal', 'noise'), f"weights is 'equal' or 'noise', not {self.weights!r}")
         _require(
             self.loss_scale in ('none', 'dynamic', 'statistic'),
             f"loss_scale is 'none', 'dynamic' or 'statistic', not {self.loss_scale!r}",
