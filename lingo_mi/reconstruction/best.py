@@ -147,9 +147,10 @@ class Best(Algorithm):
         plan.append(own)
         if self.finer > 1:
             plan.append(self._try(kept, held_out, plain, REFINED, self.finer, count, beat=own.score, by=TRIAL))
+        ahead = any(min(trial.scores[:TRIAL]) < own.score for trial in plan[2:])
+        if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
+            plan[1] = self._try(kept, held_out, plain, REFINED, 1, count)
         best = min(plan[1:], key=lambda trial: trial.score)
-        if best is own and own.niter == TRIAL < self.niter:  # it was cut short
-            plan[1] = best = self._try(kept, held_out, plain, REFINED, 1, count)
         if best.niter < self.niter // 2:
             plan.append(self._try(kept, held_out, plain, SMOOTHED, best.finer, count))
         return plan

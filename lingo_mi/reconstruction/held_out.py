@@ -24,6 +24,7 @@ from lingo_mi.reconstruction.system import evaluated
 from lingo_mi.scan import Scan
 
 LEAST_VIEWS = 4
+NEAR = 1.03  # times another trial's score, which may still be beaten in the passes that follow
 PATIENCE = 3  # passes without a better score, after which a trial ends
 
 
@@ -114,7 +115,7 @@ class Watch:
     """The `watch` of `ASDPOCS.run` that scores a trial after every pass, and keeps its best volume.
 
     score    of the held-out views, on the trial's voxels
-    beat     score to beat by the pass `by`, else the trial ends there; None: it goes on
+    beat     score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on
     """
 
     def __init__(self, score: Score, trial: Trial, beat: float | None = None, by: int = 0):
@@ -125,6 +126,6 @@ class Watch:
         trial.scores.append(self.score(x))
         if trial.niter == done:
             trial.volume = x.numpy().reshape(self.score.size)
-        if self.beat is not None and done == self.by and trial.score >= self.beat:
+        if self.beat is not None and done == self.by and trial.score >= NEAR * self.beat:
             return True
         return done - trial.niter >= PATIENCE
