@@ -1,8 +1,8 @@
 """How long a frame of report.html takes in headless Chromium without a GPU: the table of the page `how_to/look.md`.
 
 pip install -e '.[browser]'
-lingo-mi fit x3d_foot --out out/foot
-python docs/measure_frames.py out/foot/report.html
+lingo-mi fit x3d_foot
+python docs/measure_frames.py out/x3d_foot/report.html
 """
 
 import shutil
