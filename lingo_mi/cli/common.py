@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from lingo_mi.errors import InputError, brief, shown
-from lingo_mi.file_access import leftovers, require_writable
+from lingo_mi.file_access import leftovers, require_writable, write_text
 from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import noticed
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
@@ -293,3 +293,26 @@ def writable_file(path: Path, force: bool) -> Path:
         raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
     require_writable(path.parent, path, 'choose another --out')
     return path
+
+
+@contextmanager
+def renewed_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[str], None]]:
+    """The table of a study that stores its cells one by one, as Markdown in a file whose folder is locked meanwhile.
+
+    Gives a function to call with a line after each cell: it prints the line and writes the table anew. At the end the table is
+    printed, and its provenance is written beside it. After KeyboardInterrupt the same command goes on.
+    """
+    from lingo_mi.studies.provenance import write_provenance
+
+    def renew(line: str) -> None:
+        print(line, flush=True)
+        write_text(file, table() + '\n')
+
+    with locked(file.parent):
+        try:
+            yield renew
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt('the same command goes on from here') from None
+        write_text(file, table() + '\n')
+        write_provenance(file)
+    print(table())

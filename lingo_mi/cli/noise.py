@@ -12,10 +12,9 @@ same command goes on after an interruption. The table, as Markdown, is renewed a
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, renewed_table
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
-from lingo_mi.folder_lock import locked
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 SETTINGS = 'equal', 'stopped', 'noise'
@@ -53,24 +52,11 @@ def main() -> None:
             raise InputError(f'{name} must be from {low} to {high:g}, not {" ".join(map(str, values))}')
     use_variant(args.variant)
     from lingo_mi.studies.noise import Case, Study
-    from lingo_mi.studies.provenance import write_provenance
     from lingo_mi.studies.tables.objects import available
 
     names = available(args.objects, print)
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size, args.pixels, args.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
-    table = args.out / 'noise.md'
-    with locked(args.out):
-
-        def renew(line: str) -> None:
-            print(line, flush=True)
-            write_text(table, study.table(cases) + '\n')
-
-        try:
-            study.compute_missing(cases, args.settings, renew)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt('the same command goes on from here') from None
-        write_text(table, study.table(cases) + '\n')
-        write_provenance(table)
-    print(study.table(cases))
+    with renewed_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
+        study.compute_missing(cases, args.settings, renew)

@@ -14,10 +14,9 @@ Seconds are those of the processor, all its cores together; of settings with a c
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, renewed_table
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
-from lingo_mi.folder_lock import locked
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 
@@ -45,7 +44,6 @@ def main() -> None:
     if not all(value == 0 or 1 <= value <= 1e12 for value in args.photons):
         raise InputError(f'--photons must be 0, or from 1 to 1e12, not {" ".join(map(str, args.photons))}')
     use_variant(args.variant)
-    from lingo_mi.studies.provenance import write_provenance
     from lingo_mi.studies.regret import MEASURED, Case, Study
     from lingo_mi.studies.tables.objects import available
 
@@ -54,17 +52,5 @@ def main() -> None:
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size)
     cases = [Case(n, f, v, p) for n in names for f in args.finer for v in args.views for p in args.photons]
-    table = args.out / 'regret.md'
-    with locked(args.out):
-
-        def renew(line: str) -> None:
-            print(line, flush=True)
-            write_text(table, study.table(cases) + '\n')
-
-        try:
-            study.compute_missing(cases, args.clouds, renew)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt('the same command goes on from here') from None
-        write_text(table, study.table(cases) + '\n')
-        write_provenance(table)
-    print(study.table(cases))
+    with renewed_table(args.out / 'regret.md', lambda: study.table(cases)) as renew:
+        study.compute_missing(cases, args.clouds, renew)
