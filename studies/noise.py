@@ -10,7 +10,6 @@ A cell is one fit of one scan by the recipe `fast`: a JSON file, written atomica
 from __future__ import annotations
 
 import functools
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -22,12 +21,12 @@ import numpy as np
 
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.file_access import write_text
 from lingo_mi.fitting import loop
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.scan import Scan
+from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.regret import simulated
 
@@ -64,21 +63,18 @@ class Study:
     """
 
     def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = FAST.iterations):
-        self.folder, self.size, self.pixels, self.iterations = Path(folder), size, pixels, iterations
+        self.size, self.pixels, self.iterations = size, pixels, iterations
+        self.cells = CellFiles(folder, 'steps', 'psnr_3d')
         self.dataset = functools.lru_cache(1)(self._dataset)
 
-    def path(self, case: Case, setting: str) -> Path:
+    def name(self, case: Case) -> str:
         scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
         steps = '' if self.iterations == FAST.iterations else f'_{self.iterations}_steps'
-        return self.folder / f'{scan}{steps}' / f'{setting}.json'
+        return f'{scan}{steps}'
 
     def get(self, case: Case, setting: str) -> dict | None:
         """A stored cell, or None where there is none that can be read."""
-        try:
-            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
-        except (FileNotFoundError, ValueError):
-            return None
-        return found if isinstance(found, dict) and {'steps', 'psnr_3d'} <= found.keys() else None
+        return self.cells.get(self.name(case), setting)
 
     def compute_missing(
         self, cases: Iterable[Case], settings: Iterable[str], say: Callable[[str], object] = lambda line: None
@@ -90,9 +86,7 @@ class Study:
                     found = self._compute(case, setting)
                     last, best = found['psnr_3d'][-1], max(found['psnr_3d'])
                     say(f'{case}, {setting}: {last:.2f} dB after {found["steps"][-1]} steps, at best {best:.2f}')
-                    path = self.path(case, setting)
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    write_text(path, json.dumps(found) + '\n')
+                    self.cells.put(self.name(case), setting, found)
 
     def _compute(self, case: Case, setting: str) -> dict:
         scan, truth = self.dataset(case)

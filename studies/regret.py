@@ -10,7 +10,6 @@ A cell is one setting on one scan: a JSON file, written atomically. A stored cel
 from __future__ import annotations
 
 import functools
-import json
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
@@ -22,7 +21,6 @@ from scipy.stats import spearmanr
 
 from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
@@ -36,6 +34,7 @@ from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import choose_views
+from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.tables.objects import averaged, load_object
 
@@ -72,21 +71,16 @@ class Study:
     """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of 5/3 as many pixels."""
 
     def __init__(self, folder: Path, size: int = 48):
-        self.folder, self.size = Path(folder), size
+        self.size, self.cells = size, CellFiles(folder, 'psnr_3d', 'seconds')
         self.dataset = functools.lru_cache(1)(self._dataset)
         self._cloud = functools.lru_cache(1)(self._fitted)
 
-    def path(self, case: Case, setting: str) -> Path:
-        scan = f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
-        return self.folder / scan / f'{setting}.json'
+    def name(self, case: Case) -> str:
+        return f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
 
     def get(self, case: Case, setting: str) -> dict | None:
         """A stored cell, or None where there is none that can be read."""
-        try:
-            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
-        except (FileNotFoundError, ValueError):
-            return None
-        return found if isinstance(found, dict) and {'psnr_3d', 'seconds'} <= found.keys() else None
+        return self.cells.get(self.name(case), setting)
 
     def compute_missing(
         self, cases: Iterable[Case], clouds: bool, say: Callable[[str], object] = lambda line: None
@@ -97,9 +91,7 @@ class Study:
                 if self.get(case, setting) is None:
                     found = self._compute(case, setting)
                     say(f'{case}, {setting}: {found["psnr_3d"]:.2f} dB, {found["seconds"]:.1f} s')
-                    path = self.path(case, setting)
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    write_text(path, json.dumps(found, indent=1) + '\n')
+                    self.cells.put(self.name(case), setting, found)
 
     def _compute(self, case: Case, setting: str) -> dict:
         dataset = self.dataset(case)

@@ -21,6 +21,7 @@ COMMANDS = {
     'gradcheck': "check the derivatives of a scene's image against differences",
     'recipes': 'compare recipes: quality against time',
     'regret': 'measure how far the choice of best is behind the best fixed setting',
+    'peers': 'compare volumes of one scan with those of RTK and MBIRJAX',
     'noise': 'measure what an early stop and weights are worth to a fit of noisy projections',
     'tables': "regenerate the paper's tables",
     'accuracy': 'measure what accuracy costs in time',

@@ -73,6 +73,26 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     return array(reconstruction.GetOutput(), itk).copy()
 
 
+def total_variation(scan: Scan, itk: Any, alpha: float = 1.0, beta: float = 1000.0, niter: int = 20) -> np.ndarray:
+    """Volume [x, y, z] by RTK's ADMM with total variation: the least of |A x - b|^2 + alpha TV(x).
+
+    beta    weight of the split gradient; it changes how fast, not where to
+    niter   outer iterations, with four conjugate gradients each
+    """
+    geometry = scan.geometry
+    solver = itk.RTK.ADMMTotalVariationConeBeamReconstructionFilter[itk.Image[itk.F, 3]].New()
+    solver.SetInput(0, volume_image(np.zeros(geometry.nVoxel), geometry, itk))
+    solver.SetInput(1, projection_image(scan.projections, geometry, itk))
+    solver.SetGeometry(gantry(geometry, itk))
+    solver.SetGatingWeights([1.0] * len(geometry))  # without a filter in between, it loses its projections (2.7)
+    solver.SetAlpha(alpha)
+    solver.SetBeta(beta)
+    solver.SetAL_iterations(niter)
+    solver.SetCG_iterations(4)
+    solver.Update()
+    return array(solver.GetOutput(), itk).copy()
+
+
 def project(volume: np.ndarray, geometry: Geometry, itk: Any) -> np.ndarray:
     """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
     zeros = np.zeros((len(geometry), *geometry.nDetector))

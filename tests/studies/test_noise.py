@@ -33,7 +33,7 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     assert stopped['psnr_3d'][-1] == pytest.approx(cells['equal']['psnr_3d'][stopped['steps'][-1] // 50 - 1], abs=1e-3)
     row = (tmp_path / 'noise.md').read_text().splitlines()[-1]
     assert row.startswith('| foot | x1 | 500 |') and row in text and '–' not in row
-    study.path(case, 'noise').write_text(json.dumps(cells['noise'] | dict(psnr_3d=[1.0, 2.0])))
+    study.cells.path(study.name(case), 'noise').write_text(json.dumps(cells['noise'] | dict(psnr_3d=[1.0, 2.0])))
     code, text, err = noise(monkeypatch, capsys, *given, '--variant', 'llvm_ad_mono')
     assert code == 0 and '2.00 (100)' in text, err
 

@@ -44,9 +44,9 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     assert row.startswith('| foot | x1 | 6 | no noise |') and f'| {behind:+.2f} |' in row and row in text
     assert row.count('–') == len(CLOUDS)
     assert json.loads((tmp_path / 'regret.provenance.json').read_text())['command'].split()[0].endswith('regret.py')
-    kept = study.path(case, 'refined')
+    kept = study.cells.path(study.name(case), 'refined')
     kept.write_text(json.dumps(cells['refined'] | dict(psnr_3d=99.0)))
-    study.path(case, BEST).write_text('{')  # cut short: computed again
+    study.cells.path(study.name(case), BEST).write_text('{')  # cut short: computed again
     code, text, err = regret(monkeypatch, capsys, *command)
     assert code == 0 and '99.00' in text and f'{cells[BEST]["psnr_3d"]:.2f} (' in text, err
 

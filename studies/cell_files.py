@@ -1,0 +1,36 @@
+"""Cells of a study below a folder: a JSON file each, written atomically, so that a study goes on where it was stopped.
+
+cells = CellFiles(Path('out/regret'), 'psnr_3d', 'seconds')
+cells.put('foot', 'best', dict(psnr_3d=36.9, seconds=120.0))
+cells.get('foot', 'best')
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from lingo_mi.file_access import write_text
+
+
+class CellFiles:
+    """The cells below a folder. needed: keys without which a file is no cell."""
+
+    def __init__(self, folder: Path, *needed: str):
+        self.folder, self.needed = Path(folder), needed
+
+    def path(self, case: str, setting: str) -> Path:
+        return self.folder / case / f'{setting}.json'
+
+    def get(self, case: str, setting: str) -> dict | None:
+        """A stored cell, or None where there is none that can be read."""
+        try:
+            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
+        except (FileNotFoundError, ValueError):
+            return None
+        return found if isinstance(found, dict) and found.keys() >= set(self.needed) else None
+
+    def put(self, case: str, setting: str, found: dict) -> None:
+        path = self.path(case, setting)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(found, indent=1) + '\n')

@@ -1,0 +1,215 @@
+"""Volumes of one scan by this package and by its neighbours, compared where no truth is known.
+
+Every method reconstructs from a few of the measured views. Its volume is measured by what it predicts of the views that are left
+(exact line integrals of its trilinear interpolant), and against a reference: the true volume, or the FDK of all views.
+
+A cell is one method on so many views: its numbers as JSON, written atomically, and its volume as NIfTI beside it. A stored cell
+is not computed again.
+
+    study = Study(dataset, Path('out/peers'))
+    study.compute_missing(['fdk', 'best', 'rtk-tv'], [15, 30])
+    print(study.table(['fdk', 'best', 'rtk-tv'], [15, 30]))
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run as fit
+from lingo_mi.fitting.recipes import FAST
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.projectors import grid
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.simulate import choose_views
+from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
+from lingo_mi.studies.cell_files import CellFiles
+from lingo_mi.studies.provenance import provenance
+
+REFERENCE = 'reference'
+MBIRJAX_DEVICES = 'MBIRJAX_NUM_CPU_DEVICES'
+
+
+def _cloud(scan: Scan) -> Fitted:
+    return fit(scan, FAST, initial_cloud(scan, FAST, 0), 0)
+
+
+def _fast(scan: Scan) -> np.ndarray:
+    volume = _cloud(scan).volume(scan.geometry)
+    assert volume is not None  # fast has densities
+    return volume
+
+
+def _refined_cloud(scan: Scan) -> np.ndarray:
+    cloud = _cloud(scan)
+
+    def sample(geometry: Geometry) -> np.ndarray:
+        volume = cloud.volume(geometry)
+        assert volume is not None  # as above
+        return volume
+
+    return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=sample).volume
+
+
+def _itk() -> Any:
+    itk = importlib.import_module('itk')
+    itk.RTK  # noqa: B018 - loads it
+    itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(_cores())
+    return itk
+
+
+def _mbirjax() -> Any:
+    os.environ.setdefault(MBIRJAX_DEVICES, '1')  # one device with all cores: as many devices as cores are slower
+    return importlib.import_module('mbirjax')
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
+# By name: what it is called in the table, and the volume [x, y, z] of a scan.
+METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
+    'fdk': ('FDK', lambda scan: FDK().run(scan).volume),
+    'sart': ('SART', lambda scan: SART().run(scan).volume),
+    'asd-pocs': ('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
+    'rtk-tv': ('RTK, total variation', lambda scan: rtk_bridge.total_variation(scan, _itk())),
+    'mbirjax': ('MBIRJAX', lambda scan: mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=1.0)),
+    'fast': ("`fast`, the cloud's volume", _fast),
+    'refined': ('`fast`, then `refined`', _refined_cloud),
+    'best': ('`best`', lambda scan: Best().run(scan).volume),
+}
+NEEDS = {
+    'rtk-tv': (_itk, "RTK: pip install -e '.[reference]'"),
+    'mbirjax': (_mbirjax, "MBIRJAX: pip install -e '.[reference]'"),
+}
+
+
+def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
+    """The methods that can run here; `say` is called with a line for each that cannot. Raises InputError where none can."""
+    found = []
+    for name in names:
+        load, what = NEEDS.get(name, (None, ''))
+        try:
+            if load:
+                load()
+            found.append(name)
+        except (ImportError, AttributeError):
+            say(f'{name}: left out, it needs {what}')
+    if not found:
+        raise InputError('none of the --methods is installed')
+    return found
+
+
+class Study:
+    """The cells of one scan below a folder.
+
+    dataset   all measured views to choose from, and the true volume, if known
+    """
+
+    def __init__(self, dataset: Dataset, folder: Path):
+        self.dataset, self.folder = dataset, Path(folder)
+        self.cells = CellFiles(folder, 'held_out_rms', 'psnr_3d', 'seconds')
+
+    def compute_missing(
+        self, methods: Iterable[str], views: Iterable[int], say: Callable[[str], object] = lambda line: None
+    ) -> None:
+        """Compute and store the cells that are missing: of every number of views, every method."""
+        methods = list(methods)
+        for count in views:
+            chosen = choose_views(self.dataset, count)
+            for method in methods:
+                if self.cells.get(_case(count), method) is None:
+                    found = self._compute(chosen, method)
+                    say(
+                        f'{count} views, {method}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
+                        f'{found["seconds"]:.0f} s'
+                    )
+                    self.cells.put(_case(count), method, found)
+
+    def volume(self, views: int, method: str) -> np.ndarray:
+        """The volume [x, y, z] of a stored cell."""
+        return read_volume(self._volume_path(_case(views), method)).data
+
+    def reference(self) -> np.ndarray:
+        """The volume [x, y, z] that all are compared with."""
+        if self.dataset.volume is not None:
+            return self.dataset.volume
+        path = self.folder / f'{REFERENCE}.nii.gz'
+        if not path.exists():
+            FDK().run(self.dataset.train).save(path)
+        return read_volume(path).data
+
+    def _compute(self, chosen: Dataset, method: str) -> dict:
+        assert chosen.test is not None  # the views that were not chosen
+        began, processor = time.perf_counter(), time.process_time()
+        volume = METHODS[method][1](chosen.train)
+        seconds, processor = time.perf_counter() - began, time.process_time() - processor
+        wrong = grid.project(volume, chosen.test.geometry) - chosen.test.projections
+        Reconstruction(volume, [], seconds, chosen.train.geometry).save(
+            self._volume_path(_case(len(chosen.train)), method), force=True
+        )
+        return dict(
+            views=len(chosen.train),
+            method=method,
+            held_out_rms=float(np.sqrt(np.mean(wrong.astype(float) ** 2))),
+            psnr_3d=psnr_3d(volume, self.reference()),
+            seconds=seconds,
+            processor_seconds=processor,
+            provenance=provenance(),
+        )
+
+    def _volume_path(self, case: str, method: str) -> Path:
+        return self.folder / case / f'{method}.nii.gz'
+
+    def table(self, methods: Sequence[str], views: Iterable[int]) -> str:
+        """The Markdown table of the cells that are there, a row a method of every number of views."""
+        lines = ['| views | method | held-out rms | volume, dB | s | processor s |', '|---:|---|---:|---:|---:|---:|']
+        for count in views:
+            found = {method: cell for method in methods if (cell := self.cells.get(_case(count), method))}
+            least = min((cell['held_out_rms'] for cell in found.values()), default=0.0)
+            for method, cell in found.items():
+                rms = f'{cell["held_out_rms"]:.4f}'
+                lines.append(
+                    f'| {count} | {METHODS[method][0]} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '
+                    f'| {cell["psnr_3d"]:.2f} | {cell["seconds"]:.0f} | {cell["processor_seconds"]:.0f} |'
+                )
+        return '\n'.join(lines)
+
+    def draw(self, methods: Sequence[str], views: Sequence[int], path: Path) -> None:
+        """Picture of the middle slice across z: a column a method, a row a number of views; the reference on the left."""
+        from matplotlib.figure import Figure  # half a second that a study need not wait for
+
+        reference = self.reference()
+        middle = reference.shape[2] // 2
+        top = float(np.quantile(reference[:, :, middle], 0.995))
+        figure = Figure(figsize=(2.1 * (len(methods) + 1), 2.2 * len(views)), layout='constrained')
+        axes = figure.subplots(len(views), len(methods) + 1, squeeze=False)
+        for row, count in zip(axes, views):
+            for axis, name in zip(row, [REFERENCE, *methods]):
+                axis.set(xticks=[], yticks=[])
+                axis.spines[:].set_visible(False)
+                if name != REFERENCE and self.cells.get(_case(count), name) is None:
+                    continue
+                shown = reference if name == REFERENCE else self.volume(count, name)
+                axis.imshow(shown[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
+            row[0].set_ylabel(f'{count} views')
+        for axis, title in zip(axes[0], ['reference', *(METHODS[name][0].replace('`', '') for name in methods)]):
+            axis.set_title(title, fontsize=9)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=90)
+
+
+def _case(views: int) -> str:
+    return f'{views}_views'

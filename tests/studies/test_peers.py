@@ -1,0 +1,94 @@
+"""`lingo-mi peers`: its numbers against their definitions, kept cells, missing packages, bad input in one line."""
+
+import json
+import runpy
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from helpers.script import FIT
+from lingo_mi.files.scans import read_scan
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.metrics import psnr_3d
+from lingo_mi.projectors import grid
+
+SIZES = dict(DSO=200.0, DSD=300.0, dDetector=3.0)
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A measured scan of a smooth object, as the file of a walnut."""
+    volume = np.zeros((16, 16, 16), np.float32)
+    volume[4:12, 5:10, 3:12] = 0.03
+    volume = gaussian_filter(volume, 1.5)
+    geometry = Geometry.cone(nDetector=24, nVoxel=16, dVoxel=2.4, angles=circular(12), **SIZES)
+    views = grid.project(volume, geometry)[:, :, ::-1]
+    path = tmp_path / 'scan.npz'
+    np.savez(path, projections=views, angles=np.degrees(geometry.angles) - 90, air=0.0, **SIZES)
+    return path
+
+
+@pytest.fixture
+def peers(monkeypatch, capsys, tmp_path, scan):
+    """Exit code, standard output and standard error of `peers.py ARGS` on that scan."""
+
+    def run(*args, missing=()):
+        for name in missing:
+            monkeypatch.setitem(sys.modules, name, None)
+        small = '-D', f'projections={scan}', '-D', 'voxels=16', '-D', 'voxel=2.4'
+        monkeypatch.setattr(
+            sys, 'argv', ['peers.py', 'walnut', *small, *map(str, args), '--out', str(tmp_path / 'out')]
+        )
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_path(str(FIT.with_name('peers.py')), run_name='__main__')
+        return stop.value.code, *capsys.readouterr()
+
+    return run
+
+
+def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
+    command = '--views', 5, 6, '--methods', 'fdk', 'asd-pocs'
+    code, text, err = peers(*command)
+    assert code == 0, err
+    folder = tmp_path / 'out' / 'walnut_16_16_16'
+    train = read_scan(scan).train
+    cell = json.loads((folder / '6_views' / 'asd-pocs.json').read_text())
+    found = read_volume(folder / '6_views' / 'asd-pocs.nii.gz').data
+    reference = read_volume(folder / 'reference.nii.gz').data
+    geometry = train.geometry.with_volume((16,) * 3, (2.4,) * 3)
+    wrong = grid.project(found, geometry.subset(slice(1, None, 2))) - train.projections[1::2]
+    assert cell['held_out_rms'] == pytest.approx(np.sqrt(np.mean(wrong.astype(float) ** 2)), rel=1e-5)
+    assert cell['psnr_3d'] == pytest.approx(psnr_3d(found, reference), abs=1e-4)
+    assert (folder / 'slices.png').stat().st_size > 1000
+    (folder / '6_views' / 'fdk.json').write_text(json.dumps(cell | dict(method='fdk', held_out_rms=0.5)))
+    code, text, err = peers(*command)
+    assert code == 0 and '| 6 | FDK | 0.5000 |' in text and '6 views, asd-pocs' not in text, err
+
+
+def test_missing_peers_are_left_out(peers):
+    code, text, err = peers('--views', 4, '--methods', 'fdk', 'rtk-tv', 'mbirjax', missing=('itk', 'mbirjax'))
+    assert code == 0 and 'rtk-tv: left out' in text and 'mbirjax: left out' in text and '| 4 | FDK |' in text, err
+    code, text, err = peers('--views', 4, '--methods', 'rtk-tv', missing=('itk',))
+    assert code == 2 and err == 'error: none of the --methods is installed\n'
+
+
+@pytest.mark.parametrize('method, module', [('rtk-tv', 'itk'), ('mbirjax', 'mbirjax')])
+def test_peers(peers, tmp_path, method, module):
+    found = pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[reference]'")
+    if module == 'itk' and not hasattr(found, 'RTK'):
+        pytest.skip("ITK has no RTK: pip install -e '.[reference]'")
+    code, text, err = peers('--views', 6, '--methods', 'sart', method)
+    assert code == 0, err
+    folder = tmp_path / 'out' / 'walnut_16_16_16' / '6_views'
+    ours, theirs = (json.loads((folder / f'{name}.json').read_text()) for name in ('sart', method))
+    assert theirs['held_out_rms'] < 2 * ours['held_out_rms'] and theirs['psnr_3d'] > ours['psnr_3d'] - 4
+
+
+@pytest.mark.parametrize('args', [('--views', 3), ('--views', 12), ('--methods', 'magic'), ('-D', 'voxels=none')])
+def test_bad_input(peers, tmp_path, args):
+    code, _, err = peers(*args)
+    assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not (tmp_path / 'out').exists()
