@@ -73,11 +73,11 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     return array(reconstruction.GetOutput(), itk).copy()
 
 
-def total_variation(scan: Scan, itk: Any, alpha: float = 1.0, beta: float = 1000.0, niter: int = 20) -> np.ndarray:
+def total_variation(scan: Scan, itk: Any, alpha: float = 0.1, beta: float = 10.0, niter: int = 20) -> np.ndarray:
     """Volume [x, y, z] by RTK's ADMM with total variation: the least of |A x - b|^2 + alpha TV(x).
 
     beta    weight of the split gradient; it changes how fast, not where to
-    niter   outer iterations, with four conjugate gradients each
+    niter   outer iterations, with ten conjugate gradients each
     """
     geometry = scan.geometry
     solver = itk.RTK.ADMMTotalVariationConeBeamReconstructionFilter[itk.Image[itk.F, 3]].New()
@@ -88,7 +88,7 @@ def total_variation(scan: Scan, itk: Any, alpha: float = 1.0, beta: float = 1000
     solver.SetAlpha(alpha)
     solver.SetBeta(beta)
     solver.SetAL_iterations(niter)
-    solver.SetCG_iterations(4)
+    solver.SetCG_iterations(10)
     solver.Update()
     return array(solver.GetOutput(), itk).copy()
 

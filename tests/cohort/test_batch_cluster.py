@@ -101,8 +101,9 @@ def test_a_worker_is_killed(home):
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGKILL])
 def test_the_command_is_stopped(home, how):
     """After Ctrl-C every worker stops with a checkpoint, after `kill -9` at its next report; the same command ends the list."""
-    rows = home / 'list.csv'  # of longer fits: workers hear of a killed command after a second or so
-    rows.write_text(rows.read_text().replace(',400,', ',2000,'))
+    if 'LINGO_MI_CUDA_STAND_IN' not in os.environ:  # where 400 steps take long
+        rows = home / 'list.csv'  # of longer fits: workers hear of a killed command after a second or so
+        rows.write_text(rows.read_text().replace(',400,', ',2000,'))
     with cluster(home, workers=2) as (address, _):
         batch = start(home, address)
         wait_until(lambda: half_done(home) or batch.poll() is not None)
