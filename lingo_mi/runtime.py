@@ -18,6 +18,11 @@ LLVM_HELP = (
 )
 
 
+def cores() -> int:
+    """The processor's cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+
+
 def find_libllvm() -> str | None:
     """Point DRJIT_LIBLLVM_PATH at the libLLVM that the environment carries, unless the user has set it.
 

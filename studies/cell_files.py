@@ -1,8 +1,10 @@
-"""Cells of a study below a folder: a JSON file each, written atomically, so that a study goes on where it was stopped.
+"""Cells of a study below a folder: a JSON file each.
 
-cells = CellFiles(Path('out/regret'), 'psnr_3d', 'seconds')
-cells.put('foot', 'best', dict(psnr_3d=36.9, seconds=120.0))
-cells.get('foot', 'best')
+They are written atomically, so that a study goes on where it was stopped:
+
+    cells = CellFiles(Path('out/regret'), 'psnr_3d', 'seconds')
+    cells.put('foot', 'best', dict(psnr_3d=36.9, seconds=120.0))
+    cells.get('foot', 'best')
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ is not computed again.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import os
 import time
@@ -22,9 +23,10 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi.completion.prepare import sampled
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import write_text
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
@@ -32,6 +34,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
+from lingo_mi.runtime import cores
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
@@ -39,44 +42,29 @@ from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
 
 REFERENCE = 'reference'
-MBIRJAX_DEVICES = 'MBIRJAX_NUM_CPU_DEVICES'
 
 
-def _cloud(scan: Scan) -> Fitted:
-    return fit(scan, FAST, initial_cloud(scan, FAST, 0), 0)
+def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
+    """A function that samples a fitted cloud."""
+    return sampled(fit(scan, FAST, initial_cloud(scan, FAST, 0), 0))
 
 
-def _fast(scan: Scan) -> np.ndarray:
-    volume = _cloud(scan).volume(scan.geometry)
-    assert volume is not None  # fast has densities
-    return volume
-
-
-def _refined_cloud(scan: Scan) -> np.ndarray:
-    cloud = _cloud(scan)
-
-    def sample(geometry: Geometry) -> np.ndarray:
-        volume = cloud.volume(geometry)
-        assert volume is not None  # as above
-        return volume
-
-    return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=sample).volume
+def _refined(scan: Scan) -> np.ndarray:
+    return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=_cloud(scan)).volume
 
 
 def _itk() -> Any:
     itk = importlib.import_module('itk')
     itk.RTK  # noqa: B018 - loads it
-    itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(_cores())
+    itk.MultiThreaderBase.SetGlobalDefaultNumberOfThreads(cores())
     return itk
 
 
 def _mbirjax() -> Any:
-    os.environ.setdefault(MBIRJAX_DEVICES, '1')  # one device with all cores: as many devices as cores are slower
+    os.environ.setdefault(
+        'MBIRJAX_NUM_CPU_DEVICES', '1'
+    )  # one device with all cores: as many devices as cores are slower
     return importlib.import_module('mbirjax')
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
 # By name: what it is called in the table, and the volume [x, y, z] of a scan.
@@ -86,8 +74,8 @@ METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
     'asd-pocs': ('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
     'rtk-tv': ('RTK, total variation', lambda scan: rtk_bridge.total_variation(scan, _itk())),
     'mbirjax': ('MBIRJAX', lambda scan: mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=1.0)),
-    'fast': ("`fast`, the cloud's volume", _fast),
-    'refined': ('`fast`, then `refined`', _refined_cloud),
+    'fast': ("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
+    'refined': ('`fast`, then `refined`', _refined),
     'best': ('`best`', lambda scan: Best().run(scan).volume),
 }
 NEEDS = {
@@ -116,6 +104,8 @@ class Study:
     """The cells of one scan below a folder.
 
     dataset   all measured views to choose from, and the true volume, if known
+
+    `compute_missing` raises InputError where the folder has the cells of another scan.
     """
 
     def __init__(self, dataset: Dataset, folder: Path):
@@ -127,6 +117,7 @@ class Study:
     ) -> None:
         """Compute and store the cells that are missing: of every number of views, every method."""
         methods = list(methods)
+        self._require_same_scan()
         for count in views:
             chosen = choose_views(self.dataset, count)
             for method in methods:
@@ -137,6 +128,17 @@ class Study:
                         f'{found["seconds"]:.0f} s'
                     )
                     self.cells.put(_case(count), method, found)
+
+    def _require_same_scan(self) -> None:
+        scan, path = self.dataset.train, self.folder / 'scan.txt'
+        rays, geometry = scan.geometry.rays(), scan.geometry
+        found = hashlib.blake2b(repr((geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)).encode(), digest_size=16)
+        for part in (scan.projections, rays.source, rays.corner, rays.u, rays.v):
+            found.update(np.ascontiguousarray(part).tobytes())
+        if path.exists() and path.read_text(encoding='utf-8').strip() != found.hexdigest():
+            raise InputError(f'{self.folder}: has the volumes of another scan; choose another --out')
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_text(path, found.hexdigest() + '\n')
 
     def volume(self, views: int, method: str) -> np.ndarray:
         """The volume [x, y, z] of a stored cell."""

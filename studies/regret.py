@@ -19,6 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.stats import spearmanr
 
+from lingo_mi.completion.prepare import sampled
 from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
@@ -123,12 +124,7 @@ class Study:
             start = ASDPOCS(niter=START).run(scan).volume
             return means(refine(scan, start, Best.niter, finer).volume, finer)
         cloud = self._cloud(case)[0]
-
-        def sample(geometry: Geometry) -> np.ndarray:
-            found = cloud.volume(geometry)
-            assert found is not None  # fast has densities
-            return found
-
+        sample = sampled(cloud)
         if setting == 'cloud':
             return sample(scan.geometry)
         if setting == 'cloud_finer':

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import queue
 import re
 import secrets
@@ -21,6 +20,7 @@ from lingo_mi.gpu import visible_gpus
 from lingo_mi.jobs.job import Event, Job, Tell
 from lingo_mi.jobs.worker import describe_worker, require_fit, work
 from lingo_mi.progress import Progress
+from lingo_mi.runtime import cores
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
 MOST_LOCAL = 1024
@@ -49,7 +49,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
         stack.enter_context(dask.config.set({'distributed.scheduler.worker-saturation': 1.0}))
         if local:
             count = int(local[1])
-            threads = threads or max(1, _cores() // count)
+            threads = threads or max(1, cores() // count)
             where: dict[str, Any] = dict(address=stack.enter_context(_local(distributed, count)))
         elif address.endswith('.json'):
             if not Path(address).is_file():
@@ -190,7 +190,3 @@ def _local(distributed: Any, count: int) -> Iterator[str]:
     scheduler = dict(cls=distributed.Scheduler, options=dict(host='127.0.0.1', dashboard_address='127.0.0.1:0'))
     with distributed.SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR) as cluster:
         yield cluster.scheduler_address
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1

@@ -13,7 +13,6 @@ the panel, ours by the matched transpose.
 from __future__ import annotations
 
 import importlib
-import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -22,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi import phantoms
+from lingo_mi import phantoms, runtime
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.joseph import Joseph
@@ -42,7 +41,7 @@ def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = 
     repeats   rounds; the first one, which compiles, comes on top
     say       called with a line for each package that is not installed
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
+    cores = runtime.cores()
     dr.set_thread_count(cores)
     volume = phantoms.make('shepp_logan', size).data
     geometry = Geometry.cone(

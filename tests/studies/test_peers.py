@@ -67,6 +67,8 @@ def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
     (folder / '6_views' / 'fdk.json').write_text(json.dumps(cell | dict(method='fdk', held_out_rms=0.5)))
     code, text, err = peers(*command)
     assert code == 0 and '| 6 | FDK | 0.5000 |' in text and '6 views, asd-pocs' not in text, err
+    code, _, err = peers(*command, '-D', 'voxel=2.5')
+    assert code == 2 and err.count('\n') == 1 and 'another scan' in err
 
 
 def test_missing_peers_are_left_out(peers):
