@@ -73,14 +73,11 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     return array(reconstruction.GetOutput(), itk).copy()
 
 
-def total_variation(scan: Scan, itk: Any, alpha: float = 0.1, beta: float = 10.0, niter: int = 20) -> np.ndarray:
+def total_variation(scan: Scan, itk: Any, beta: float, alpha: float = 0.1, niter: int = 20) -> np.ndarray:
     """Volume [x, y, z] by RTK's ADMM with total variation: the least of |A x - b|^2 + alpha TV(x).
 
-    beta    weight of the split gradient, which decides how fast it converges
+    beta    weight of the split gradient: the smaller, the faster it converges, until it diverges, from few views sooner
     niter   outer iterations, with ten conjugate gradients each
-
-    The defaults of alpha and beta are the best of those tried on 30 views of the walnut, 64 voxels a side, with the volume
-    of all views at hand.
     """
     geometry = scan.geometry
     solver = itk.RTK.ADMMTotalVariationConeBeamReconstructionFilter[itk.Image[itk.F, 3]].New()
