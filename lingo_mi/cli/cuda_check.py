@@ -1,11 +1,11 @@
 """Check the CUDA backend without a GPU: the tests on cuda_ad_mono under a stand-in for the driver, then NVIDIA's assembler.
 
     lingo-mi cuda-check --stand-in PROGRAM --share --sm 80
-    lingo-mi cuda-check --stand-in PROGRAM --noise --markdown docs/tables/cuda.md
+    lingo-mi cuda-check --stand-in PROGRAM --noise --out out/cuda --markdown docs/tables/cuda.md
 
 PROGRAM COMMAND ... runs a command with a CUDA driver that executes Dr.Jit's PTX on the CPU (see lingo_mi.studies.cuda). Needs a
 checkout, for its tests, and `pip install nvidia-cuda-nvcc-cu12` for ptxas. The exit code is 1 where a test fails, or a kernel
-does not assemble or spills registers.
+does not assemble or spills registers. With --out, a run that was stopped goes on with the test file where it was.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def arguments() -> argparse.Namespace:
     )
     p.add_argument('--sm', type=int, nargs='+', default=[75, 80, 90], help='compute capabilities times ten')
     p.add_argument('--noise', action='store_true', help='once more, with the errors that NVIDIA allows, and checks')
+    p.add_argument('--out', type=Path, metavar='DIR', help='keep what is done there, and go on from it')
     p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
     args = p.parse_args()
     if shutil.which(args.stand_in) is None:
@@ -41,23 +42,23 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
-    from lingo_mi.studies.cuda.assemble import assemble_all, find_ptxas
+    from lingo_mi.studies.cell_files import CellFiles
+    from lingo_mi.studies.cuda.assemble import find_ptxas
     from lingo_mi.studies.cuda.page import page
     from lingo_mi.studies.cuda.suite import SHARE, all_files, run_tests
     from lingo_mi.studies.provenance import write_provenance
 
     find_ptxas()
-    stand_in, outcomes = Path(shutil.which(args.stand_in) or '').resolve(), {}
-    files = [args.tests / name for name in SHARE] if args.share else all_files(args.tests)
+    stand_in, outcomes, kernels = Path(shutil.which(args.stand_in) or '').resolve(), {}, []
+    names = SHARE if args.share else all_files(args.tests)
+    runs = {f'sm_{sm}': dict(sm=sm) for sm in args.sm}
+    if args.noise:
+        runs[f'sm_{args.sm[0]}, noise, checked'] = dict(sm=args.sm[0], noise=True)
     with tempfile.TemporaryDirectory() as folder:
-        runs = {f'sm_{sm}': dict(SM=sm, DUMP=folder) for sm in args.sm}
-        if args.noise:
-            runs[f'sm_{args.sm[0]}, noise, checked'] = dict(SM=args.sm[0], NOISE=1, CHECK=1)
+        cells = CellFiles(args.out or Path(folder), 'outcome', 'kernels', 'commit')
         for title, settings in runs.items():
-            outcomes[title] = run_tests(
-                stand_in, files, lambda line, title=title: print(f'{title}: {line}', flush=True), **settings
-            )
-        kernels = assemble_all(Path(folder), args.sm)
+            outcomes[title], found = run_tests(stand_in, args.tests, names, **settings, cells=cells, report=show)
+            kernels += [] if settings.get('noise') else found  # the same once more
     text = page(outcomes, kernels)
     print(text)
     if args.markdown:
@@ -67,3 +68,7 @@ def main() -> int:
     for name in failed:
         print(f'failed: {name}', file=sys.stderr)
     return int(bool(failed) or any(k.error or k.spilled for k in kernels))
+
+
+def show(line: str) -> None:
+    print(line, flush=True)

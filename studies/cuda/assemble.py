@@ -5,14 +5,11 @@ It comes with `pip install nvidia-cuda-nvcc-cu12` or a CUDA toolkit, and needs n
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +21,7 @@ class Kernel:
     """What the assembler makes of one entry of a module.
 
     name        of the entry
+    test        a test file that compiled it
     sm          compute capability times ten that it was assembled for
     lines       PTX instructions of its module
     registers   a thread's
@@ -32,6 +30,7 @@ class Kernel:
     """
 
     name: str
+    test: str
     sm: int
     lines: int
     registers: int = 0
@@ -48,35 +47,22 @@ def find_ptxas() -> Path:
     raise InputError('there is no ptxas: pip install nvidia-cuda-nvcc-cu12')
 
 
-def assemble(module: Path, sm: int, ptxas: Path) -> list[Kernel]:
-    """The kernels of a PTX file, assembled for a compute capability. None where its code is for a newer one."""
+def assemble(module: Path, sm: int, test: str = '') -> list[Kernel]:
+    """The kernels of a PTX file, assembled for a compute capability times ten. test   the test file that they are from"""
     text = module.read_text(encoding='utf-8')
     names = re.findall(r'\.entry\s+([\w$]+)', text)
-    target = re.search(r'\.target\s+sm_(\d+)', text)
-    if target is None or int(target[1]) > sm:
-        return []
     lines = sum(line.rstrip().endswith(';') and not line.lstrip().startswith('.') for line in text.splitlines())
     with tempfile.TemporaryDirectory() as folder:
-        command = [ptxas, '-v', '-O3', f'-arch=sm_{sm}', module, '-o', Path(folder) / 'kernel.cubin']
+        command = [find_ptxas(), '-v', '-O3', f'-arch=sm_{sm}', module, '-o', Path(folder) / 'kernel.cubin']
         done = subprocess.run(command, capture_output=True, text=True)
     said = done.stdout + done.stderr
     if done.returncode:
         reason = next((line.strip() for line in said.splitlines() if 'error' in line or 'fatal' in line), said.strip())
-        return [Kernel(name, sm, lines, error=reason) for name in names]
+        return [Kernel(name, test, sm, lines, error=reason) for name in names]
     out = []
     for name in names:
         part = said.partition(f"Compiling entry function '{name}'")[2].partition('Compiling entry function')[0]
         stores, loads = re.search(r'(\d+) bytes spill stores, (\d+) bytes spill loads', part).groups()  # type: ignore
         registers = re.search(r'Used (\d+) registers', part)
-        out.append(Kernel(name, sm, lines, int(registers[1]) if registers else 0, int(stores) + int(loads)))
+        out.append(Kernel(name, test, sm, lines, int(registers[1]) if registers else 0, int(stores) + int(loads)))
     return out
-
-
-def assemble_all(folder: Path, sms: Iterable[int]) -> list[Kernel]:
-    """The kernels of all PTX files in a folder, for each of some compute capabilities that their code is for."""
-    ptxas = find_ptxas()
-    sms = list(sms)
-    jobs = [(module, sm) for module in sorted(Path(folder).glob('*.ptx')) for sm in sms]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = pool.map(lambda job: assemble(job[0], job[1], ptxas), jobs)
-        return [kernel for kernels in found for kernel in kernels]

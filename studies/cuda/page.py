@@ -52,10 +52,11 @@ def _kernels(kernels):
         ],
         by_sm.items(),  # type: ignore[arg-type]
     )
-    largest = sorted(kernels, key=lambda k: -k.registers)[:LARGEST]
+    largest = sorted(kernels, key=lambda k: (-k.spilled, -k.registers))[:LARGEST]
     rows = table(
         [
             ('kernel', lambda k: f'`{k["name"][6:18]}`'),
+            ('compiled by', lambda k: f'`{k["test"]}`'),
             ('for', lambda k: f'sm_{k["sm"]}'),
             ('PTX instructions', lambda k: f'{k["lines"]}'),
             ('registers', lambda k: f'{k["registers"]}'),
@@ -64,4 +65,9 @@ def _kernels(kernels):
         map(asdict, largest),
     )
     errors = [f'- `{k.name}`, sm_{k.sm}: {k.error}' for k in kernels if k.error]
-    return [summary, 'Those with the most registers:', rows, *(['\n'.join(errors)] if errors else [])]
+    return [
+        summary,
+        'Those that spill, then those with the most registers:',
+        rows,
+        *(['\n'.join(errors)] if errors else []),
+    ]

@@ -10,8 +10,12 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+
+from lingo_mi.studies.cell_files import CellFiles
+from lingo_mi.studies.cuda.assemble import Kernel, assemble
+from lingo_mi.studies.provenance import commit
 
 # Of every part that computes on the device, what takes few minutes.
 SHARE = (
@@ -44,47 +48,79 @@ class Outcome:
     failed: list[str] = field(default_factory=list)
     skipped: Counter = field(default_factory=Counter)
 
+    def __post_init__(self):
+        self.skipped = Counter(self.skipped)  # a stored cell has a plain dictionary
+
     def add(self, other: Outcome) -> None:
         self.passed += other.passed
         self.failed += other.failed
         self.skipped += other.skipped
 
 
-def all_files(tests: Path) -> list[Path]:
-    """All test files of a checkout."""
-    return sorted(Path(tests).rglob('test_*.py'))
+def all_files(tests: Path) -> list[str]:
+    """The names of all test files in a folder and those below it."""
+    return sorted(p.relative_to(tests).as_posix() for p in Path(tests).rglob('test_*.py'))
 
 
-def run_tests(stand_in: Path, files: Iterable[Path], report: Callable[[str], None], **settings: str | int) -> Outcome:
-    """Run test files, a process each.
+def run_tests(
+    stand_in: Path,
+    tests: Path,
+    names: Iterable[str],
+    *,
+    sm: int,
+    noise: bool = False,
+    cells: CellFiles,
+    report: Callable[[str], None],
+) -> tuple[Outcome, list[Kernel]]:
+    """Run test files, a process each, and assemble the kernels that they compile.
 
     stand_in   the program that runs a command with its driver
-    files      within a checkout; the tests run from its root
+    tests      the folder of tests of a checkout
+    names      of files in it; they run from the checkout's root
+    sm         compute capability times ten
+    noise      approximate instructions err by as much as NVIDIA allows, and every address is checked
+    cells      what is done, a file each; a file that it holds is not run again
     report     called with a line for every file
-    settings   the stand-in's variables, without their prefix: SM=80, DUMP='folder', NOISE=1
     """
-    variables = {f'CUDA_ON_CPU_{name}': str(value) for name, value in settings.items()}
-    variables |= dict(LINGO_MI_TEST_VARIANT='cuda_ad_mono', LINGO_MI_CUDA_STAND_IN=str(stand_in))
-    total = Outcome()
+    run, known = f'sm_{sm}_noise' if noise else f'sm_{sm}', set()
+    total, kernels = Outcome(), {}
 
-    def run(file):
-        with tempfile.TemporaryDirectory() as folder:
-            result = Path(folder) / 'result.xml'
-            command = [stand_in, sys.executable, '-m', 'pytest', '-q', file, f'--junitxml={result}']
-            root = next(p.parent for p in Path(file).resolve().parents if p.name == 'tests')
-            done = subprocess.run(command, cwd=root, env=os.environ | variables, capture_output=True, text=True)
-            found = _read(result) if result.exists() else Outcome(failed=[f'{Path(file).name}: ended by itself'])
-        if done.returncode not in (0, 5) and not found.failed:  # 5: there are no tests
-            found.failed.append(f'{Path(file).name}: exit code {done.returncode}')
-        return file, found
+    def cell(name):
+        found = cells.get(run, name)
+        if found is None:
+            outcome, compiled = _run_file(stand_in, tests, name, sm, noise, known)
+            found = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled])
+            cells.put(run, name, found | dict(commit=commit()))
+        outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
+        known.update(kernel.name for kernel in compiled)  # spares the next files their assembling
+        return name, outcome, compiled
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        for file, found in pool.map(run, files):
-            total.add(found)
-            report(
-                f'{Path(file).name}: {found.passed} passed, {found.skipped.total()} skipped, {len(found.failed)} failed'
-            )
-    return total
+        for name, outcome, compiled in pool.map(cell, names):
+            total.add(outcome)
+            kernels = {kernel.name: kernel for kernel in compiled} | kernels
+            counts = f'{outcome.passed} passed, {outcome.skipped.total()} skipped, {len(outcome.failed)} failed'
+            report(f'{run}: {name}: {counts}; kernels: {len(compiled)}')
+    return total, list(kernels.values())
+
+
+def _run_file(stand_in, tests, name, sm, noise, known):
+    """The outcome of a test file, and its kernels beyond those known."""
+    with tempfile.TemporaryDirectory() as folder:
+        result, dump = Path(folder) / 'result.xml', Path(folder) / 'ptx'
+        dump.mkdir()
+        variables = dict(CUDA_ON_CPU_SM=f'{sm}', CUDA_ON_CPU_DUMP=f'{dump}')
+        if noise:
+            variables |= dict(CUDA_ON_CPU_NOISE='1', CUDA_ON_CPU_CHECK='1')
+        variables |= dict(LINGO_MI_TEST_VARIANT='cuda_ad_mono', LINGO_MI_CUDA_STAND_IN=f'{stand_in}')
+        command = [stand_in, sys.executable, '-m', 'pytest', '-q', tests.resolve() / name, f'--junitxml={result}']
+        environment, root = os.environ | variables, tests.resolve().parent
+        done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
+        outcome = _read(result) if result.exists() else Outcome(failed=[f'{name}: ended by itself'])
+        if done.returncode not in (0, 5) and not outcome.failed:  # 5: there are no tests
+            outcome.failed.append(f'{name}: exit code {done.returncode}')
+        modules = [m for m in sorted(dump.glob('*.ptx')) if m.stem not in known]
+        return outcome, [kernel for module in modules for kernel in assemble(module, sm, name)]
 
 
 def _read(result: Path) -> Outcome:

@@ -9,12 +9,13 @@ import pytest
 from helpers.script import FIT, run
 from lingo_mi.errors import InputError
 from lingo_mi.gpu import GPU
+from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.cuda import assemble, model, report, waits
-from lingo_mi.studies.cuda.assemble import Kernel, assemble_all, find_ptxas
+from lingo_mi.studies.cuda.assemble import Kernel, find_ptxas
 from lingo_mi.studies.cuda.count import KINDS, _counts, difference
 from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
 from lingo_mi.studies.cuda.page import page
-from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files
+from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files, run_tests
 
 CHECK = FIT.with_name('cuda_check.py')
 TESTS = FIT.parents[1] / 'tests'
@@ -51,12 +52,10 @@ def ptxas():
 def test_kernels_are_assembled(ptxas, tmp_path):
     (tmp_path / 'good.ptx').write_text(MODULE)
     (tmp_path / 'bad.ptx').write_text(MODULE.replace('add.f32', 'ad.f32').replace('twice', 'broken'))
-    (tmp_path / 'newer.ptx').write_text(MODULE.replace('sm_75', 'sm_90').replace('twice', 'newer'))
-    found = {(k.name, k.sm): k for k in assemble_all(tmp_path, [75, 90])}
-    assert set(found) == {('twice', 75), ('twice', 90), ('broken', 75), ('broken', 90), ('newer', 90)}
-    good, bad = found['twice', 75], found['broken', 75]
-    assert good.error is None and 0 < good.registers < 32 and good.spilled == 0 and good.lines == 5
-    assert 'ad' in bad.error
+    (good,), (bad,) = (assemble.assemble(tmp_path / f'{name}.ptx', 75, 'test_a.py') for name in ('good', 'bad'))
+    assert (good.name, good.test, good.sm, good.lines) == ('twice', 'test_a.py', 75, 5)
+    assert good.error is None and 0 < good.registers < 32 and good.spilled == 0
+    assert bad.name == 'broken' and 'ad' in bad.error
 
 
 def test_no_assembler(monkeypatch):
@@ -174,14 +173,56 @@ def test_tables_of_the_document(tmp_path, monkeypatch):
 
 def test_page():
     outcomes = {'sm_80': Outcome(5, ['test_a.py: test_b'], Counter({'no OptiX': 2}))}
-    text = page(outcomes, [Kernel('drjit_0123456789abcdef', 80, 99, 200, 16), Kernel('drjit_f', 80, 9, error='why')])
+    spills = Kernel('drjit_0123456789abcdef', 'test_a.py', 80, 99, 200, 16)
+    text = page(outcomes, [spills, Kernel('drjit_f', 'test_a.py', 80, 9, error='why')])
     assert '| sm_80 | 5 | 2 | 1 |' in text and '| no OptiX | 2 |' in text and '- sm_80: test_a.py: test_b' in text
-    assert '| sm_80 | 2 | 200 | 200 | 1 | 1 | 1 |' in text and '`0123456789ab`' in text and 'sm_80: why' in text
+    assert (
+        '| sm_80 | 2 | 200 | 200 | 1 | 1 | 1 |' in text
+        and '`0123456789ab` | `test_a.py`' in text
+        and 'sm_80: why' in text
+    )
 
 
 def test_the_share_is_of_tests_that_exist():
-    files = {str(p.relative_to(TESTS)) for p in all_files(TESTS)}
-    assert set(SHARE) < files
+    assert set(SHARE) < set(all_files(TESTS))
+
+
+STAND_IN = """#!/bin/sh
+# Runs a command, with a kernel that its driver would have compiled.
+printf '%s' "$MODULE" > "$CUDA_ON_CPU_DUMP/twice.ptx"
+exec "$@"
+"""
+PASSES = 'def test_once():\n    import pathlib\n    pathlib.Path("ran.txt").open("a").write("x")\n'
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A checkout of three test files, and a program that runs them."""
+    tests, stand_in = tmp_path / 'tests', tmp_path / 'stand_in'
+    (tests / 'part').mkdir(parents=True)
+    (tests / 'part/test_a.py').write_text(PASSES)
+    (tests / 'test_b.py').write_text(PASSES + 'def test_more():\n    import pytest\n    pytest.skip("no room")\n')
+    (tests / 'test_c.py').write_text('def test_fails():\n    assert 0\n')
+    stand_in.write_text(STAND_IN)
+    stand_in.chmod(0o755)
+    monkeypatch.setenv('MODULE', MODULE)
+    return stand_in, tests
+
+
+def test_a_check_goes_on_where_it_was_stopped(ptxas, checkout, tmp_path):
+    """A stored file is not run again; one that is cut off is. A kernel that several files compile counts once."""
+    stand_in, tests = checkout
+    names, cells, lines = all_files(tests), CellFiles(tmp_path / 'cells', 'outcome', 'kernels', 'commit'), []
+    assert names == ['part/test_a.py', 'test_b.py', 'test_c.py']
+    first = run_tests(stand_in, tests, names, sm=75, cells=cells, report=lines.append)
+    assert run_tests(stand_in, tests, names, sm=75, cells=cells, report=lines.append) == first
+    outcome, kernels = first
+    assert outcome.passed == 2 and outcome.skipped == {'no room': 1} and len(outcome.failed) == 1
+    assert [kernel.name for kernel in kernels] == ['twice'] and kernels[0].spilled == 0
+    assert (tmp_path / 'ran.txt').read_text() == 'xx' and lines[:3] == lines[3:]
+    cells.path('sm_75', 'test_b.py').write_text('{"outcome"')
+    assert run_tests(stand_in, tests, names, sm=75, cells=cells, report=lines.append)[0] == outcome
+    assert (tmp_path / 'ran.txt').read_text() == 'xxx'
 
 
 @pytest.mark.parametrize('args', [(), ('--stand-in', 'no-such-program'), ('--stand-in', 'true', '--tests', 'nowhere')])
