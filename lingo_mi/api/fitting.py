@@ -91,8 +91,7 @@ def fit(
 
             def report(iteration, **fields):
                 bar.update(iteration, **fields)
-                if 'held_out' not in fields:  # the search shows nothing of the fit
-                    watch.step(iteration, fields['loss'], fields['gaussians'])
+                watch.step(iteration, **fields)
                 check()
 
             measure = quick_measure(dataset, look=watch.look if watch.watchers else None)

@@ -32,6 +32,9 @@ class EventLog:
             self._writer: Any = library.SummaryWriter(str(path), flush_secs=5)
         self._at = 0
 
+    def search(self, iteration: int, held_out: float) -> None:
+        """See `watch.Watcher`. Its steps are not those of the fit: nothing is written."""
+
     def step(self, entry: dict, total: int) -> None:
         """See `watch.Watcher`."""
         for name, value in entry.items():

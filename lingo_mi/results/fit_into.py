@@ -48,8 +48,7 @@ def fit_into(
 
         def report(iteration, **fields):
             progress(iteration, **fields)
-            if 'held_out' not in fields:  # the search shows nothing of the fit
-                watch.step(iteration, fields['loss'], fields['gaussians'])
+            watch.step(iteration, **fields)
             check()
 
         look = quick_measure(dataset, look=watch.look if watchers else None)

@@ -76,16 +76,19 @@ class Live:
 
     # ---- of the fit ----
 
+    def search(self, iteration: int, held_out: float) -> None:
+        """See `watch.Watcher`."""
+        error = '' if np.isnan(held_out) else f', error of the views held out {held_out:.4g}'
+        with self._lock:
+            self._line = f'Search for the step to stop at: step {iteration:,}{error}. The fit begins after it.'
+
     def step(self, entry: dict, total: int) -> None:
         """See `watch.Watcher`."""
         first = self._history[0] if self._history else dict(iteration=0, seconds=0.0)  # a resumed fit begins later
         steps, seconds = entry['iteration'] - first['iteration'], entry['seconds'] - first['seconds']
         left = seconds * (total - entry['iteration']) / max(1, steps)
-        parts = [
-            f'Step {entry["iteration"]:,} of {total:,}',
-            f'loss {entry["loss"]:.4g}',
-            f'{entry["gaussians"]:,} Gaussians',
-        ]
+        parts = [f'Step {entry["iteration"]:,} of {total:,}', f'loss {entry["loss"]:.4g}']
+        parts += [f'{entry["gaussians"]:,} Gaussians'] if entry['gaussians'] else []
         parts.append(f'{clock(left)} left' if entry['iteration'] < total else f'done in {clock(entry["seconds"])}')
         with self._lock:
             self._history += history([entry])

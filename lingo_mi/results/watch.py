@@ -52,6 +52,9 @@ class Snapshot:
 class Watcher(Protocol):
     """What looks at a fit."""
 
+    def search(self, iteration: int, held_out: float) -> None:
+        """About every second of a search for the step to stop at (`fitting.stopping`): steps done, and its error so far."""
+
     def step(self, entry: dict, total: int) -> None:
         """About every second: `iteration`, `seconds`, `loss`, `gaussians`, and at some also what was measured; steps in all."""
 
@@ -71,15 +74,26 @@ class Watch:
         self._began = time.perf_counter()
         self._told, self._new = 0.0, {}
 
-    def step(self, iteration: int, loss: Callable[[], float], gaussians: int) -> None:
-        """To be called after every step; it returns at once unless there is something to tell."""
-        now = time.perf_counter() - self._began
-        if not self.watchers or not (self._new or now - self._told >= EVERY or iteration == self.total):
+    def step(
+        self,
+        iteration: int,
+        loss: Callable[[], float],
+        gaussians: int,
+        *,
+        held_out: float | None = None,
+        stops_at: int | None = None,
+        **_: Any,
+    ) -> None:
+        """To be called after every step with what `fitting.loop.run` reports. It returns at once where nothing is to be told."""
+        now, total = time.perf_counter() - self._began, stops_at or self.total
+        if not self.watchers or not (self._new or now - self._told >= EVERY or iteration == total):
             return
         self._told = now
+        if held_out is not None:
+            return self._each(lambda watcher: watcher.search(iteration, held_out))
         entry = dict(iteration=iteration, seconds=now, loss=loss(), gaussians=gaussians) | self._new
         self._new = {}
-        self._each(lambda watcher: watcher.step(entry, self.total))
+        self._each(lambda watcher: watcher.step(entry, total))
 
     def look(self, snapshot: Snapshot) -> None:
         """To be called with a state that is measured."""

@@ -109,6 +109,9 @@ class Failing:
     def __init__(self, at):
         self.at = at
 
+    def search(self, iteration, held_out):
+        self._fail('search')
+
     def step(self, entry, total):
         self._fail('step')
 
@@ -157,6 +160,20 @@ def test_steps_are_told_once_a_second_and_with_what_was_measured():
             watch._new = dict(psnr_2d=30.0)
         watch.step(i, lambda: 0.5, 3)
     assert [e['iteration'] for e in told] == [500, 1000] and told[0]['psnr_2d'] == 30 and 'psnr_2d' not in told[1]
+
+
+def test_a_fit_that_stops_early(live):
+    """First its search, then the steps until where it stops; `gaussians` is None for a neural field."""
+    watch = Watch([live], 1000)
+    told = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
+    watch._told = -1.0
+    told(iteration=10, held_out=0.25)
+    assert asked(live)['line'].startswith('Search for the step to stop at: step 10, error of the views held out 0.25.')
+    watch._told = -1.0
+    told(iteration=100, stops_at=400)
+    assert asked(live)['line'].startswith('Step 100 of 400, loss 0.5, ')
+    told(iteration=400, stops_at=400)
+    assert 'Step 400 of 400' in asked(live)['line'] and watch.watchers == [live]
 
 
 def test_a_lost_viewer_stops_nothing(data, monkeypatch):
