@@ -1,0 +1,132 @@
+"""Where the time of a step of a fit goes.
+
+    lingo-mi fit x3d_foot
+    python -m lingo_mi.studies.benchmarks.step out/x3d_foot/checkpoint.npz
+
+Steps from the end of a fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
+saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns. A
+renewal of the cloud (densification) counts with its share of a step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.cli.common import guard
+from lingo_mi.errors import InputError
+from lingo_mi.fitting.adam import adam_step
+from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.step import Stepper
+from lingo_mi.projectors.cloud import line_integrals
+from lingo_mi.projectors.options import RenderOptions
+from lingo_mi.runtime import use_variant
+from lingo_mi.scan import Scan
+from lingo_mi.studies.markdown import table
+
+WARM = 3  # turns that are not counted
+VIEWS = 4
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
+    p.add_argument('checkpoint', type=Path, help='of a fit of a cloud')
+    p.add_argument('--repeats', type=int, default=31, help='turns')
+    p.add_argument('--variant', help='of Mitsuba')
+    args = p.parse_args()
+    use_variant(args.variant)
+    fitted = Fitted.from_checkpoint(args.checkpoint)
+    if not fitted.settings.cloud:
+        raise InputError(f'{args.checkpoint}: is a neural field, and its step has other parts')
+    print(described(measured(fitted, args.repeats)))
+
+
+def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
+    """Seconds of each part of a step, of a whole one, and of the integrator alone."""
+    settings, state = fitted.settings, DeviceState(fitted.state)
+    geometry, rng = fitted.geometry.subset(range(VIEWS)), np.random.default_rng(0)
+    scan = Scan(geometry, rng.uniform(1, 2, (VIEWS, *geometry.nDetector)).astype(np.float32))
+    without = {
+        'whole': settings,
+        'no SSIM': replace(settings, loss=replace(settings.loss, lambda_ssim=0.0)),
+        'no TV': replace(settings, loss=replace(settings.loss, lambda_tv=0.0)),
+    }
+    steppers = {name: Stepper(scan, s) for name, s in without.items()}
+    late, upstream = settings.iterations - 1, dr.opaque(mi.Float, 1, int(np.prod(geometry.nDetector)))
+    gradients = {name: dr.zeros(type(x), dr.width(x)) for name, x in state.values.items()}
+    dr.eval(gradients)
+
+    def integrate(turn, backward):
+        gaussians = [dr.detach(x) for x in steppers['whole'].forward.gaussians(state.values)]
+        view = steppers['whole'].targets[turn % VIEWS].view
+        if backward:
+            dr.enable_grad(gaussians)
+        image = line_integrals(*gaussians, view=view, options=RenderOptions(settings.model.extent))
+        if not backward:
+            return dr.eval(image)
+        dr.backward(image * upstream)
+        return dr.eval([dr.grad(x) for x in gaussians])
+
+    work: dict[str, Callable[[int], object]] = {
+        'image': lambda turn: integrate(turn, backward=False),
+        'image and derivatives': lambda turn: integrate(turn, backward=True),
+        'Adam': lambda _: adam_step(state, gradients, settings, late),
+        **{name: lambda turn, s=s: s.step(state, [turn % VIEWS], late, rng) for name, s in steppers.items()},
+    }
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for turn in range(WARM + repeats):
+        for name, do in work.items():
+            dr.sync_thread()
+            began = time.perf_counter()
+            do(turn)
+            dr.sync_thread()
+            times[name].append(time.perf_counter() - began)
+    median = {name: float(np.median(taken[WARM:])) for name, taken in times.items()}
+    found = {
+        'integrator, forward': median['image'],
+        'integrator, backward': median['image and derivatives'] - median['image'],
+        'SSIM': median['whole'] - median['no SSIM'],
+        'total variation': median['whole'] - median['no TV'],
+        'Adam': median['Adam'],
+    }
+    found['the rest'] = median['whole'] - sum(found.values())
+    return found | {'a step': median['whole'], 'densification': _renewal(steppers['whole'], state, rng)}
+
+
+def _renewal(stepper, state, rng):
+    """Seconds of densification, spread over all steps of the fit."""
+    s, iterations = stepper.settings.densification, stepper.settings.iterations
+    due = [i for i in range(s.densify_from + 1, min(s.densify_until, iterations)) if i % s.densify_every == 0]
+    if not due:
+        return 0.0
+    began = time.perf_counter()
+    stepper.renewed(state, due[-1], rng)
+    dr.sync_thread()
+    return (time.perf_counter() - began) * len(due) / iterations
+
+
+def described(found: dict[str, float]) -> str:
+    """A Markdown table, and how a step compares with the integrator alone."""
+    whole = found['a step']
+    rows = table(
+        [
+            ('part', lambda row: row[0]),
+            ('ms', lambda row: f'{row[1] * 1e3:.1f}'),
+            ('of a step', lambda row: f'{100 * row[1] / whole:.0f} %'),
+        ],
+        found.items(),  # type: ignore[arg-type] - rows of any kind do
+    )
+    ratio = whole / (found['integrator, forward'] + found['integrator, backward'])
+    return f'{rows}\n\nA step takes {ratio:.2f} times as long as the integrator, forward and backward.'
+
+
+if __name__ == '__main__':
+    guard(main)
