@@ -30,6 +30,7 @@ COMMANDS = {
     'growth': 'measure how time and memory grow with voxels, pixels, views and Gaussians',
     'explain': 'measure which errors of a scanner explain what a reconstruction leaves of a measured scan',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
+    'bench-step': 'time a step of a fit, part by part',
     'bench-recon': 'time reconstruction on voxels against other packages',
     'fuzz': 'give every reader mutated files: a value, or one line that refuses it',
     'cuda-check': 'check the CUDA backend where there is no GPU',

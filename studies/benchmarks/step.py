@@ -1,8 +1,5 @@
 """Where the time of a step of a fit goes.
 
-    lingo-mi fit x3d_foot
-    python -m lingo_mi.studies.benchmarks.step out/x3d_foot/checkpoint.npz
-
 Steps from the end of a fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
 saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns. A
 renewal of the cloud (densification) counts with its share of a step.
@@ -10,25 +7,20 @@ renewal of the cloud (densification) counts with its share of a step.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.cli.common import guard
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.step import Stepper
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
 from lingo_mi.studies.markdown import table
 
@@ -36,23 +28,10 @@ WARM = 3  # turns that are not counted
 VIEWS = 4
 
 
-def main() -> None:
-    p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
-    p.add_argument('checkpoint', type=Path, help='of a fit of a cloud')
-    p.add_argument('--repeats', type=int, default=31, help='turns')
-    p.add_argument('--variant', help='of Mitsuba')
-    args = p.parse_args()
-    use_variant(args.variant)
-    fitted = Fitted.from_checkpoint(args.checkpoint)
-    if not fitted.settings.cloud:
-        raise InputError(f'{args.checkpoint}: is a neural field, and its step has other parts')
-    print(described(measured(fitted, args.repeats)))
-
-
 def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     """Seconds of each part of a step, of a whole one, and of the integrator alone."""
     settings, state = fitted.settings, DeviceState(fitted.state)
-    geometry, rng = fitted.geometry.subset(range(VIEWS)), np.random.default_rng(0)
+    geometry, rng = fitted.geometry.subset(list(range(VIEWS))), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (VIEWS, *geometry.nDetector)).astype(np.float32))
     without = {
         'whole': settings,
@@ -126,7 +105,3 @@ def described(found: dict[str, float]) -> str:
     )
     ratio = whole / (found['integrator, forward'] + found['integrator, backward'])
     return f'{rows}\n\nA step takes {ratio:.2f} times as long as the integrator, forward and backward.'
-
-
-if __name__ == '__main__':
-    guard(main)

@@ -89,9 +89,10 @@ def run_tests(
         found = cells.get(run, name)
         if found is None:
             outcome, compiled = _run_file(stand_in, tests, name, sm, noise, known)
-            found = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled])
-            cells.put(run, name, found | dict(commit=commit()))
-        outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
+            kept = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], commit=commit())
+            cells.put(run, name, kept)
+        else:
+            outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
         known.update(kernel.name for kernel in compiled)  # spares the next files their assembling
         return name, outcome, compiled
 

@@ -8,10 +8,10 @@ above what libraries and a tiny call take.
 
 from __future__ import annotations
 
+import argparse
 import gc
 import json
 import resource
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -216,10 +216,28 @@ def measure(stage: str, size: Size, least: float = 0.2) -> dict:
     return dict(seconds=(_cpu() - began) / max(calls - 1, 1), peak=_memory('VmHWM') - before)
 
 
-if __name__ == '__main__':
+def main() -> None:
     from lingo_mi.runtime import use_variant
 
+    p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
+    p.add_argument('stage', choices=DEPENDS)
+    p.add_argument('sizes', nargs='+', type=_size, metavar=','.join(AXES))
+    args = p.parse_args()
     use_variant('llvm_ad_mono')
-    prepare(sys.argv[1], Size(*TINY))()
-    for word in sys.argv[2:]:
-        print(json.dumps(measure(sys.argv[1], Size(*map(int, word.split(','))))), flush=True)
+    prepare(args.stage, Size(*TINY))()
+    for size in args.sizes:
+        print(json.dumps(measure(args.stage, size)), flush=True)
+
+
+def _size(text: str) -> Size:
+    try:
+        numbers = [int(number) for number in text.split(',')]
+        if len(numbers) == len(AXES) and min(numbers) > 0:
+            return Size(*numbers)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f'{text!r} is not four positive numbers, such as 64,128,16,10000')
+
+
+if __name__ == '__main__':
+    main()

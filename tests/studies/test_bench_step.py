@@ -1,10 +1,9 @@
 """What a step of a fit is made of."""
 
-import subprocess
-import sys
+import pytest
 
 import lingo_mi as lm
-from helpers.script import FIT
+from helpers.script import FIT, run
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.studies.benchmarks.step import described, measured
 
@@ -25,7 +24,7 @@ def test_parts_of_a_step(tmp_path):
     )
 
 
-def test_no_checkpoint(tmp_path):
-    command = [sys.executable, '-m', 'lingo_mi.studies.benchmarks.step', tmp_path / 'nothing.npz']
-    done = subprocess.run(command, capture_output=True, text=True, cwd=FIT.parents[1])
-    assert done.returncode == 2 and done.stderr.startswith('error: ') and done.stderr.count('\n') == 1
+@pytest.mark.parametrize('args', [(), ('nothing.npz',), ('nothing.npz', '--repeats', 0)])
+def test_bad_input(args):
+    code, out, err = run(FIT.with_name('bench_step.py'), *args)
+    assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not out

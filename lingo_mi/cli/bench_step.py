@@ -1,0 +1,39 @@
+"""Time a step of a fit, and each of its parts: the integrator, SSIM, total variation, Adam, densification.
+
+    lingo-mi fit x3d_foot
+    lingo-mi bench-step out/x3d_foot/checkpoint.npz
+
+Steps from the end of the fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
+saves is their time. All run in turns, so that all see the same machine; medians of all turns. Densification counts with its share
+of a step.
+"""
+
+import argparse
+from pathlib import Path
+
+from lingo_mi.cli.common import Parser
+from lingo_mi.errors import InputError
+from lingo_mi.runtime import use_variant
+
+
+def arguments() -> argparse.Namespace:
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('checkpoint', type=Path, help='checkpoint.npz of a fit of a cloud')
+    p.add_argument('--repeats', type=int, default=31, metavar='N', help='turns (default: 31)')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    args = p.parse_args()
+    if not 1 <= args.repeats <= 10_000:
+        raise InputError(f'--repeats must be from 1 to 10000, not {args.repeats}')
+    return args
+
+
+def main() -> None:
+    args = arguments()
+    use_variant(args.variant)
+    from lingo_mi.fitting.fitted import Fitted
+    from lingo_mi.studies.benchmarks.step import described, measured
+
+    fitted = Fitted.from_checkpoint(args.checkpoint)
+    if not fitted.settings.cloud:
+        raise InputError(f'{args.checkpoint}: is a neural field, whose step has other parts')
+    print(described(measured(fitted, args.repeats)))
