@@ -37,6 +37,16 @@ class Kernel:
     spilled: int = 0
     error: str | None = None
 
+    @property
+    def ours(self) -> bool:
+        """Whether it is compiled from a program's operations; Dr.Jit's own, such as matrix products, are fixed."""
+        return self.name.startswith('drjit_')
+
+    @property
+    def fails(self) -> bool:
+        """Whether it does not assemble, or spills and could be written otherwise."""
+        return self.error is not None or self.ours and self.spilled > 0
+
 
 def find_ptxas() -> Path:
     """The assembler: of the package nvidia-cuda-nvcc-cu12, or on PATH. Raises InputError where there is none."""

@@ -39,10 +39,15 @@ def page(outcomes: dict[str, Outcome], kernels: Sequence[Kernel]) -> str:
 
 
 def _kernels(kernels):
-    by_sm = {sm: [k for k in kernels if k.sm == sm] for sm in sorted({k.sm for k in kernels})}
+    kinds = {True: '', False: ", Dr.Jit's own matrix products"}
+    groups = {
+        f'sm_{sm}{kind}': [k for k in kernels if k.sm == sm and k.ours == ours]
+        for sm in sorted({k.sm for k in kernels})
+        for ours, kind in kinds.items()
+    }
     summary = table(
         [
-            ('assembled for', lambda row: f'sm_{row[0]}'),
+            ('assembled for', lambda row: row[0]),
             ('kernels', lambda row: f'{len(row[1])}'),
             ('registers, median', lambda row: f'{sorted(k.registers for k in row[1])[len(row[1]) // 2]}'),
             ('most', lambda row: f'{max(k.registers for k in row[1])}'),
@@ -50,9 +55,9 @@ def _kernels(kernels):
             ('spill', lambda row: f'{sum(k.spilled > 0 for k in row[1])}'),
             ('not assembled', lambda row: f'{sum(k.error is not None for k in row[1])}'),
         ],
-        by_sm.items(),  # type: ignore[arg-type]
+        [row for row in groups.items() if row[1]],  # type: ignore[arg-type]
     )
-    largest = sorted(kernels, key=lambda k: (-k.spilled, -k.registers))[:LARGEST]
+    largest = sorted((k for k in kernels if k.ours), key=lambda k: (-k.spilled, -k.registers))[:LARGEST]
     rows = table(
         [
             ('kernel', lambda k: f'`{k["name"][6:18]}`'),

@@ -174,8 +174,11 @@ def test_tables_of_the_document(tmp_path, monkeypatch):
 def test_page():
     outcomes = {'sm_80': Outcome(5, ['test_a.py: test_b'], Counter({'no OptiX': 2}))}
     spills = Kernel('drjit_0123456789abcdef', 'test_a.py', 80, 99, 200, 16)
-    text = page(outcomes, [spills, Kernel('drjit_f', 'test_a.py', 80, 9, error='why')])
+    own = Kernel('gemm_f32_64_tn', 'test_a.py', 80, 99, 128, 16)
+    assert spills.fails and not own.fails
+    text = page(outcomes, [spills, own, Kernel('drjit_f', 'test_a.py', 80, 9, error='why')])
     assert '| sm_80 | 5 | 2 | 1 |' in text and '| no OptiX | 2 |' in text and '- sm_80: test_a.py: test_b' in text
+    assert "| sm_80, Dr.Jit's own matrix products | 1 | 128 | 128 | 0 | 1 | 0 |" in text
     assert (
         '| sm_80 | 2 | 200 | 200 | 1 | 1 | 1 |' in text
         and '`0123456789ab` | `test_a.py`' in text
