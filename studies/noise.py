@@ -15,14 +15,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting import loop
 from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.scan import Scan
@@ -97,8 +96,7 @@ class Study:
 
         began = time.process_time()
         cloud = initial_cloud(scan, settings)
-        with mock.patch.object(loop, 'measure_at', lambda iterations: range(EVERY, iterations + 1, EVERY)):
-            fitted = loop.run(scan, settings, cloud, 0, measure)
+        fitted = fit(scan, settings, cloud, 0, measure, at=range(EVERY, self.iterations + 1, EVERY))
         return dict(
             asdict(case),
             setting=setting,

@@ -17,8 +17,6 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
-SETTINGS = 'equal', 'stopped', 'noise'
-
 
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -28,7 +26,7 @@ def arguments() -> argparse.Namespace:
     )
     p.add_argument('--finer', nargs='+', type=int, default=[2], metavar='N', help='(default: 2)')
     p.add_argument('--views', type=int, default=25, metavar='N', help='(default: 25)')
-    p.add_argument('--settings', nargs='+', choices=SETTINGS, default=list(SETTINGS), help='(default: all)')
+    p.add_argument('--settings', nargs='+', metavar='NAME', help='some of equal, stopped, noise (default: all)')
     p.add_argument('--size', type=int, default=64, help='voxels along the longest side (default: 64)')
     p.add_argument('--pixels', type=int, default=64, help='of the panel, a side (default: 64)')
     p.add_argument('--iterations', type=int, default=1400, metavar='N', help='steps of a fit, at most (default: 1400)')
@@ -51,12 +49,16 @@ def main() -> None:
         if not all(low <= value <= high for value in values):
             raise InputError(f'{name} must be from {low} to {high:g}, not {" ".join(map(str, values))}')
     use_variant(args.variant)
-    from lingo_mi.studies.noise import Case, Study
+    from lingo_mi.studies.noise import SETTINGS, Case, Study
     from lingo_mi.studies.tables.objects import available
 
+    settings = args.settings or list(SETTINGS)
+    for name in settings:
+        if name not in SETTINGS:
+            raise InputError(f'--settings {name}: is unknown; use some of {", ".join(SETTINGS)}')
     names = available(args.objects, print)
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size, args.pixels, args.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
     with renewed_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
-        study.compute_missing(cases, args.settings, renew)
+        study.compute_missing(cases, settings, renew)

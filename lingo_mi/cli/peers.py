@@ -1,7 +1,7 @@
 """Reconstruct one scan by this package's methods and by RTK and MBIRJAX, and compare the volumes where no truth is known.
 
     lingo-mi peers walnut --views 15 30 60
-    lingo-mi peers walnut --views 30 -D voxels=256 -D voxel=0.1525 --methods asd-pocs mbirjax best
+    lingo-mi peers walnut --views 30 -D voxels=256 -D voxel_size=0.1525 --methods asd-pocs mbirjax best
     lingo-mi peers scenes/mine.xml --projections scan.npy --views 40
 
 Every method gets the same few, evenly spaced views. The table says how well its volume predicts the views that are left, as root

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import drjit as dr
@@ -33,6 +33,7 @@ def run(
     measure: Callable[[Model, DeviceState], dict] | None = None,
     progress: Callable[..., None] | None = None,
     path: Path | None = None,
+    at: Iterable[int] | None = None,
 ) -> Fitted:
     """Fit a cloud, or a neural field, to a scan.
 
@@ -46,6 +47,7 @@ def run(
                a neural field; during a search held_out= is its error so far. The state is then consistent: if it raises
                KeyboardInterrupt, a checkpoint is written
     path       checkpoint file, written every `checkpoint_seconds` and at the end; its folder is created
+    at         iterations to measure at, besides the last; None: `measure_at`
 
     Raises InputError for a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
 
@@ -81,7 +83,7 @@ def run(
             stepper, host = search.begin(host, seed)
         state = DeviceState(host)
     last = search.kept if search and not search.on else settings.iterations
-    marks = {*measure_at(settings.iterations), last}
+    marks = {*(measure_at(settings.iterations) if at is None else at), last}
     clock = saved = time.perf_counter()
 
     def store():

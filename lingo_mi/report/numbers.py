@@ -63,6 +63,7 @@ QUALITY = {
         'Mean distance of initial points to Gaussians born in the fit', '', '.4f', 'The same, seen from the initial points.'
     ),
     'gaussians': Number('Gaussians', '', ',d', 'The size of the cloud at the end.'),
+    'parameters': Number('Parameters', '', ',d', 'Numbers that the fit adjusts.'),
     'seconds_init': Number('Time to initialise', 's', '.2f', 'From projections to the initial cloud.'),
     'seconds_fit': Number('Time to fit', 's', '.1f', 'All steps, without the measurements in between.'),
     'ms_per_iteration': Number(

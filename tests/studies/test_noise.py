@@ -7,7 +7,6 @@ import sys
 import pytest
 
 from helpers.script import FIT
-from lingo_mi.cli import noise as command
 from lingo_mi.studies.noise import SETTINGS, Case, Study
 
 
@@ -38,10 +37,6 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     assert code == 0 and '2.00 (100)' in text, err
 
 
-def test_the_command_knows_all_settings():
-    assert command.SETTINGS == tuple(SETTINGS)
-
-
 @pytest.mark.parametrize(
     'args, says',
     [
@@ -50,6 +45,7 @@ def test_the_command_knows_all_settings():
         (['--size', 4], '--size must be from 12 to 512'),
         (['--iterations', 1], '--iterations must be from 50 to'),
         (['--photons', 0], '--photons must be from 1 to'),
+        (['--settings', 'equal', 'other'], '--settings other: is unknown; use some of equal, stopped, noise'),
         (['--objects', 'cat'], "object 'cat' is unknown"),
     ],
 )
