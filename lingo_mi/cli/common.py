@@ -84,7 +84,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         '--volume',
         metavar='F',
         help="a CT volume to scan with the scene's scanner: NIfTI, NRRD, MHA, "
-        'NPY/NPZ, raw, a TIFF stack or a DICOM folder',
+        'OME-Zarr, NPY/NPZ, raw, a TIFF stack or a DICOM folder',
     )
     parser.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
     parser.add_argument('--dtype', help='type of a raw --volume, such as uint8')

@@ -36,7 +36,7 @@ def write_slabs(
                   2 x 2 x 2 voxels)
     geometry      of the whole volume
     slabs         float32 [x, y, slices] from the first slice on, together the whole volume
-    description   of the values, for NIfTI
+    description   what the values are, as of `write_volume`
 
     Raises InputError for another suffix, values that are not finite, slabs that do not make the volume, and a file that cannot be
     written. Slabs of `THICKNESS` slices make whole chunks of .ome.zarr, which are written fastest.
@@ -47,7 +47,7 @@ def write_slabs(
     if path.name.endswith(NIFTI):
         _write_nifti(path, geometry, slabs, description)
     elif path.name.endswith(ZARR):
-        _write_zarr(path, geometry, slabs)
+        _write_zarr(path, geometry, slabs, description)
     else:
         raise InputError(
             f'{path}: volumes are written as NIfTI (.nii, .nii.gz) or OME-Zarr (.ome.zarr); give such a name'
@@ -80,7 +80,7 @@ def _write_nifti(path, geometry, slabs, description):
             file.write(slab.astype('<f4', copy=False).tobytes(order='F'))
 
 
-def _write_zarr(path, geometry, slabs):
+def _write_zarr(path, geometry, slabs, description):
     zarr, writer = optional('zarr', 'ome-zarr'), optional('ome_zarr.writer', 'ome-zarr')
     shapes = [geometry.nVoxel[::-1]]
     while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
@@ -96,6 +96,7 @@ def _write_zarr(path, geometry, slabs):
         for begin, slab in _grouped(_checked(path, geometry, slabs), 2 ** (len(levels) - 1)):
             _add(levels, begin, slab.transpose(2, 1, 0))
         _describe(writer, group, geometry, len(levels))
+        group.attrs['lingo_mi'] = description
 
 
 def _grouped(slabs: Iterable[tuple[int, np.ndarray]], step: int) -> Iterator[tuple[int, np.ndarray]]:

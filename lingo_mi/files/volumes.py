@@ -1,11 +1,11 @@
-"""CT volumes: NIfTI, NRRD/MetaImage, NumPy, raw bytes, TIFF stacks and DICOM folders in; NIfTI out.
+"""CT volumes: NIfTI, NRRD/MetaImage, OME-Zarr, NumPy, raw bytes, TIFF stacks and DICOM folders in; NIfTI out.
 
 A volume is indexed [x, y, z] in the order of the file. Nothing is flipped; the affine gives the voxels' positions
 in the world.
 
 Values become density by these rules, the first that applies:
 
-1. A NIfTI file that `write_volume` wrote is returned unchanged.
+1. A file that `write_volume` or `slabs.write_slabs` wrote is returned unchanged.
 2. Hounsfield units. They are recognised by a minimum of -500 or less, by DICOM or by `hu=True`; with `mu_water`
    also if rule 3 would refuse negative values. With `mu_water` (1/mm) they become mu_water (1 + HU / 1000), at
    least 0, in 1/mm. Without, they are clipped to [-1000, 2000] and mapped to [0, 1] (R2-Gaussian's rule).
@@ -32,7 +32,7 @@ from lingo_mi import notebook
 from lingo_mi.arrays import short_repr
 from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import reading, replacing
-from lingo_mi.files import arrays, metaimage, nifti, nrrd, slices
+from lingo_mi.files import arrays, metaimage, nifti, nrrd, ome_zarr, slices
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.voxels import LPS_TO_RAS, read_voxels
 from lingo_mi.geometry.base import Geometry
@@ -175,7 +175,7 @@ def read_volume(
 ) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
-    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd; .npy, .npz with one 3D array,
+    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd; .ome.zarr (zarr); .npy, .npz with one 3D array,
                [x, y, z]; .tif, .tiff or a folder of them, [z][y, x], sorted by name (tifffile); a folder of
                DICOM slices, sorted by position (pydicom); .raw, or any file if shape and dtype are given
     mu_water   attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1]
@@ -195,7 +195,9 @@ def read_volume(
         raise InputError(f'mu_water must be positive, in 1/mm, not {shown(mu_water)}; water at 60 keV has 0.0206')
     if (shape is None) != (dtype is None) and not name.endswith('.raw'):
         raise InputError(f'{path}: the shape and the dtype of raw bytes go together; give both or neither')
-    if path.is_dir():
+    if name.endswith('.zarr'):
+        data, affine, description = ome_zarr.read(path)
+    elif path.is_dir():
         data, affine = slices.read_folder(path)
         hu = True if hu is None and affine is not None else hu  # DICOM's
     elif shape is not None and dtype is not None or name.endswith('.raw'):

@@ -119,13 +119,45 @@ def volumes() -> dict[str, list[Sample]]:
         ],
         'raw': [Sample('v.raw', {'v.raw': raw})],
     }
-    return out | _tiff() | _dicom()
+    return out | _zarr() | _tiff() | _dicom()
 
 
 def _saved_pair(image) -> dict[str, Any]:
     maps = image.make_file_map({'header': io.BytesIO(), 'image': io.BytesIO()})
     image.to_file_map(maps)
     return maps
+
+
+def _zarr():
+    values, shape = VALUES.transpose(2, 1, 0), list(SHAPE[::-1])
+    chunk = gzip.compress(values.tobytes(), mtime=0)
+    axes = [dict(name=name, type='space', unit='millimeter') for name in 'zyx']
+    placed = [dict(type='scale', scale=[2.0, 1.0, 1.0]), dict(type='translation', translation=[1.0, 2.0, 3.0])]
+    image = dict(axes=axes, datasets=[dict(path='0', coordinateTransformations=placed)], version='0.4')
+    group = dict(zarr_format=3, node_type='group', attributes=dict(ome=dict(version='0.5', multiscales=[image])))
+    array = dict(
+        zarr_format=3, node_type='array', shape=shape, data_type='uint8', fill_value=0, attributes={},
+        chunk_grid=dict(name='regular', configuration=dict(chunk_shape=shape)),
+        chunk_key_encoding=dict(name='default', configuration=dict(separator='/')),
+        codecs=[dict(name='bytes'), dict(name='gzip', configuration=dict(level=5))],
+    )  # fmt: skip
+    older = dict(
+        zarr_format=2, shape=shape, chunks=shape, dtype='|u1', fill_value=0, order='C', filters=None,
+        compressor=dict(id='gzip', level=5),
+    )  # fmt: skip
+    third = {'zarr.json': Structured(group, as_json), '0/zarr.json': Structured(array, as_json), '0/c/0/0/0': chunk}
+    second = {
+        '.zattrs': Structured(dict(multiscales=[image]), as_json),
+        '0/.zarray': Structured(older, as_json),
+        '0/0.0.0': chunk,
+        '.zgroup': as_json(dict(zarr_format=2)),
+    }
+    return {
+        'ome-zarr': [
+            Sample('v.zarr', {f'v.zarr/{name}': content for name, content in files.items()})
+            for files in (third, second)
+        ]
+    }
 
 
 def _tiff():
