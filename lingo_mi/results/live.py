@@ -124,12 +124,15 @@ class Live:
             self._spent += self._latest
 
     def close(self, finished: bool) -> None:
-        """See `watch.Watcher`. Waits a moment for a page that is open, so that it sees the end."""
+        """See `watch.Watcher`. The server ends once a page that is open has seen the end, or after `PATIENCE`."""
         if finished and self._waiting is not None and self._watched():
             self._show(self._waiting)
         with self._lock:
             self._done = True
             self._line += ' The fit is finished.' if finished else ' The fit was stopped.'
+        threading.Thread(target=self._end).start()  # no daemon: a process that ends waits for it
+
+    def _end(self) -> None:
         if self._watched():
             self._end_seen.wait(PATIENCE)
         self._server.shutdown()
