@@ -31,7 +31,7 @@ def arguments() -> argparse.Namespace:
     )
     p.add_argument('--sm', type=int, nargs='+', default=[75, 80, 90], help='compute capabilities times ten')
     p.add_argument('--noise', action='store_true', help='once more, with the errors that NVIDIA allows, and checks')
-    p.add_argument('--out', type=Path, metavar='DIR', help='keep what is done there, and go on from it')
+    p.add_argument('--out', type=Path, metavar='DIR', help='keep what has passed there, and go on from it')
     p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
     args = p.parse_args()
     if shutil.which(args.stand_in) is None:

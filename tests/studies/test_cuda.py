@@ -213,7 +213,7 @@ def checkout(tmp_path, monkeypatch):
 
 
 def test_a_check_goes_on_where_it_was_stopped(ptxas, checkout, tmp_path):
-    """A stored file is not run again; one that is cut off is. A kernel that several files compile counts once."""
+    """A stored file is not run again; one that is cut off, or has failed, is. A kernel that several files compile counts once."""
     stand_in, tests = checkout
     names, cells, lines = all_files(tests), CellFiles(tmp_path / 'cells', 'outcome', 'kernels', 'commit'), []
     assert names == ['part/test_a.py', 'test_b.py', 'test_c.py']
@@ -226,6 +226,9 @@ def test_a_check_goes_on_where_it_was_stopped(ptxas, checkout, tmp_path):
     cells.path('sm_75', 'test_b.py').write_text('{"outcome"')
     assert run_tests(stand_in, tests, names, sm=75, cells=cells, report=lines.append)[0] == outcome
     assert (tmp_path / 'ran.txt').read_text() == 'xxx'
+    (tests / 'test_c.py').write_text(PASSES)
+    outcome, _ = run_tests(stand_in, tests, names, sm=75, cells=cells, report=lines.append)
+    assert (outcome.passed, outcome.failed) == (3, []) and (tmp_path / 'ran.txt').read_text() == 'xxxx'
 
 
 @pytest.mark.parametrize('args', [(), ('--stand-in', 'no-such-program'), ('--stand-in', 'true', '--tests', 'nowhere')])
