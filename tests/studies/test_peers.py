@@ -39,7 +39,7 @@ def peers(monkeypatch, capsys, tmp_path, scan):
     def run(*args, missing=()):
         for name in missing:
             monkeypatch.setitem(sys.modules, name, None)
-        small = '-D', f'projections={scan}', '-D', 'voxels=16', '-D', 'voxel=2.4'
+        small = '-D', f'projections={scan}', '-D', 'voxels=16', '-D', 'voxel_size=2.4'
         monkeypatch.setattr(
             sys, 'argv', ['peers.py', 'walnut', *small, *map(str, args), '--out', str(tmp_path / 'out')]
         )
@@ -67,7 +67,7 @@ def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
     (folder / '6_views' / 'fdk.json').write_text(json.dumps(cell | dict(method='fdk', held_out_rms=0.5)))
     code, text, err = peers(*command)
     assert code == 0 and '| 6 | FDK | 0.5000 |' in text and '6 views, asd-pocs' not in text, err
-    code, _, err = peers(*command, '-D', 'voxel=2.5')
+    code, _, err = peers(*command, '-D', 'voxel_size=2.5')
     assert code == 2 and err.count('\n') == 1 and 'another scan' in err
 
 
