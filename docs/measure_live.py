@@ -1,4 +1,4 @@
-"""What a live page that is looked at costs a fit: the number of the page `how_to/look.md`.
+"""What a live page that is looked at costs a fit.
 
 pip install -e .
 python docs/measure_live.py

@@ -109,15 +109,15 @@ def _placed(level, dimensions):
     steps, shift = np.ones(dimensions), np.zeros(dimensions)
     for transformation in level['coordinateTransformations']:
         kind = transformation['type']
-        numbers = np.array([float(n) for n in transformation[kind]]) if kind != 'identity' else np.zeros(0)
-        if numbers.shape != (dimensions if kind != 'identity' else 0,) or not np.isfinite(numbers).all():
+        if kind == 'identity':
+            continue
+        numbers = np.array([float(n) for n in transformation[kind]])
+        if kind not in ('scale', 'translation') or len(numbers) != dimensions or not np.isfinite(numbers).all():
             raise ValueError(kind)
         if kind == 'scale':
             steps, shift = steps * numbers, shift * numbers
-        elif kind == 'translation':
+        else:
             shift = shift + numbers
-        elif kind != 'identity':
-            raise ValueError(kind)
     return steps, shift
 
 

@@ -94,7 +94,7 @@ def preview(volume: np.ndarray, most: int = MOST_VOXELS) -> tuple[np.ndarray, in
     for axis, size in enumerate(volume.shape):  # one by one: all at once takes numpy five times as long
         by = min(n, size)
         whole = np.moveaxis(mean, axis, 0)[: size // by * by]
-        mean = np.moveaxis(sum(whole[i::by] for i in range(1, by)) + whole[0::by], 0, axis) / np.float32(by)
+        mean = np.moveaxis(sum(whole[i::by] for i in range(by)), 0, axis) / np.float32(by)
     return mean, n
 
 

@@ -25,14 +25,15 @@ from lingo_mi.scan import Scan
 from lingo_mi.studies.markdown import table
 
 WARM = 3  # turns that are not counted
-VIEWS = 4
+VIEWS = 4  # at most
 
 
 def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     """Seconds of each part of a step, of a whole one, and of the integrator alone."""
     settings, state = fitted.settings, DeviceState(fitted.state)
-    geometry, rng = fitted.geometry.subset(list(range(VIEWS))), np.random.default_rng(0)
-    scan = Scan(geometry, rng.uniform(1, 2, (VIEWS, *geometry.nDetector)).astype(np.float32))
+    views = min(VIEWS, len(fitted.geometry))
+    geometry, rng = fitted.geometry.subset(list(range(views))), np.random.default_rng(0)
+    scan = Scan(geometry, rng.uniform(1, 2, (views, *geometry.nDetector)).astype(np.float32))
     without = {
         'whole': settings,
         'no SSIM': replace(settings, loss=replace(settings.loss, lambda_ssim=0.0)),
@@ -45,7 +46,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
 
     def integrate(turn, backward):
         gaussians = [dr.detach(x) for x in steppers['whole'].forward.gaussians(state.values)]
-        view = steppers['whole'].targets[turn % VIEWS].view
+        view = steppers['whole'].targets[turn % views].view
         if backward:
             dr.enable_grad(gaussians)
         image = line_integrals(*gaussians, view=view, options=RenderOptions(settings.model.extent))
@@ -58,7 +59,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
         'image': lambda turn: integrate(turn, backward=False),
         'image and derivatives': lambda turn: integrate(turn, backward=True),
         'Adam': lambda _: adam_step(state, gradients, settings, late),
-        **{name: lambda turn, s=s: s.step(state, [turn % VIEWS], late, rng) for name, s in steppers.items()},
+        **{name: lambda turn, s=s: s.step(state, [turn % views], late, rng) for name, s in steppers.items()},
     }
     times: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(WARM + repeats):
