@@ -34,6 +34,6 @@ def main() -> None:
     from lingo_mi.studies.benchmarks.step import described, measured
 
     fitted = Fitted.from_checkpoint(args.checkpoint)
-    if not fitted.settings.cloud:
-        raise InputError(f'{args.checkpoint}: is a neural field, whose step has other parts')
+    if not (fitted.settings.cloud and fitted.settings.volumetric):
+        raise InputError(f'{args.checkpoint}: is a neural field or composites opacities; its step has other parts')
     print(described(measured(fitted, args.repeats)))

@@ -8,20 +8,29 @@ from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.studies.benchmarks.step import described, measured
 
 
+def checkpoint(folder, method, **settings):
+    """Of a short fit of three views."""
+    scan = dict(DSO=100, DSD=150, nDetector=24, dDetector=3, nVoxel=16, dVoxel=2, angles=lm.circular(3))
+    data = lm.simulate(lm.phantom('foot', size=16).data, lm.Geometry.cone(**scan), progress=False)
+    lm.fit(data, method, progress=False, checkpoint=folder / 'checkpoint.npz', **settings)
+    return folder / 'checkpoint.npz'
+
+
 def test_parts_of_a_step(tmp_path):
     """The parts make a whole, and each that computes takes time."""
-    scan = dict(DSO=100, DSD=150, nDetector=24, dDetector=3, nVoxel=16, dVoxel=2)
-    data = lm.simulate(
-        lm.phantom('foot', size=16).data, lm.Geometry.cone(angles=lm.circular(6), **scan), progress=False
-    )
-    lm.fit(data, 'fast', n_points=200, iterations=20, progress=False, checkpoint=tmp_path / 'checkpoint.npz')
-    found = measured(Fitted.from_checkpoint(tmp_path / 'checkpoint.npz'), 3)
+    found = measured(Fitted.from_checkpoint(checkpoint(tmp_path, 'fast', n_points=200, iterations=20)), 3)
     whole, densification = found.pop('a step'), found.pop('densification')
     assert abs(sum(found.values()) - whole) < 1e-9 and densification >= 0
     assert min(found['integrator, forward'], found['Adam'], whole) > 0
     assert 'A step takes 2.00 times' in described(
         {'integrator, forward': 0.004, 'integrator, backward': 0.006, 'a step': 0.02}
     )
+
+
+def test_another_kind_of_fit(tmp_path):
+    path = checkpoint(tmp_path, '3dgs', n_points=50, iterations=2)
+    code, _, err = run(FIT.with_name('bench_step.py'), path)
+    assert code == 2 and 'composites opacities' in err and err.count('\n') == 1
 
 
 @pytest.mark.parametrize('args', [(), ('nothing.npz',), ('nothing.npz', '--repeats', 0)])
