@@ -11,6 +11,7 @@ import base64
 import gzip
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -94,7 +95,7 @@ def preview(volume: np.ndarray, most: int = MOST_VOXELS) -> tuple[np.ndarray, in
     for axis, size in enumerate(volume.shape):  # one by one: all at once takes numpy five times as long
         by = min(n, size)
         whole = np.moveaxis(mean, axis, 0)[: size // by * by]
-        mean = np.moveaxis(sum(whole[i::by] for i in range(by)), 0, axis) / np.float32(by)
+        mean = np.moveaxis(reduce(np.add, (whole[i::by] for i in range(by))), 0, axis) / np.float32(by)
     return mean, n
 
 
