@@ -43,6 +43,7 @@ from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
 
 REFERENCE = 'reference'
+ACROSS = 5  # slices side by side in the picture
 RTK_BETAS = 10.0, 30.0, 100.0, 300.0  # none is good for every number of views
 
 
@@ -203,27 +204,30 @@ class Study:
         return '\n'.join(lines)
 
     def draw(self, methods: Sequence[str], views: Sequence[int], path: Path) -> None:
-        """Picture of the middle slice across z: a column a method, a row a number of views; the reference on the left."""
+        """Picture of the middle slice across z, of every number of views: the reference, then the methods."""
         from matplotlib.figure import Figure  # half a second that a study need not wait for
 
         reference = self.reference()
         middle = reference.shape[2] // 2
         top = float(np.quantile(reference[:, :, middle], 0.995))
-        figure = Figure(figsize=(2.1 * (len(methods) + 1), 2.2 * len(views)), layout='constrained')
-        axes = figure.subplots(len(views), len(methods) + 1, squeeze=False)
-        for row, count in zip(axes, views):
-            for axis, name in zip(row, [REFERENCE, *methods]):
-                axis.set(xticks=[], yticks=[])
-                axis.spines[:].set_visible(False)
-                if name != REFERENCE and self.cells.get(_case(count), name) is None:
+        names = [REFERENCE, *methods]
+        columns, rows = min(len(names), ACROSS), -(-len(names) // ACROSS)
+        figure = Figure(figsize=(2.4 * columns, 2.6 * rows * len(views)), layout='constrained')
+        axes = figure.subplots(rows * len(views), columns, squeeze=False)
+        for axis in axes.flat:
+            axis.axis('off')
+        for block, count in zip(np.split(axes, len(views)), views):
+            for axis, name in zip(block.flat, names):
+                if name == REFERENCE:
+                    shown, title = reference, 'reference'
+                elif self.cells.get(_case(count), name) is None:
                     continue
-                shown = reference if name == REFERENCE else self.volume(count, name)
+                else:
+                    shown, title = self.volume(count, name), f'{METHODS[name][0].replace("`", "")}, {count} views'
                 axis.imshow(shown[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
-            row[0].set_ylabel(f'{count} views')
-        for axis, title in zip(axes[0], ['reference', *(METHODS[name][0].replace('`', '') for name in methods)]):
-            axis.set_title(title, fontsize=9)
+                axis.set_title(title, fontsize=9)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=90)
+        figure.savefig(path, dpi=110)
 
 
 def _case(views: int) -> str:
