@@ -210,21 +210,19 @@ class Study:
         reference = self.reference()
         middle = reference.shape[2] // 2
         top = float(np.quantile(reference[:, :, middle], 0.995))
-        names = [REFERENCE, *methods]
-        columns, rows = min(len(names), ACROSS), -(-len(names) // ACROSS)
+        slices = 1 + len(methods)
+        columns, rows = min(slices, ACROSS), -(-slices // ACROSS)
         figure = Figure(figsize=(2.4 * columns, 2.6 * rows * len(views)), layout='constrained')
         axes = figure.subplots(rows * len(views), columns, squeeze=False)
         for axis in axes.flat:
             axis.axis('off')
         for block, count in zip(np.split(axes, len(views)), views):
-            for axis, name in zip(block.flat, names):
-                if name == REFERENCE:
-                    shown, title = reference, 'reference'
-                elif self.cells.get(_case(count), name) is None:
-                    continue
-                else:
-                    shown, title = self.volume(count, name), f'{METHODS[name][0].replace("`", "")}, {count} views'
-                axis.imshow(shown[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
+            shown = [('reference', reference)]
+            for name in methods:
+                if self.cells.get(_case(count), name) is not None:
+                    shown.append((f'{METHODS[name][0].replace("`", "")}, {count} views', self.volume(count, name)))
+            for axis, (title, volume) in zip(block.flat, shown):
+                axis.imshow(volume[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
                 axis.set_title(title, fontsize=9)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=110)
