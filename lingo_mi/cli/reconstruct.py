@@ -22,7 +22,8 @@ the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is lea
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is
 given; with --complete and --start, those that the fit has modelled.
 
-A volume larger than memory is made and written in slabs of --slab slices, by fdk and voxelize.
+A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
+ones keep it in the folder V.slabs beside it until it is complete; where they were stopped, the same command goes on.
 """
 
 import argparse
@@ -56,6 +57,7 @@ from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, 
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_signal
+from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
@@ -65,6 +67,7 @@ from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
 
 FROM_CLOUD = 'refined', 'voxelize'  # algorithms that nothing can be done by without a cloud
+IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'voxelize'  # those that need not hold the whole volume
 
 
 def arguments() -> argparse.Namespace:
@@ -98,7 +101,7 @@ def arguments() -> argparse.Namespace:
         '--slab',
         type=int,
         metavar='N',
-        help='hold N slices of the volume in memory at once (fdk and voxelize; default: all)',
+        help='hold N slices of the volume in memory at once (fdk, sart, os-sart, sirt, voxelize; default: all)',
     )
     p.add_argument(
         '--report',
@@ -159,8 +162,10 @@ def check_arguments(args: argparse.Namespace) -> None:
         raise InputError(f'--seed must not be negative, but is {args.seed}')
     if args.slab is not None and args.report is not None:
         raise InputError('--report needs the whole volume: leave out --slab')
-    if args.slab is not None and (args.slab < 1 or args.algorithm not in ('fdk', 'voxelize')):
-        raise InputError('--slab is a number of slices from 1 on, for --algorithm fdk and voxelize')
+    if args.slab is not None and (args.slab < 1 or args.algorithm not in IN_SLABS):
+        raise InputError(f'--slab is a number of slices from 1 on, for --algorithm {", ".join(IN_SLABS)}')
+    if args.slab is not None and args.start:
+        raise InputError('--slab starts from an empty volume: leave out --start, or --slab')
     if args.algorithm == 'best' and (args.complete or args.start):
         raise InputError(
             '--algorithm best chooses by measured views, which a fitted cloud has seen already: leave out --complete and --start'
@@ -260,9 +265,17 @@ def reconstruct_into(
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
-        if args.slab and isinstance(algorithm, FDK):
-            with Progress('fdk', len(scan) * len(parts)) as bar:
-                slabs = algorithm.slabs(scan, args.slab, progress=lambda done, *_: bar.update(done))
+        if args.slab:
+            assert isinstance(algorithm, FDK | Sweeps)  # as `check_arguments` has made sure
+            with Progress(algorithm.name, algorithm.slab_steps(scan, args.slab)) as bar:
+
+                def report(done, _, residual):
+                    bar.update(done, residual=residual)
+
+                if isinstance(algorithm, FDK):
+                    slabs = algorithm.slabs(scan, args.slab, progress=report)
+                else:
+                    slabs = algorithm.slabs(scan, args.slab, out.with_name(out.name + '.slabs'), progress=report)
                 write_in_slabs(out, scan, slabs, args)
             return
         with progress_bar(algorithm, scan) as progress:

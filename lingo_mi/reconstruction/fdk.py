@@ -270,6 +270,10 @@ class FDK(Algorithm):
             slab: CircularGeometry = geometry.slab(*part)  # type: ignore[assignment] - of the same class
             yield _backprojected(slab, lambda first: found[first : first + BATCH], report)
 
+    def slab_steps(self, scan: Scan, thickness: int) -> int:
+        """The number of steps of `slabs`, for `progress`."""
+        return len(scan) * len(scan.geometry.slabs(thickness))
+
 
 def _weighted(scan: Scan) -> tuple[np.ndarray, CircularGeometry]:
     """Projections on an upright panel, rays weighted by how often they were measured; and their geometry."""

@@ -31,6 +31,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from os import PathLike
 from typing import ClassVar
 
 import drjit as dr
@@ -38,9 +39,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import as_path
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
-from lingo_mi.reconstruction.system import System, evaluated, scalar
+from lingo_mi.reconstruction.sart_update import normalised, updated
+from lingo_mi.reconstruction.slab_sweeps import swept
+from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
 
@@ -82,22 +87,13 @@ def sweep(
     system: System, x: mi.Float, lmbda: float, parts: Sequence[Sequence[int] | np.ndarray], noneg: bool
 ) -> mi.Float:
     """One pass over all blocks of views, from a volume (mi.Float [voxels], density per mm) to the next."""
-    A, step, start = system.A, scalar(lmbda), x
+    A, start = system.A, x
     for views in parts:
         ax, path = A.forward(x, views)
         if system.weights is not None:
             path = A.select(system.weighed, views)
-        error = A.select(system.b, views) - ax
-        error = evaluated(dr.select(path > 0, error * dr.rcp(dr.maximum(path, 1e-30)), 0))
-
-        def updated(voxel, change, weight, x=x):
-            change = dr.select(weight > 0, change * dr.rcp(dr.maximum(weight, 1e-30)), 0)
-            if system.weights is not None:
-                change *= dr.gather(mi.Float, system.weights, voxel)
-            value = dr.fma(step, change, dr.gather(mi.Float, x, voxel))
-            return dr.maximum(value, 0) if noneg else value
-
-        x = evaluated(A.adjoint(error, views, updated))
+        error = normalised(A.select(system.b, views) - ax, path)
+        x = evaluated(A.adjoint(error, views, updated(x, lmbda, noneg, system.weights)))
     if system.between is None and system.blur is None:
         return x
     change = x - start
@@ -142,6 +138,37 @@ class Sweeps(Algorithm):
             if progress:
                 progress(k + 1, how.niter, residuals[-1])
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+
+    def slabs(
+        self, scan: Scan, thickness: int, folder: str | PathLike, *, progress: Progress | None = None
+    ) -> Iterator[np.ndarray]:
+        """The volume of `run` in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
+
+        folder     for the volume while it is made, twice its size; made if missing, and removed at the end. Where the work was
+                   stopped, the same call goes on after the last whole update, to the same result
+        progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of
+                   this update before it)
+
+        Takes memory for seven slabs, two sets of projections, and ten images for each view of a block. Raises InputError as
+        `run`, if tol is above 0, if rays leave voxels out, for too little memory or room on the disk, and for a folder that
+        holds other work.
+
+            for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
+                ...
+        """
+        how = self._by_blocks(len(scan))
+        if how.tol:
+            raise InputError(
+                'slabs do not know the residual of all views: leave out tol, or make the volume without slabs'
+            )
+        order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
+        updates = [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
+        return swept(scan, updates, how.noneg, thickness, as_path('folder', folder), progress)
+
+    def slab_steps(self, scan: Scan, thickness: int) -> int:
+        """The number of steps of `slabs`, for `progress`."""
+        how = self._by_blocks(len(scan))
+        return how.niter * -(-len(scan) // how.blocksize) * len(scan.geometry.slabs(thickness))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,281 @@
+"""Sweeps over a volume that is larger than memory: it lies on a disk, and one slab of it at a time is worked on.
+
+Line integrals of slabs add up to those of the whole volume if every voxel keeps the weights that it has there. A projector holds
+the outermost values for half a voxel, so a slab is projected between two slices of zeros, but at the ends of the volume.
+
+An update of the volume reads it once and writes it once. While a slab is in memory, it is changed by what the last views
+lacked, and the line integrals of the next ones are taken.
+
+The volume lies in two files, which updates read and write in turn, and a third file says how many updates they have had. So
+work that was stopped at any moment, `kill -9` included, goes on after the last whole update, to the same result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from math import prod
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.file_access import reading, write_text, writing
+from lingo_mi.folder_lock import locked
+from lingo_mi.projectors.grid_pair import GridPair
+from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.reconstruction.algorithm import Progress
+from lingo_mi.reconstruction.preconditions import is_circular
+from lingo_mi.reconstruction.sart_update import normalised, updated
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm
+from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
+from lingo_mi.scan import Scan
+from lingo_mi.scene.checks import check_memory
+
+Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
+STATE = 'state.json'
+LENGTHS = 4  # views whose rays' lengths are computed at once
+SLABS, IMAGES = 7, 10  # peak memory, as measured: in slabs, and in images for each view of an update
+
+
+def swept(
+    scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int, folder: Path, progress: Progress | None = None
+) -> Iterator[np.ndarray]:
+    """The volume after the updates, in slabs [x, y, thickness] along z; the last may be thinner.
+
+    folder     for the files; removed when the last slab has been taken, and kept where the work is stopped earlier
+    progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this
+               update before it)
+
+    Raises InputError for pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two
+    volumes, for a folder that holds other work, and if the volume is not finite.
+    """
+    if leave_voxels_out(scan.geometry):
+        raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
+    slab, n, pixels = 4 * prod(scan.geometry.nVoxel[:2]) * thickness, len(scan), 4 * prod(scan.geometry.nDetector)
+    check_memory(
+        scan.geometry.slab(0, min(thickness, scan.geometry.nVoxel[2])),
+        needed=SLABS * slab + 2 * n * pixels + IMAGES * max(len(views) for _, views in updates) * pixels,
+    )
+    with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
+        system, parts = _Slabs(scan, volume), len(volume.parts)
+        lengths = system.lengths()
+        ax = system.project(updates[volume.done][1]) if volume.done < len(updates) else None
+        for done in range(volume.done, len(updates)):
+            lmbda, views = updates[done]
+            b = system.A.images(scan.projections[views])
+            error = evaluated(b - ax)
+            relative = norm(error) / (norm(b) or 1.0)
+            if not np.isfinite(relative):
+                raise InputError(DIVERGED)
+            error = normalised(error, mi.Float(lengths[views].ravel()))
+            following = updates[done + 1][1] if done + 1 < len(updates) else None
+
+            def report(slabs, done=done, relative=relative):
+                if progress:
+                    progress(done * parts + slabs, len(updates) * parts, relative)
+
+            ax = system.update(error, views, lmbda, noneg, following, report)
+        for part in range(parts):
+            slab = volume.read(part)
+            if not np.isfinite(slab).all():
+                raise InputError(DIVERGED)
+            yield slab
+        volume.remove()
+    with suppress(OSError):  # something else lies there
+        folder.rmdir()
+
+
+class _Slabs:
+    """The matrix A of a scan, by slabs of a volume on a disk. Images are mi.Float [view, u, v].
+
+    A   that of the first slab, for what does not depend on the voxels
+    """
+
+    def __init__(self, scan: Scan, volume: _Volume):
+        self.scan, self.volume = scan, volume
+        self.A = self._projector(0)[0]
+
+    def lengths(self) -> np.ndarray:
+        """A 1, float32 [view, pixel]."""
+        n = len(self.scan)
+        out = np.zeros((n, self.A.pixels), np.float32)
+        for part in range(len(self.volume.parts)):
+            A, inside = self._projector(part)
+            ones = evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0))
+            for first in range(0, n, LENGTHS):
+                views = np.arange(first, min(first + LENGTHS, n))
+                out[views] += A.forward(ones, views)[0].numpy().reshape(len(views), -1)
+        return out
+
+    def project(self, views: np.ndarray) -> mi.Float:
+        """A x of some views."""
+        ax = self._nothing(views)
+        if self.volume.done:
+            for part in range(len(self.volume.parts)):
+                A, _ = self._projector(part)
+                ax = evaluated(ax + A.forward(self._load(part), views)[0])
+        return ax
+
+    def update(
+        self,
+        error: mi.Float,
+        views: np.ndarray,
+        lmbda: float,
+        noneg: bool,
+        following: np.ndarray | None,
+        report: Callable[[int], None],
+    ) -> mi.Float | None:
+        """Update the volume by the normalised error of some views, and return A x of the following ones.
+
+        report   called with the number of slabs that are updated
+        """
+        ax = None if following is None else self._nothing(following)
+        for part in range(len(self.volume.parts)):
+            A, x = self._updated(part, error, views, lmbda, noneg)
+            if following is not None:
+                ax = evaluated(ax + A.forward(x, following)[0])
+            self._store(part, x, A.size)
+            report(part + 1)
+        self.volume.turn()
+        return ax
+
+    def _updated(self, part, error, views, lmbda, noneg):
+        """The projector of a slab, and the slab after an update."""
+        A, inside = self._projector(part)
+        rule = updated(self._load(part), lmbda, noneg)
+
+        def between_zeros(voxel, *sums):
+            return dr.select(inside(voxel), rule(voxel, *sums), 0)
+
+        return A, evaluated(A.adjoint(error, views, between_zeros))
+
+    def _nothing(self, views):
+        nothing = dr.zeros(mi.Float, len(views) * self.A.pixels)
+        dr.make_opaque(nothing)
+        return nothing
+
+    def _margins(self, part):
+        """How many slices of zeros lie below and above a slab."""
+        begin, end = self.volume.parts[part]
+        return int(begin > 0), int(end < self.scan.geometry.nVoxel[2])
+
+    def _projector(self, part):
+        """The projector of a slab between its slices of zeros, and a function that tells whether a voxel is none of these."""
+        (begin, end), (below, above) = self.volume.parts[part], self._margins(part)
+        geometry = self.scan.geometry.slab(begin - below, end + above)
+        A = Joseph(geometry) if is_circular(self.scan) else GridPair(geometry, self.scan.valid)
+        low, high = (dr.opaque(mi.UInt, z) for z in (below, end - begin + below))
+
+        def inside(voxel):
+            height = voxel % A.size[2]
+            return (height >= low) & (height < high)
+
+        return A, inside
+
+    def _load(self, part):
+        return mi.Float(np.pad(self.volume.read(part), ((0, 0), (0, 0), self._margins(part))).ravel())
+
+    def _store(self, part, x, size):
+        (begin, end), (below, _) = self.volume.parts[part], self._margins(part)
+        self.volume.write(part, x.numpy().reshape(size)[:, :, below : below + end - begin])
+
+
+class _Volume:
+    """A volume in slabs, in two files of a folder: one is read, the other written, and they change places.
+
+    parts   (begin, end) of the slabs
+    done    how often they have changed places; before, the volume is zero
+    """
+
+    def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
+        self.parts, self.done = scan.geometry.slabs(thickness), 0
+        self._size, self._folder, self._digest = scan.geometry.nVoxel, folder, digest
+        self._paths = folder / 'even.f32', folder / 'odd.f32'
+        state = folder / STATE
+        if state.exists():
+            with reading(state):
+                text = state.read_bytes()
+            try:
+                known = json.loads(text)
+                found, done = known['of'], int(known['updates'])
+            except (KeyError, TypeError, ValueError):
+                raise InputError(f'{state}: is no state of ours; move its folder away') from None
+            if found != digest:
+                raise InputError(
+                    f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
+                    'remove the folder, or repeat that command to complete it'
+                )
+            self.done = done
+        self._require_room()
+
+    def _require_room(self):
+        needed = 8 * prod(self._size) - sum(path.stat().st_size for path in self._paths if path.exists())
+        if needed > (free := shutil.disk_usage(self._folder).free):
+            raise InputError(
+                f'{self._folder}: two volumes need {needed / 2**30:,.1f} GiB more of the disk, which has '
+                f'{free / 2**30:,.1f}; choose another disk, or fewer voxels'
+            )
+
+    def __enter__(self) -> _Volume:
+        with writing(self._folder):
+            flags = os.O_RDWR | os.O_CREAT | getattr(os, 'O_BINARY', 0)
+            self._files = [os.fdopen(os.open(path, flags, 0o666), 'r+b', buffering=0) for path in self._paths]
+        return self
+
+    def __exit__(self, *error):
+        for file in self._files:
+            file.close()
+
+    def read(self, part: int) -> np.ndarray:
+        """A slab, float32 [x, y, slices]."""
+        shape, start = self._place(part)
+        if not self.done:
+            return np.zeros(shape, np.float32)
+        path, file = self._paths[self.done % 2], self._files[self.done % 2]
+        with reading(path):
+            file.seek(start)
+            values = np.fromfile(file, np.float32, prod(shape))
+        if len(values) < prod(shape):
+            raise InputError(f'{path}: is cut off; remove its folder, and begin again')
+        return values.reshape(shape)
+
+    def write(self, part: int, slab: np.ndarray) -> None:
+        """Set a slab of the next volume."""
+        file = self._files[(self.done + 1) % 2]
+        with writing(self._folder):
+            file.seek(self._place(part)[1])
+            np.ascontiguousarray(slab).tofile(file)
+
+    def turn(self) -> None:
+        """The next volume is complete: it becomes the one that is read."""
+        with writing(self._folder):
+            os.fsync(self._files[(self.done + 1) % 2].fileno())
+        self.done += 1
+        write_text(self._folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
+
+    def remove(self) -> None:
+        """Remove the files."""
+        with writing(self._folder):
+            for path in (self._folder / STATE, *self._paths):  # the state first: without it the rest is nothing
+                path.unlink(missing_ok=True)
+
+    def _place(self, part):
+        (begin, end), (nx, ny, _) = self.parts[part], self._size
+        return (nx, ny, end - begin), 4 * nx * ny * begin
+
+
+def _digest(scan, updates, noneg, thickness):
+    """Of all that the result depends on."""
+    found = hashlib.sha256(repr((noneg, thickness)).encode())
+    for lmbda, views in updates:
+        found.update(repr((lmbda, views.tolist())).encode())
+    for value in (type(scan.geometry).__name__, *vars(scan.geometry).values(), scan.projections, scan.valid):
+        found.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return found.hexdigest()

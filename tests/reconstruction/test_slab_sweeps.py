@@ -1,0 +1,203 @@
+"""SART, OS-SART and SIRT in slabs: the volume of the whole, in the memory of a slab, and work that is stopped and goes on."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from helpers.script import FIT, SCENE, run
+from lingo_mi.errors import InputError
+from lingo_mi.files.volumes import read_volume
+from lingo_mi.reconstruction import OSSART, SART, SIRT
+
+RECONSTRUCT = FIT.with_name('reconstruct.py')
+SHAPE = 24, 20, 16
+
+
+@pytest.fixture(scope='module')
+def scan():
+    """A cone beam that meets the ends of the volume at a slant, with a box of unequal sides off the axis."""
+    geometry = lm.Geometry.cone(
+        DSO=300,
+        DSD=450,
+        nDetector=(40, 48),
+        dDetector=4.0,
+        nVoxel=SHAPE,
+        dVoxel=(4.0, 5.0, 6.0),
+        offOrigin=(3.0, -4.0, 5.0),
+        angles=np.linspace(0, 6, 9),
+    )
+    return lm.simulate(np.random.default_rng(0).random(SHAPE, np.float32), geometry, progress=False).train
+
+
+def difference(found, whole):
+    return np.abs(np.concatenate(list(found), 2) - whole).max() / np.abs(whole).max()
+
+
+@pytest.mark.parametrize('thickness', [1, 5, 8, 24])
+@pytest.mark.parametrize(
+    'algorithm', [SART(niter=3), OSSART(niter=3, blocksize=4, noneg=False), SIRT(niter=3)], ids=lambda a: a.name
+)
+def test_slabs_are_the_whole_volume(scan, tmp_path, algorithm, thickness):
+    steps = []
+    slabs = algorithm.slabs(scan, thickness, tmp_path / 'work', progress=lambda *step: steps.append(step))
+    assert difference(slabs, algorithm.run(scan).volume) < 1e-5
+    count = algorithm.slab_steps(scan, thickness)
+    assert [step[:2] for step in steps] == [(i + 1, count) for i in range(count)]
+    assert steps[0][2] == 1 and steps[-1][2] < 0.1  # of an empty volume, and of the last
+    assert not (tmp_path / 'work').exists()
+
+
+def test_invalid_pixels(scan, tmp_path):
+    """The exact projector."""
+    valid = np.ones(scan.projections.shape, bool)
+    valid[:, 10:20, 20:30] = False
+    holed = replace(scan, valid=valid)
+    assert difference(SART(niter=2).slabs(holed, 5, tmp_path / 'work'), SART(niter=2).run(holed).volume) < 1e-5
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.mark.parametrize('last', [1, 2, 3, 10, 12])
+def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
+    """Stopped within the first update, between two, and within the last."""
+    how = OSSART(niter=2, blocksize=5)
+    whole = list(how.slabs(scan, 6, tmp_path / 'a'))
+
+    def stop(done, *_):
+        if done == last:
+            raise Stop
+
+    with pytest.raises(Stop):
+        list(how.slabs(scan, 6, tmp_path / 'b', progress=stop))
+    steps = []
+    found = list(how.slabs(scan, 6, tmp_path / 'b', progress=lambda done, *_: steps.append(done)))
+    np.testing.assert_array_equal(np.concatenate(found, 2), np.concatenate(whole, 2))
+    assert steps[0] == (last - 1) // 3 * 3 + 1  # three slabs an update
+
+
+def test_writing_goes_on(scan, tmp_path):
+    """Stopped after the last update, while slabs are taken: nothing is computed again."""
+    how = SART(niter=1)
+    whole = list(how.slabs(scan, 6, tmp_path / 'a'))
+    taken = how.slabs(scan, 6, tmp_path / 'b')
+    next(taken)
+    taken.close()
+    found = list(how.slabs(scan, 6, tmp_path / 'b', progress=lambda *_: pytest.fail('computed again')))
+    np.testing.assert_array_equal(np.concatenate(found, 2), np.concatenate(whole, 2))
+
+
+def test_other_work_is_left_alone(scan, tmp_path):
+    how = SART(niter=2)
+    slabs = how.slabs(scan, 16, tmp_path / 'work')
+    next(slabs)
+    slabs.close()
+    before = {p.name: p.read_bytes() for p in (tmp_path / 'work').iterdir()}
+    assert set(before) == {'even.f32', 'odd.f32', 'state.json'}
+    others = scan.projections.copy()
+    others[0, 0, 0] += 1e-3
+    for other, options in (
+        (scan, SART(niter=3)),
+        (scan, SART(niter=2, noneg=False)),
+        (replace(scan, projections=others), how),
+    ):
+        with pytest.raises(InputError, match='holds a reconstruction of other data or with other options'):
+            next(options.slabs(other, 16, tmp_path / 'work'))
+    with pytest.raises(InputError, match='holds a reconstruction of other data'):
+        next(how.slabs(scan, 8, tmp_path / 'work'))
+    assert {p.name: p.read_bytes() for p in (tmp_path / 'work').iterdir()} == before
+
+
+def test_spoiled_files(scan, tmp_path):
+    how, work = SART(niter=1), tmp_path / 'work'
+    slabs = how.slabs(scan, 16, work)
+    next(slabs)
+    slabs.close()
+    whole = {path.name: path.read_bytes() for path in work.iterdir()}
+    for name in ('even.f32', 'odd.f32'):
+        (work / name).write_bytes(whole[name][:-4])
+    with pytest.raises(InputError, match='is cut off; remove its folder'):
+        list(how.slabs(scan, 16, work))
+    for text in ('', '{', '[]', '{"of": 1}', 'null', '\xff'):
+        (work / 'state.json').write_text(text, encoding='latin-1')
+        with pytest.raises(InputError, match='is no state of ours'):
+            list(how.slabs(scan, 16, work))
+
+
+def test_bad_input(scan, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match='leave out tol'):
+        SART(tol=0.1).slabs(scan, 8, tmp_path / 'work')
+    fine = lm.Scan(scan.geometry.with_volume((96, 80, 64), (1.0, 1.25, 1.5)), scan.projections)
+    with pytest.raises(InputError, match='pixels are two or more voxels wide'):
+        next(SART().slabs(fine, 8, tmp_path / 'work'))
+    with pytest.raises(InputError, match='cannot be written'):
+        next(SART().slabs(scan, 8, Path('/proc/no/such')))
+    monkeypatch.setattr('shutil.disk_usage', lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match='two volumes need .* more of the disk'):
+        next(SART().slabs(scan, 8, tmp_path / 'work'))
+    assert not (tmp_path / 'work').exists()
+
+
+def test_the_command(tmp_path):
+    """Killed by the system, it goes on."""
+    scene, out, work = tmp_path / 'tiny.xml', tmp_path / 'slabs.nii.gz', tmp_path / 'slabs.nii.gz.slabs'
+    scene.write_text(SCENE)
+    options = '--algorithm', 'sart', '-D', 'niter=15'
+    code, _, err = run(RECONSTRUCT, scene, *options, '--out', tmp_path / 'whole.nii.gz')
+    assert code == 0, err
+    command = [sys.executable, RECONSTRUCT, scene, *options, '--slab', '8', '--out', out]
+    process = subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (work / 'state.json').exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert json.loads((work / 'state.json').read_text())['updates'] >= 1 and not out.exists()
+    code, text, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--out', out)
+    assert code == 0 and str(out) in text and not work.exists(), err
+    whole, found = read_volume(tmp_path / 'whole.nii.gz').data, read_volume(out).data
+    assert np.abs(found - whole).max() < 1e-5 * whole.max()
+    code, _, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--start', 'x.xml', '--out', out, '--force')
+    assert code == 2 and 'leave out --start' in err
+
+
+PROGRAM = """
+import sys
+import numpy as np
+import lingo_mi as lm
+from lingo_mi.runtime import use_variant
+use_variant('llvm_ad_mono')
+
+def go(nz):
+    g = lm.Geometry.cone(
+        DSO=1000, DSD=1500, nDetector=192, dDetector=2.6, nVoxel=(256, 256, nz), dVoxel=1, angles=np.arange(3.0)
+    )
+    for slab in lm.SART(niter=1).slabs(lm.Scan(g, np.ones((3, 192, 192), np.float32)), 16, sys.argv[1] + '/work'):
+        pass
+
+def peak():
+    return 1024 * next(int(l.split()[1]) for l in open('/proc/self/status') if l.startswith('VmHWM'))
+
+go(32)
+before = peak()
+go(int(sys.argv[2]))
+print(before, peak())
+"""
+
+
+@pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
+def test_memory_is_that_of_a_slab(tmp_path):
+    """A volume of sixteen times the slices, 134 MB, takes no more."""
+    command = [sys.executable, '-c', PROGRAM, str(tmp_path), '512']
+    before, peak = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert peak - before < 30e6, (before, peak)
