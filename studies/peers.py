@@ -44,7 +44,9 @@ from lingo_mi.studies.provenance import provenance
 
 REFERENCE = 'reference'
 ACROSS = 5  # slices side by side in the picture
-RTK_BETAS = 10.0, 30.0, 100.0, 300.0  # none is good for every number of views
+# None is good for every scan.
+RTK_BETAS = 10.0, 30.0, 100.0, 300.0
+SHARPNESS = -1.0, 0.0, 1.0, 2.0  # of MBIRJAX, whose default is 1
 
 
 def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
@@ -64,14 +66,26 @@ def _itk() -> Any:
 
 
 def _rtk_tv(scan: Scan) -> np.ndarray:
-    """RTK's total variation with the weight that predicts one view in five best from the others."""
-    itk, (kept, held_out) = _itk(), split(scan, 5)
+    """RTK's total variation, with the weight that is best for this scan."""
+    itk = _itk()
+    return _best_for(scan, RTK_BETAS, lambda part, beta: rtk_bridge.total_variation(part, itk, beta))
 
-    def miss(beta: float) -> float:
-        found = grid.project(rtk_bridge.total_variation(kept, itk, beta), held_out.geometry) - held_out.projections
+
+def _qggmrf(scan: Scan) -> np.ndarray:
+    """MBIRJAX with the sharpness that is best for this scan."""
+    mbirjax = _mbirjax()
+    return _best_for(scan, SHARPNESS, lambda part, value: mbirjax_bridge.reconstruct(part, mbirjax, sharpness=value))
+
+
+def _best_for(scan: Scan, values: Sequence[float], reconstruct: Callable[[Scan, float], np.ndarray]) -> np.ndarray:
+    """The volume by the setting that predicts one view in five best from the others."""
+    kept, held_out = split(scan, 5)
+
+    def miss(value: float) -> float:
+        found = grid.project(reconstruct(kept, value), held_out.geometry) - held_out.projections
         return float(np.nan_to_num(np.linalg.norm(found.astype(float)), nan=np.inf))
 
-    return rtk_bridge.total_variation(scan, itk, min(RTK_BETAS, key=miss))
+    return reconstruct(scan, min(values, key=miss))
 
 
 def _mbirjax() -> Any:
@@ -87,7 +101,7 @@ METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
     'sart': ('SART', lambda scan: SART().run(scan).volume),
     'asd-pocs': ('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
     'rtk-tv': ('RTK, total variation', _rtk_tv),
-    'mbirjax': ('MBIRJAX', lambda scan: mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=1.0)),
+    'mbirjax': ('MBIRJAX', _qggmrf),
     'fast': ("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
     'refined': ('`fast`, then `refined`', _refined),
     'best': ('`best`', lambda scan: Best().run(scan).volume),
