@@ -378,7 +378,12 @@ class Geometry(ABC):
         return replace(self, nVoxel=(nx, ny, end - begin), offOrigin=(x, y, middle))
 
     def slabs(self, thickness: int) -> list[tuple[int, int]]:
-        """(begin, end) of slabs of so many slices along z, from the first; the last may be thinner."""
+        """(begin, end) of slabs of so many slices along z, from the first; the last may be thinner.
+
+        Raises InputError unless a slab has a slice.
+        """
+        if thickness < 1:
+            raise InputError(f'a slab has one slice or more, not {thickness}')
         return [(z, min(z + thickness, self.nVoxel[2])) for z in range(0, self.nVoxel[2], thickness)]
 
     @property

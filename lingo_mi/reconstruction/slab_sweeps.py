@@ -58,11 +58,9 @@ def swept(
     """
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
-    slab, n, pixels = 4 * prod(scan.geometry.nVoxel[:2]) * thickness, len(scan), 4 * prod(scan.geometry.nDetector)
-    check_memory(
-        scan.geometry.slab(0, min(thickness, scan.geometry.nVoxel[2])),
-        needed=SLABS * slab + 2 * n * pixels + IMAGES * max(len(views) for _, views in updates) * pixels,
-    )
+    first = scan.geometry.slab(*scan.geometry.slabs(thickness)[0])
+    images = 2 * len(scan) + IMAGES * max(len(views) for _, views in updates)
+    check_memory(first, needed=4 * (SLABS * prod(first.nVoxel) + images * prod(first.nDetector)))
     with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
         system, parts = _Slabs(scan, volume), len(volume.parts)
         lengths = system.lengths()

@@ -137,6 +137,12 @@ def test_spoiled_files(scan, tmp_path):
 def test_bad_input(scan, tmp_path, monkeypatch):
     with pytest.raises(InputError, match='leave out tol'):
         SART(tol=0.1).slabs(scan, 8, tmp_path / 'work')
+    with pytest.raises(InputError, match='a slab has one slice or more, not 0'):
+        next(SART().slabs(scan, 0, tmp_path / 'work'))
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 1000)
+    with pytest.raises(InputError, match='need at least .* of memory'):
+        next(SART().slabs(scan, 8, tmp_path / 'work'))
+    monkeypatch.undo()
     fine = lm.Scan(scan.geometry.with_volume((96, 80, 64), (1.0, 1.25, 1.5)), scan.projections)
     with pytest.raises(InputError, match='pixels are two or more voxels wide'):
         next(SART().slabs(fine, 8, tmp_path / 'work'))
