@@ -5,7 +5,7 @@
 
 X3D's views are made by TIGRE's default projector, Siddon's, which takes a voxel for a box. Those of this package are exact for
 the trilinear interpolant of voxels. Here every voxel is cut into --cut pieces a side of its own density, whose interpolant is
-constant but within half a piece of its faces. The scene must have a volume as its only object, whose voxels are the scanner's.
+constant but within half a piece of its faces. What is scanned is the scene's true volume on the scanner's voxels.
 """
 
 from __future__ import annotations
@@ -50,8 +50,15 @@ def main() -> None:
     p.add_argument('out', type=Path, metavar='F.pickle', help='the scan, for --projections')
     p.add_argument('--cut', type=int, default=2, metavar='N', help='pieces of a voxel along each side (default 2)')
     args = p.parse_args()
+    if args.cut < 1:
+        p.error(f'--cut is 1 or more, not {args.cut}')
+    if args.out.exists():
+        p.error(f'{args.out}: exists already; choose another name')
     use_variant(None)
-    write_scan(args.out, with_boxes(simulate(args.scene), args.cut), 'naf')
+    try:
+        write_scan(args.out, with_boxes(simulate(args.scene), args.cut), 'naf')
+    except InputError as error:
+        p.error(str(error))
 
 
 if __name__ == '__main__':

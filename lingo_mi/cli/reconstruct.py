@@ -23,7 +23,8 @@ Beam hardening and scatter that the scene's tube names are taken out of the proj
 given; with --complete and --start, those that the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
-ones keep it in the folder V.slabs beside it until it is complete; where they were stopped, the same command goes on.
+ones keep it in a folder beside it, of its name and .slabs, until it is written; where they were stopped, the same command goes
+on.
 """
 
 import argparse
@@ -56,8 +57,10 @@ from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.reconstruction.preconditions import require_signal
+from lingo_mi.reconstruction.preconditions import require_rays, require_signal
+from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.sart import Sweeps
+from lingo_mi.reconstruction.slab_sweeps import discard
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
@@ -246,7 +249,9 @@ def reconstruct_into(
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, args.slab or 0)
     scan, inputs = dataset.train, {}
     parts = scan.geometry.slabs(args.slab or scan.geometry.nVoxel[2])
-    check_scan(scan.geometry.slab(*parts[0]), algorithm, views)
+    require_rays(scan.geometry)
+    if not (args.slab and isinstance(algorithm, Sweeps)):  # whose `slabs` knows better
+        check_room(scan.geometry.slab(*parts[0]), algorithm, views)
     if algorithm is None:
         assert cloud is not None  # as `check_arguments` has made sure
         if args.slab:
@@ -267,6 +272,7 @@ def reconstruct_into(
             scan = linearised(scan, scan.effects)
         if args.slab:
             assert isinstance(algorithm, FDK | Sweeps)  # as `check_arguments` has made sure
+            work = out.with_name(out.name + '.slabs')
             with Progress(algorithm.name, algorithm.slab_steps(scan, args.slab)) as bar:
 
                 def report(done, _, residual):
@@ -275,8 +281,10 @@ def reconstruct_into(
                 if isinstance(algorithm, FDK):
                     slabs = algorithm.slabs(scan, args.slab, progress=report)
                 else:
-                    slabs = algorithm.slabs(scan, args.slab, out.with_name(out.name + '.slabs'), progress=report)
+                    slabs = algorithm.slabs(scan, args.slab, work, progress=report)
                 write_in_slabs(out, scan, slabs, args)
+            if isinstance(algorithm, Sweeps):
+                discard(work)
             return
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress, **inputs)

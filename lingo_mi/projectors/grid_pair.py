@@ -7,6 +7,7 @@ valid pixels only.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import drjit as dr
@@ -30,6 +31,13 @@ class GridPair(Stack):
         super().__init__(geometry)
         self._rays = [mi.Float(row) for row in view_table(geometry)]
         self._valid = None if valid is None else self.images(valid)
+
+    def of_slab(self, slab: Geometry) -> GridPair:
+        """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
+        out = copy(self)
+        Stack.__init__(out, slab)
+        out._rays = [mi.Float(row) for row in view_table(slab)]
+        return out
 
     def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].

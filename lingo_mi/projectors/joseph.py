@@ -17,6 +17,7 @@ Volumes and images are on the device: volumes mi.Float [nx * ny * nz], z fastest
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,17 +110,20 @@ class Joseph(Stack):
                 f'{half:.4g} mm from the axis; lower nVoxel or dVoxel'
             )
         rays, voxel = geometry.rays(), geometry.dVoxel[2]
-        first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
         self._columns = mi.Float(column_table(geometry).ravel())
-        source = 0.0 if rays.parallel else (rays.source[0, 2] - first) / voxel
-        top = (rays.corner[0, 2] + rays.v[0, 2] / 2 - first) / voxel
-        # Height of the source, of the first row over it, and between rows, in voxels.
-        self._rows = [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
+        self._rows = _heights(geometry)
         self._matrix = mi.Float(self._column_matrix().ravel())
         # The largest number of rows with hats that cover a voxel; it is reached nearest to the source.
         nearest = 1.0 if rays.parallel else (geometry.DSO - half) / geometry.DSD
         rows = int(np.ceil(2 * voxel / (nearest * abs(rays.v[0, 2])) + 1e-3))
         self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
+
+    def of_slab(self, slab: Geometry) -> Joseph:
+        """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
+        out = copy(self)
+        Stack.__init__(out, slab)
+        out._rows = _heights(slab)
+        return out
 
     def _column_matrix(self):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
@@ -175,6 +179,15 @@ class _Tables:
     rows: Sequence
     matrices: Any
     margin: int
+
+
+def _heights(geometry):
+    """Height of the source, of the first row over it, and between rows, in voxels, on the device."""
+    rays, voxel = geometry.rays(), geometry.dVoxel[2]
+    first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
+    source = 0.0 if rays.parallel else (rays.source[0, 2] - first) / voxel
+    top = (rays.corner[0, 2] + rays.v[0, 2] / 2 - first) / voxel
+    return [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
 
 
 def _numbers(views):

@@ -47,6 +47,11 @@ def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: in
     views       number of views to reconstruct from (None: the geometry's own)
     """
     require_rays(geometry)
+    check_room(geometry, algorithm, views)
+
+
+def check_room(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
+    """Raises InputError if memory is too small; arguments as of `check_scan`."""
     views = views or len(geometry)
     if algorithm is None:
         check_memory(geometry, views=views)

@@ -144,12 +144,13 @@ class Sweeps(Algorithm):
     ) -> Iterator[np.ndarray]:
         """The volume of `run` in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
-        folder     for the volume while it is made, twice its size; made if missing, and removed at the end. Where the work was
-                   stopped, the same call goes on after the last whole update, to the same result
+        folder     for the volume while it is made, twice its size; made if missing. Where the work was stopped, the same call
+                   goes on after the last whole update, to the same result. The files stay: remove them when the volume is safe
         progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of
                    this update before it)
 
-        Takes memory for seven slabs, two sets of projections, and ten images for each view of a block. Raises InputError as
+        Takes memory for seven slabs, two sets of projections (three with invalid pixels), and ten images for each view of a
+        block. Raises InputError as
         `run`, if tol is above 0, if rays leave voxels out, for too little memory or room on the disk, and for a folder that
         holds other work.
 

@@ -7,7 +7,8 @@ An update of the volume reads it once and writes it once. While a slab is in mem
 lacked, and the line integrals of the next ones are taken.
 
 The volume lies in two files, which updates read and write in turn, and a third file says how many updates they have had. So
-work that was stopped at any moment, `kill -9` included, goes on after the last whole update, to the same result.
+work that was stopped at any moment, `kill -9` included, goes on after the last whole update, to the same result: to the last bit
+with `Joseph`, to rounding with `GridPair`, whose transpose adds in any order.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, write_text, writing
+from lingo_mi.file_access import leftovers, reading, write_text, writing
 from lingo_mi.folder_lock import locked
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
@@ -39,7 +40,7 @@ from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
 Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
-STATE = 'state.json'
+STATE, FILES = 'state.json', ('even.f32', 'odd.f32')
 LENGTHS = 4  # views whose rays' lengths are computed at once
 SLABS, IMAGES = 7, 10  # peak memory, as measured: in slabs, and in images for each view of an update
 
@@ -49,7 +50,7 @@ def swept(
 ) -> Iterator[np.ndarray]:
     """The volume after the updates, in slabs [x, y, thickness] along z; the last may be thinner.
 
-    folder     for the files; removed when the last slab has been taken, and kept where the work is stopped earlier
+    folder     for the files. They stay, so that the volume can be had again at once; `discard` removes them
     progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this
                update before it)
 
@@ -58,47 +59,60 @@ def swept(
     """
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
-    first = scan.geometry.slab(*scan.geometry.slabs(thickness)[0])
-    images = 2 * len(scan) + IMAGES * max(len(views) for _, views in updates)
-    check_memory(first, needed=4 * (SLABS * prod(first.nVoxel) + images * prod(first.nDetector)))
+    (nx, ny, nz), (begin, end) = scan.geometry.nVoxel, scan.geometry.slabs(thickness)[0]
+    slab, image = nx * ny * min(end - begin + 2, nz), prod(scan.geometry.nDetector)
+    images = (2 if scan.valid is None else 3) * len(scan) + IMAGES * max(len(views) for _, views in updates)
+    check_memory(scan.geometry.slab(begin, end), needed=4 * (SLABS * slab + images * image))
     with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
-        system, parts = _Slabs(scan, volume), len(volume.parts)
-        lengths = system.lengths()
-        ax = system.project(updates[volume.done][1]) if volume.done < len(updates) else None
-        for done in range(volume.done, len(updates)):
-            lmbda, views = updates[done]
-            b = system.A.images(scan.projections[views])
-            error = evaluated(b - ax)
-            relative = norm(error) / (norm(b) or 1.0)
-            if not np.isfinite(relative):
-                raise InputError(DIVERGED)
-            error = normalised(error, mi.Float(lengths[views].ravel()))
-            following = updates[done + 1][1] if done + 1 < len(updates) else None
-
-            def report(slabs, done=done, relative=relative):
-                if progress:
-                    progress(done * parts + slabs, len(updates) * parts, relative)
-
-            ax = system.update(error, views, lmbda, noneg, following, report)
-        for part in range(parts):
+        if volume.done < len(updates):
+            _complete(_Slabs(scan, volume), updates, noneg, progress)
+        for part in range(len(volume.parts)):
             slab = volume.read(part)
             if not np.isfinite(slab).all():
                 raise InputError(DIVERGED)
             yield slab
-        volume.remove()
-    with suppress(OSError):  # something else lies there
+
+
+def discard(folder: Path) -> None:
+    """Remove the files of `swept`, and their folder if nothing else lies there."""
+    with writing(folder):
+        for name in (STATE, *FILES):  # the state first: without it the rest is nothing
+            (folder / name).unlink(missing_ok=True)
+    with suppress(OSError):
         folder.rmdir()
+
+
+def _complete(system: _Slabs, updates: Sequence[Update], noneg: bool, progress: Progress | None) -> None:
+    """The updates that are left."""
+    volume, projections, lengths = system.volume, system.scan.projections, system.lengths()
+    parts, ax = len(volume.parts), system.project(updates[volume.done][1])
+    for done in range(volume.done, len(updates)):
+        lmbda, views = updates[done]
+        b = system.A.images(projections[views])
+        error = evaluated(b - ax)
+        relative = norm(error) / (norm(b) or 1.0)
+        if not np.isfinite(relative):
+            raise InputError(DIVERGED)
+        error = normalised(error, mi.Float(lengths[views].ravel()))
+        following = updates[done + 1][1] if done + 1 < len(updates) else None
+
+        def report(slabs, done=done, relative=relative):
+            if progress:
+                progress(done * parts + slabs, len(updates) * parts, relative)
+
+        ax = system.update(error, views, lmbda, noneg, following, report)
 
 
 class _Slabs:
     """The matrix A of a scan, by slabs of a volume on a disk. Images are mi.Float [view, u, v].
 
-    A   that of the first slab, for what does not depend on the voxels
+    A   that of one slice, for what does not depend on the voxels
     """
 
     def __init__(self, scan: Scan, volume: _Volume):
         self.scan, self.volume = scan, volume
-        self.A = self._projector(0)[0]
+        one = scan.geometry.slab(0, 1)
+        self.A: Joseph | GridPair = Joseph(one) if is_circular(scan) else GridPair(one, scan.valid)
 
     def lengths(self) -> np.ndarray:
         """A 1, float32 [view, pixel]."""
@@ -167,8 +181,7 @@ class _Slabs:
     def _projector(self, part):
         """The projector of a slab between its slices of zeros, and a function that tells whether a voxel is none of these."""
         (begin, end), (below, above) = self.volume.parts[part], self._margins(part)
-        geometry = self.scan.geometry.slab(begin - below, end + above)
-        A = Joseph(geometry) if is_circular(self.scan) else GridPair(geometry, self.scan.valid)
+        A = self.A.of_slab(self.scan.geometry.slab(begin - below, end + above))
         low, high = (dr.opaque(mi.UInt, z) for z in (below, end - begin + below))
 
         def inside(voxel):
@@ -195,8 +208,10 @@ class _Volume:
     def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
         self.parts, self.done = scan.geometry.slabs(thickness), 0
         self._size, self._folder, self._digest = scan.geometry.nVoxel, folder, digest
-        self._paths = folder / 'even.f32', folder / 'odd.f32'
+        self._paths = [folder / name for name in FILES]
         state = folder / STATE
+        for path, _ in leftovers(folder):
+            path.unlink()
         if state.exists():
             with reading(state):
                 text = state.read_bytes()
@@ -211,7 +226,10 @@ class _Volume:
                     'remove the folder, or repeat that command to complete it'
                 )
             self.done = done
+        elif any(os.path.lexists(path) for path in self._paths):
+            raise InputError(f'{folder}: has files named {" or ".join(FILES)} that are not ours; choose another folder')
         self._require_room()
+        self._record()
 
     def _require_room(self):
         needed = 8 * prod(self._size) - sum(path.stat().st_size for path in self._paths if path.exists())
@@ -256,13 +274,10 @@ class _Volume:
         with writing(self._folder):
             os.fsync(self._files[(self.done + 1) % 2].fileno())
         self.done += 1
-        write_text(self._folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
+        self._record()
 
-    def remove(self) -> None:
-        """Remove the files."""
-        with writing(self._folder):
-            for path in (self._folder / STATE, *self._paths):  # the state first: without it the rest is nothing
-                path.unlink(missing_ok=True)
+    def _record(self):
+        write_text(self._folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
 
     def _place(self, part):
         (begin, end), (nx, ny, _) = self.parts[part], self._size
@@ -271,9 +286,11 @@ class _Volume:
 
 def _digest(scan, updates, noneg, thickness):
     """Of all that the result depends on."""
-    found = hashlib.sha256(repr((noneg, thickness)).encode())
+    geometry, rays = scan.geometry, scan.geometry.rays()
+    numbers = geometry.nVoxel, geometry.dVoxel, geometry.offOrigin, geometry.nDetector, is_circular(scan)
+    found = hashlib.sha256(repr((numbers, noneg, thickness)).encode())
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
-    for value in (type(scan.geometry).__name__, *vars(scan.geometry).values(), scan.projections, scan.valid):
-        found.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    for array in (rays.source, rays.corner, rays.u, rays.v, scan.projections, scan.valid):
+        found.update(b'' if array is None else np.asarray(array).tobytes())
     return found.hexdigest()

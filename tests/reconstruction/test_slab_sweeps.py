@@ -16,7 +16,10 @@ import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
 from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.geometry.base import PosedGeometry
+from lingo_mi.geometry.rays import Rays
 from lingo_mi.reconstruction import OSSART, SART, SIRT
+from lingo_mi.reconstruction.slab_sweeps import _digest, discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 SHAPE = 24, 20, 16
@@ -53,6 +56,7 @@ def test_slabs_are_the_whole_volume(scan, tmp_path, algorithm, thickness):
     count = algorithm.slab_steps(scan, thickness)
     assert [step[:2] for step in steps] == [(i + 1, count) for i in range(count)]
     assert steps[0][2] == 1 and steps[-1][2] < 0.1  # of an empty volume, and of the last
+    discard(tmp_path / 'work')
     assert not (tmp_path / 'work').exists()
 
 
@@ -86,15 +90,41 @@ def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
     assert steps[0] == (last - 1) // 3 * 3 + 1  # three slabs an update
 
 
-def test_writing_goes_on(scan, tmp_path):
-    """Stopped after the last update, while slabs are taken: nothing is computed again."""
-    how = SART(niter=1)
-    whole = list(how.slabs(scan, 6, tmp_path / 'a'))
-    taken = how.slabs(scan, 6, tmp_path / 'b')
-    next(taken)
+def test_the_volume_stays(scan, tmp_path):
+    """Stopped after the last update, while slabs are taken or written: nothing is computed again."""
+    how, work = SART(niter=1), tmp_path / 'work'
+    (tmp_path / 'work').mkdir()
+    (work / '.lingo_mi-0123456789abcdef-state.json').touch()  # of a process that was killed while it wrote
+    taken = how.slabs(scan, 6, work)
+    first = next(taken)
     taken.close()
-    found = list(how.slabs(scan, 6, tmp_path / 'b', progress=lambda *_: pytest.fail('computed again')))
-    np.testing.assert_array_equal(np.concatenate(found, 2), np.concatenate(whole, 2))
+    for _ in range(2):
+        found = list(how.slabs(scan, 6, work, progress=lambda *_: pytest.fail('computed again')))
+        np.testing.assert_array_equal(found[0], first)
+    discard(work)
+    assert not work.exists()
+
+
+def test_poses_in_the_middle_count(scan, tmp_path):
+    """Of 400 poses, one has moved."""
+    rays = scan.geometry.rays()
+    many = Rays(*(np.resize(part, (400, 3)) for part in (rays.source, rays.corner, rays.u, rays.v)), rays.parallel)
+    moved = replace(many, source=many.source + 1e-9 * (np.arange(400) == 200)[:, None])
+    digests = []
+    for poses in (many, moved):
+        g = scan.geometry
+        geometry = PosedGeometry(
+            poses=poses, nDetector=g.nDetector, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin
+        )
+        digests.append(_digest(lm.Scan(geometry, np.zeros((400, *g.nDetector), np.float32)), [], True, 8))
+    assert digests[0] != digests[1]
+
+
+def test_files_of_the_user_stay(scan, tmp_path):
+    (tmp_path / 'odd.f32').write_text('mine')
+    with pytest.raises(InputError, match='files named even.f32 or odd.f32 that are not ours'):
+        next(SART().slabs(scan, 8, tmp_path))
+    assert [p.name for p in tmp_path.iterdir()] == ['odd.f32'] and (tmp_path / 'odd.f32').read_text() == 'mine'
 
 
 def test_other_work_is_left_alone(scan, tmp_path):
@@ -163,12 +193,13 @@ def test_the_command(tmp_path):
     assert code == 0, err
     command = [sys.executable, RECONSTRUCT, scene, *options, '--slab', '8', '--out', out]
     process = subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (work / 'state.json').exists():
+    state = work / 'state.json'
+    while not state.exists() or json.loads(state.read_text())['updates'] < 2:
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert json.loads((work / 'state.json').read_text())['updates'] >= 1 and not out.exists()
+    assert not out.exists()
     code, text, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--out', out)
     assert code == 0 and str(out) in text and not work.exists(), err
     whole, found = read_volume(tmp_path / 'whole.nii.gz').data, read_volume(out).data
