@@ -219,7 +219,7 @@ def go(nz):
     g = lm.Geometry.cone(
         DSO=1000, DSD=1500, nDetector=192, dDetector=2.6, nVoxel=(256, 256, nz), dVoxel=1, angles=np.arange(3.0)
     )
-    for slab in lm.SART(niter=1).slabs(lm.Scan(g, np.ones((3, 192, 192), np.float32)), 16, sys.argv[1] + '/work'):
+    for slab in lm.SART(niter=1).slabs(lm.Scan(g, np.ones((3, 192, 192), np.float32)), 16, f'{sys.argv[1]}/{nz}'):
         pass
 
 def peak():
