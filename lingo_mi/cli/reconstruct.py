@@ -23,8 +23,8 @@ Beam hardening and scatter that the scene's tube names are taken out of the proj
 given; with --complete and --start, those that the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
-ones keep it in a folder beside it, of its name and .slabs, until it is written; where they were stopped, the same command goes
-on.
+ones keep it in a folder beside it, whose name is that of the volume and .slabs, until it is written. Where they were stopped, the
+same command goes on.
 """
 
 import argparse
@@ -271,20 +271,7 @@ def reconstruct_into(
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
         if args.slab:
-            assert isinstance(algorithm, FDK | Sweeps)  # as `check_arguments` has made sure
-            work = out.with_name(out.name + '.slabs')
-            with Progress(algorithm.name, algorithm.slab_steps(scan, args.slab)) as bar:
-
-                def report(done, _, residual):
-                    bar.update(done, residual=residual)
-
-                if isinstance(algorithm, FDK):
-                    slabs = algorithm.slabs(scan, args.slab, progress=report)
-                else:
-                    slabs = algorithm.slabs(scan, args.slab, work, progress=report)
-                write_in_slabs(out, scan, slabs, args)
-            if isinstance(algorithm, Sweeps):
-                discard(work)
+            make_in_slabs(out, scan, algorithm, args)
             return
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress, **inputs)
@@ -328,6 +315,22 @@ def write_page(path: Path, found: Reconstruction, truth: np.ndarray | None, args
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, report_page(data))
+
+
+def make_in_slabs(out: Path, scan: Scan, algorithm: Algorithm, args: argparse.Namespace) -> None:
+    """Reconstruct a volume slab by slab, and write it."""
+    assert isinstance(algorithm, FDK | Sweeps)  # as `check_arguments` has made sure
+    with Progress(algorithm.name, algorithm.slab_steps(scan, args.slab)) as bar:
+
+        def report(done: int, _: int, residual: float | None) -> None:
+            bar.update(done, residual=residual)
+
+        if isinstance(algorithm, FDK):
+            write_in_slabs(out, scan, algorithm.slabs(scan, args.slab, progress=report), args)
+        else:
+            work = out.with_name(out.name + '.slabs')
+            write_in_slabs(out, scan, algorithm.slabs(scan, args.slab, work, progress=report), args)
+            discard(work)  # not before the volume is safe
 
 
 def write_in_slabs(out: Path, scan: Scan, slabs: Iterator[np.ndarray], args: argparse.Namespace) -> None:

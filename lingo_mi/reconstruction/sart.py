@@ -150,9 +150,8 @@ class Sweeps(Algorithm):
                    this update before it)
 
         Takes memory for seven slabs, two sets of projections (three with invalid pixels), and ten images for each view of a
-        block. Raises InputError as
-        `run`, if tol is above 0, if rays leave voxels out, for too little memory or room on the disk, and for a folder that
-        holds other work.
+        block. Raises InputError as `run`, if tol is above 0, if rays leave voxels out, for too little memory or room on the
+        disk, and for a folder that holds other work.
 
             for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
                 ...

@@ -41,8 +41,10 @@ from lingo_mi.scene.checks import check_memory
 
 Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
 STATE, FILES = 'state.json', ('even.f32', 'odd.f32')
-LENGTHS = 4  # views whose rays' lengths are computed at once
-SLABS, IMAGES = 7, 10  # peak memory, as measured: in slabs, and in images for each view of an update
+SLABS, IMAGES = (
+    7,
+    10,
+)  # peak memory, in slabs and in images of a view of an update: tests/reconstruction/test_slab_sweeps.py
 
 
 def swept(
@@ -59,10 +61,9 @@ def swept(
     """
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
-    (nx, ny, nz), (begin, end) = scan.geometry.nVoxel, scan.geometry.slabs(thickness)[0]
-    slab, image = nx * ny * min(end - begin + 2, nz), prod(scan.geometry.nDetector)
-    images = (2 if scan.valid is None else 3) * len(scan) + IMAGES * max(len(views) for _, views in updates)
-    check_memory(scan.geometry.slab(begin, end), needed=4 * (SLABS * slab + images * image))
+    begin, end = scan.geometry.slabs(thickness)[0]
+    blocksize = max(len(views) for _, views in updates)
+    check_memory(scan.geometry.slab(begin, end), needed=needed(scan, thickness, blocksize))
     with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
         if volume.done < len(updates):
             _complete(_Slabs(scan, volume), updates, noneg, progress)
@@ -73,10 +74,18 @@ def swept(
             yield slab
 
 
+def needed(scan: Scan, thickness: int, blocksize: int) -> int:
+    """Peak memory of `swept` with updates of so many views, bytes."""
+    nx, ny, nz = scan.geometry.nVoxel
+    slab = nx * ny * min(thickness + 2, nz)  # with its slices of zeros
+    images = (2 if scan.valid is None else 3) * len(scan) + IMAGES * blocksize
+    return 4 * (SLABS * slab + images * prod(scan.geometry.nDetector))
+
+
 def discard(folder: Path) -> None:
     """Remove the files of `swept`, and their folder if nothing else lies there."""
     with writing(folder):
-        for name in (STATE, *FILES):  # the state first: without it the rest is nothing
+        for name in (*FILES, STATE):  # the state last: it says that the rest is ours
             (folder / name).unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()
@@ -116,14 +125,12 @@ class _Slabs:
 
     def lengths(self) -> np.ndarray:
         """A 1, float32 [view, pixel]."""
-        n = len(self.scan)
-        out = np.zeros((n, self.A.pixels), np.float32)
+        out = np.zeros((len(self.scan), self.A.pixels), np.float32)
         for part in range(len(self.volume.parts)):
             A, inside = self._projector(part)
             ones = evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0))
-            for first in range(0, n, LENGTHS):
-                views = np.arange(first, min(first + LENGTHS, n))
-                out[views] += A.forward(ones, views)[0].numpy().reshape(len(views), -1)
+            for view in range(len(out)):
+                out[view] += A.forward(ones, [view])[0].numpy()
         return out
 
     def project(self, views: np.ndarray) -> mi.Float:
@@ -225,7 +232,8 @@ class _Volume:
                     f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
                     'remove the folder, or repeat that command to complete it'
                 )
-            self.done = done
+            if self._paths[done % 2].exists():  # else it was being discarded
+                self.done = done
         elif any(os.path.lexists(path) for path in self._paths):
             raise InputError(f'{folder}: has files named {" or ".join(FILES)} that are not ours; choose another folder')
         self._require_room()
@@ -292,5 +300,5 @@ def _digest(scan, updates, noneg, thickness):
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
     for array in (rays.source, rays.corner, rays.u, rays.v, scan.projections, scan.valid):
-        found.update(b'' if array is None else np.asarray(array).tobytes())
+        found.update(b'' if array is None else np.ascontiguousarray(array).data)
     return found.hexdigest()
