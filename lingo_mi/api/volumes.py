@@ -15,7 +15,7 @@ from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.parsing import whole
-from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined, progress_bar
+from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined, check_scan, progress_bar
 from lingo_mi.reconstruction import reconstruct as run
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.runtime import ensure_variant
@@ -64,6 +64,7 @@ def reconstruct(
     if isinstance(start, Result):
         cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)
         if views is not None:
+            check_scan(scan.geometry, algorithm, views)
             scan, inputs = prepare_completed(dataset, cloud, views, algorithm)
         else:
             if isinstance(algorithm, Refined):

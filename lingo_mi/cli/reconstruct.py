@@ -243,7 +243,7 @@ def reconstruct_into(
             + ('leave out --start' if args.start else 'take another --algorithm')
         )
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
-    views = len(cloud.geometry) if cloud else args.views
+    views = args.views or (len(cloud.geometry) if cloud else None)
     if not (args.projections or args.volume):  # their geometry is not known before they are read
         check_scan(scene.scanner.geometry, algorithm, views)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, args.slab or 0)
@@ -261,7 +261,7 @@ def reconstruct_into(
         began = time.perf_counter()
         volume = sampled(cloud)(scan.geometry)
         found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
-        of = f'a cloud fitted to {views}'
+        of = f'a cloud fitted to {len(cloud.geometry)}'
     else:
         require_signal(scan)
         if cloud and args.complete:

@@ -12,7 +12,8 @@ from lingo_mi.completion.views import as_corrected, complete, fitted_views, with
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.geometry.base import CircularGeometry, Geometry
-from lingo_mi.reconstruction import FDK, Algorithm, Best, Refined, check_scan
+from lingo_mi.reconstruction import FDK, Algorithm, Best, Refined
+from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.truth import voxelize_cloud
 
@@ -55,8 +56,8 @@ def prepare_completed(
     dataset   holds the views that the cloud was fitted to
 
     `Refined` gets the measured views and, in addition, the completed ones and the cloud's densities. Any other algorithm gets
-    the completed views. Raises InputError as `fitted_views`, `check_scan` and `complete` do, and for FDK if the fit has
-    corrected the poses.
+    the completed views. Raises InputError as `fitted_views`, `require_rays` and `complete` do, and for FDK if the fit has
+    corrected the poses. Whether there is memory for the algorithm is not checked.
     """
     _refuse_best(algorithm)
     measured = fitted_views(dataset, cloud.geometry)
@@ -66,7 +67,7 @@ def prepare_completed(
             'filtered backprojection needs a source on a circle, and the fit has corrected the poses: '
             'take another algorithm'
         )
-    check_scan(measured.geometry, algorithm, views)
+    require_rays(measured.geometry)
     whole = complete(measured, cloud, views)
     if isinstance(algorithm, Refined):
         return whole.subset(np.arange(len(measured))), dict(completed=whole, sample=sampled(cloud))

@@ -10,6 +10,7 @@ import pytest
 import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
 from lingo_mi.errors import InputError
+from lingo_mi.files.scans import write_scan
 from lingo_mi.files.slabs import write_slabs
 from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 
@@ -116,6 +117,23 @@ def test_a_cloud(tmp_path):
         result.save_volume(tmp_path / 'v.nii')
 
 
+def test_completed_views_need_no_volume(tmp_path, monkeypatch):
+    scene = tmp_path / 'tiny.xml'
+    scene.write_text(SCENE)
+    data = lm.simulate(scene)
+    lm.fit(data, 'fast', iterations=10, n_points=100, progress=False).save(tmp_path / 'fit')
+    large = data.train.geometry.with_volume((120, 120, 24), 1)
+    write_scan(tmp_path / 'scan.npy', lm.Scan(large, data.train.projections), 'npy')
+    given = '--projections', tmp_path / 'scan.npy', '--algorithm', 'sart', '-D', 'niter=1'
+    views = '--complete', tmp_path / 'fit' / 'result.xml', '--views', 12
+    command = RECONSTRUCT, scene, *given, *views, '--out', tmp_path / 'v.nii'
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 4e6)  # bytes; the volume has 1.4e6
+    code, _, err = run(*command)
+    assert code == 2 and 'of memory' in err
+    code, _, err = run(*command, '--slab', 4)
+    assert code == 0 and read_volume(tmp_path / 'v.nii').data.shape == (120, 120, 24), err
+
+
 def test_the_command(tmp_path):
     zarr = pytest.importorskip('zarr')
     scene = tmp_path / 'tiny.xml'
@@ -150,6 +168,7 @@ import numpy as np
 import lingo_mi as lm
 from lingo_mi.runtime import use_variant
 use_variant('llvm_ad_mono')
+from lingo_mi.files.scans import write_scan
 from lingo_mi.files.slabs import write_slabs
 
 def go(nz, out):
