@@ -46,7 +46,7 @@ REFERENCE = 'reference'
 ACROSS = 5  # slices side by side in the picture
 # None is good for every scan.
 RTK_BETAS = 10.0, 30.0, 100.0, 300.0
-SHARPNESS = -1.0, 0.0, 1.0, 2.0  # of MBIRJAX, whose default is 1
+SHARPNESS = 0.0, 1.0, 2.0, 3.0  # of MBIRJAX, whose default is 1
 
 
 def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
@@ -72,9 +72,13 @@ def _rtk_tv(scan: Scan) -> np.ndarray:
 
 
 def _qggmrf(scan: Scan) -> np.ndarray:
-    """MBIRJAX with the sharpness that is best for this scan."""
+    """MBIRJAX with the sharpness that is best for this scan, and densities that are not negative, as of SART and ASD-POCS."""
     mbirjax = _mbirjax()
-    return _best_for(scan, SHARPNESS, lambda part, value: mbirjax_bridge.reconstruct(part, mbirjax, sharpness=value))
+
+    def run(part: Scan, sharpness: float) -> np.ndarray:
+        return mbirjax_bridge.reconstruct(part, mbirjax, sharpness=sharpness, positivity_flag=True)
+
+    return _best_for(scan, SHARPNESS, run)
 
 
 def _best_for(scan: Scan, values: Sequence[float], reconstruct: Callable[[Scan, float], np.ndarray]) -> np.ndarray:
