@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from lingo_mi.errors import InputError
@@ -104,10 +105,10 @@ def settings_of(method: str, **values: Any) -> Settings:
 
     Raises InputError for an unknown method or setting.
 
-    Example: `settings_of('lingo:V_S=1', iterations=800)`.
+    Example: `settings_of('lingo:V_S=1,rate_density=1e-2,1e-3', iterations=800)`.
     """
     name, _, changes = method.partition(':')
     if name not in METHODS:
         raise InputError(f'{method}: there is no such recipe; use one of {", ".join(METHODS)}')
-    own = {setting: value for setting, _, value in (c.partition('=') for c in changes.split(',') if c)}
+    own = {setting: value for setting, _, value in (c.partition('=') for c in re.split(r',(?=\w+=)', changes) if c)}
     return METHODS[name].changed(**values).changed(**own)

@@ -18,8 +18,12 @@ def test_names():
 def test_settings_by_name_and_value():
     assert settings_of('lingo') == METHODS['lingo']
     assert settings_of('lingo', iterations=7) == METHODS['lingo'].changed(iterations=7)
+    found = settings_of('naf:rate_features=1e-2,1e-3,field_levels=7', iterations=7)
+    assert found == METHODS['naf'].changed(iterations=7, rate_features=(1e-2, 1e-3), field_levels=7)
     with pytest.raises(InputError, match='lingo'):
         settings_of('lingoX')
+    with pytest.raises(InputError, match="unknown setting 'nothing'"):
+        settings_of('lingo:nothing')
 
 
 # Thresholds as released, for a loss that weighs L1 by 0.8; rates as released.
