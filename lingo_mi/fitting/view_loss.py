@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -101,7 +100,7 @@ def differentiate(
     flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
     dr.backward(loss * weight * (1 / batch), flags=flags)
     # Outside `suspend_grad`, where gradients read as zero.
-    gx, gy = (functools.reduce(operator.add, [dr.grad(leaf[i]) for _, leaf, _ in bundles]) for i in (-2, -1))
+    gx, gy = functools.reduce(_sum, [(dr.grad(leaf[-2]), dr.grad(leaf[-1])) for _, leaf, _ in bundles])
     footprints = bundles[len(bundles) // 2][0]
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
@@ -112,6 +111,12 @@ def differentiate(
             cut.pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate(gaussians)
     return dr.detach(loss) * (1 / batch), norm, visible
+
+
+def _sum(a, b):
+    total = a[0] + b[0], a[1] + b[1]
+    dr.eval(total)  # or the optimiser's kernel would sum over all bundles
+    return total
 
 
 def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings, batch: int) -> list:
