@@ -109,7 +109,7 @@ def differentiate(
     for footprints, leaf, cut in bundles:  # one by one: a single kernel for all would take long to compile
         with full_float64():
             cut.pass_on(footprints.values, map(dr.grad, leaf), flags)
-        evaluate(gaussians)
+        evaluate((*gaussians, view.source, view.corner, view.u, view.v))
     return dr.detach(loss) * (1 / batch), norm, visible
 
 
