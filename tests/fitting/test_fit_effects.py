@@ -107,6 +107,16 @@ def test_a_second_view_compiles_nothing():
     assert set(second) <= set(first)
 
 
+def test_kernels_do_not_grow_with_the_bundles():
+    """Each is of one bundle: one of all would not find registers enough on a GPU."""
+
+    def of(order):
+        stepper, state = stepper_of(Effects(None, SPOT, detector(aperture=1.0, aperture_order=order)))
+        return set(kernels(lambda: stepper.step(state, [1], 0, np.random.default_rng(0))))
+
+    assert of(3) == of(2)
+
+
 # ---- images and derivatives ------------------------------------------------------------------------------------------
 
 EFFECTS = {
