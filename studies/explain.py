@@ -5,10 +5,13 @@ reconstructs those views, and predicts the others, whose corrections are those f
 what was measured as it is, so that no row is favoured by a change of the data. The last row has no error of measurement at all:
 what all views reconstruct is taken for the object, and scanned with the noise of the scan's air. It tells what so few views leave
 in any case.
+
+A row is stored when it is done, and not computed again for the same scan and numbers.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -24,6 +27,7 @@ from lingo_mi.projectors import grid
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.reconstruction import ASDPOCS, OSSART, reconstruct
 from lingo_mi.scan import Dataset, Scan
+from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.markdown import table
 from lingo_mi.studies.provenance import write_provenance
 
@@ -75,29 +79,38 @@ def binned(dataset: Dataset, factor: int) -> Dataset:
     return Dataset(of(dataset.train), of(dataset.test))
 
 
-def rows(dataset: Dataset, calibration: Calibration, progress: Callable[[str], None] = print) -> Iterable[Explained]:
-    """The table's rows on voxels, by ASD-POCS. The calibration is of `dataset.train`."""
-    numbers, names = calibration.found.measured, set()
+def rows(
+    dataset: Dataset, calibration: Calibration, folder: Path, progress: Callable[[str], None] = print
+) -> Iterable[Explained]:
+    """The table's rows on voxels, by ASD-POCS, stored below `folder`. The calibration is of `dataset.train`."""
+    numbers, names, stored = calibration.found.measured, set(), _Stored(folder, dataset)
     for name, prefixes in ROWS.items():
         more = {k for k in numbers if k in prefixes or k.rstrip('0123456789_') in prefixes and k[0] not in 'uvy'}
         if prefixes and not more:
             continue
         names |= more
         progress(name)
-        some = _with(calibration, {k: numbers[k] for k in names})
-        yield _judged(name, dataset, some)
+        some = {k: numbers[k] for k in sorted(names)}
+        yield stored.row(name, some, lambda: _judged(name, dataset, _with(calibration, some)))
     progress(NOTHING)
-    yield _judged(NOTHING, _ideal(dataset), _with(calibration, {}))
+    yield stored.row(NOTHING, {}, lambda: _judged(NOTHING, _ideal(dataset), _with(calibration, {})))
 
 
-def cloud_rows(dataset: Dataset, progress: Callable[[str], None] = print, **settings) -> Iterable[Explained]:
-    """Rows of fits that find the corrections with the cloud."""
-    test = dataset.test
+def cloud_rows(
+    dataset: Dataset, folder: Path, progress: Callable[[str], None] = print, **settings
+) -> Iterable[Explained]:
+    """Rows of fits that find the corrections with the cloud, stored below `folder`."""
+    test, stored = dataset.test, _Stored(folder, dataset)
     assert test is not None  # what rows are judged by
+
+    def fitted(name, changes):
+        result = fit(dataset.train, 'fast', progress=False, **changes)
+        return _row(name, test, result.fitted.expected(test.geometry))
+
     for name, changes in WITH_CLOUD.items():
         progress(name)
-        result = fit(dataset.train, 'fast', progress=False, **(settings | changes))
-        yield _row(name, test, result.fitted.expected(test.geometry))
+        chosen = settings | changes
+        yield stored.row(name, chosen, lambda: fitted(name, chosen))
 
 
 def report(found: list[Explained], folder: Path, title: str) -> str:
@@ -122,6 +135,28 @@ def find(dataset: Dataset, kinds: Iterable[str]) -> Calibration:
         curve=int('curve' in asked),
         scatter='scatter' in asked and dataset.train.geometry.nVoxel[2] > 1,
     )
+
+
+class _Stored:
+    """The rows of a scan below a folder."""
+
+    def __init__(self, folder: Path, dataset: Dataset):
+        self.cells = CellFiles(folder, 'of', 'rms', 'view')
+        found = hashlib.blake2b(repr(dataset.train.geometry.nVoxel).encode(), digest_size=16)
+        for scan in (dataset.train, dataset.test):
+            assert scan is not None  # views that are held out
+            found.update(np.ascontiguousarray(scan.projections).data)
+        self.scan = found.hexdigest()
+
+    def row(self, name: str, made_with: dict, compute: Callable[[], Explained]) -> Explained:
+        """The row of this name, computed unless it is stored and was made with these numbers or settings."""
+        of, place = f'{self.scan} {json.dumps(made_with)}', name.replace(' ', '_')
+        found = self.cells.get('rows', place)
+        if found is None or found['of'] != of:
+            row = compute()
+            found = dict(of=of, rms=row.rms, view=row.view.tolist())
+            self.cells.put('rows', place, found)
+        return Explained(name, found['rms'], np.array(found['view'], np.float32))
 
 
 def _with(calibration, numbers):

@@ -6,7 +6,8 @@
     lingo-mi explain walnut_cone.npz --views 30 --with-cloud
 
 Calibrates the views that are kept, adds what was found kind by kind, and compares predictions of the other views with what was
-measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to --out.
+measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to --out. A row is
+stored when it is done: the same command goes on.
 """
 
 import argparse
@@ -57,9 +58,9 @@ def main() -> None:
     dataset = binned(dataset, args.binning)
     if args.with_cloud:
         settings = {} if args.iterations is None else dict(iterations=args.iterations)
-        found = list(cloud_rows(dataset, **settings))
+        found = list(cloud_rows(dataset, args.out, **settings))
         print(report(found, args.out, 'found with the cloud'))
         return
     calibration = find(dataset, args.correct)
     print('\n'.join(calibration.lines()))
-    print(report(list(rows(dataset, calibration)), args.out, 'corrected'))
+    print(report(list(rows(dataset, calibration, args.out)), args.out, 'corrected'))

@@ -26,9 +26,28 @@ def fan(views=60):
 def test_a_drift_is_what_explains_it(tmp_path):
     dataset = fan()
     calibration = lm.calibrate(dataset, drift=3, progress=False)
-    found = list(explain.rows(dataset, calibration, progress=lambda name: None))
+    found = list(explain.rows(dataset, calibration, tmp_path, progress=lambda name: None))
     assert [row.name for row in found] == ['as given', 'axis and turn of the panel', 'drift', explain.NOTHING]
     assert found[1].rms < found[0].rms and found[2].rms < 0.6 * found[1].rms
     text = explain.report(found, tmp_path, 'corrected')
     assert text.count('\n') >= 5 and json.loads((tmp_path / 'rms.json').read_text())['drift'] == found[2].rms
     assert (tmp_path / 'residuals.png').stat().st_size > 1000 and (tmp_path / 'rms.provenance.json').exists()
+
+
+def test_stored_rows_are_those_of_their_scan_and_numbers(tmp_path, monkeypatch):
+    dataset = fan(24)
+    calibration = lm.calibrate(dataset, progress=False)
+
+    def rows(data=dataset):
+        return list(explain.rows(data, calibration, tmp_path, progress=lambda name: None))
+
+    first, judged = rows(), explain._judged
+    computed = []
+    monkeypatch.setattr(explain, '_judged', lambda name, *rest: computed.append(name) or judged(name, *rest))
+    again = rows()
+    assert not computed and [row.rms for row in again] == [row.rms for row in first]
+    np.testing.assert_array_equal(again[1].view, first[1].view)
+    (tmp_path / 'rows' / 'as_given.json').write_text('{"rms": 1')  # cut off
+    assert rows()[0].rms == first[0].rms and computed == ['as given']
+    other = lm.Dataset(dataset.train, lm.Scan(dataset.test.geometry, 1.1 * dataset.test.projections))
+    assert rows(other)[0].rms > first[0].rms and computed[1:] == [row.name for row in first]
