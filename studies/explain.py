@@ -16,6 +16,7 @@ import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -151,7 +152,7 @@ class _Stored:
     def row(self, name: str, made_with: dict, compute: Callable[[], Explained]) -> Explained:
         """The row of this name, computed unless it is stored and was made with these numbers or settings."""
         of, place = f'{self.scan} {json.dumps(made_with)}', name.replace(' ', '_')
-        found = self.cells.get('rows', place)
+        found: dict[str, Any] | None = self.cells.get('rows', place)
         if found is None or found['of'] != of:
             row = compute()
             found = dict(of=of, rms=row.rms, view=row.view.tolist())
