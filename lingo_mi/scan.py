@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -98,6 +99,15 @@ class Scan:
         p = blocks(self.projections).mean((2, 4))
         valid = None if self.valid is None else blocks(self.valid).all((2, 4))
         return replace(self, geometry=geometry, projections=p, valid=valid)
+
+    def digest(self) -> str:
+        """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""
+        geometry, rays = self.geometry, self.geometry.rays()
+        numbers = geometry.nVoxel, geometry.dVoxel, geometry.offOrigin, geometry.nDetector
+        found = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
+        for array in (rays.source, rays.corner, rays.u, rays.v, self.projections, self.valid):
+            found.update(b'' if array is None else np.ascontiguousarray(array).data)
+        return found.hexdigest()
 
     @property
     def normalised(self) -> np.ndarray:

@@ -11,7 +11,6 @@ A row is stored when it is done, and not computed again for the same scan and nu
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -84,7 +83,7 @@ def rows(
     dataset: Dataset, calibration: Calibration, folder: Path, progress: Callable[[str], None] = print
 ) -> Iterable[Explained]:
     """The table's rows on voxels, by ASD-POCS, stored below `folder`. The calibration is of `dataset.train`."""
-    numbers, names, stored = calibration.found.measured, set(), _Stored(folder, dataset)
+    numbers, names, stored = calibration.found.measured, set(), _Stored(folder, 'corrected', dataset)
     for name, prefixes in ROWS.items():
         more = {k for k in numbers if k in prefixes or k.rstrip('0123456789_') in prefixes and k[0] not in 'uvy'}
         if prefixes and not more:
@@ -101,7 +100,7 @@ def cloud_rows(
     dataset: Dataset, folder: Path, progress: Callable[[str], None] = print, **settings
 ) -> Iterable[Explained]:
     """Rows of fits that find the corrections with the cloud, stored below `folder`."""
-    test, stored = dataset.test, _Stored(folder, dataset)
+    test, stored = dataset.test, _Stored(folder, 'with_the_cloud', dataset)
     assert test is not None  # what rows are judged by
 
     def fitted(name, changes):
@@ -139,24 +138,21 @@ def find(dataset: Dataset, kinds: Iterable[str]) -> Calibration:
 
 
 class _Stored:
-    """The rows of a scan below a folder."""
+    """The rows of a table of a scan, in a folder of its name."""
 
-    def __init__(self, folder: Path, dataset: Dataset):
-        self.cells = CellFiles(folder, 'of', 'rms', 'view')
-        found = hashlib.blake2b(repr(dataset.train.geometry.nVoxel).encode(), digest_size=16)
-        for scan in (dataset.train, dataset.test):
-            assert scan is not None  # views that are held out
-            found.update(np.ascontiguousarray(scan.projections).data)
-        self.scan = found.hexdigest()
+    def __init__(self, folder: Path, table: str, dataset: Dataset):
+        assert dataset.test is not None  # what rows are judged by
+        self.cells, self.table = CellFiles(folder, 'of', 'rms', 'view'), table
+        self.scans = f'{dataset.train.digest()} {dataset.test.digest()}'
 
     def row(self, name: str, made_with: dict, compute: Callable[[], Explained]) -> Explained:
         """The row of this name, computed unless it is stored and was made with these numbers or settings."""
-        of, place = f'{self.scan} {json.dumps(made_with)}', name.replace(' ', '_')
-        found: dict[str, Any] | None = self.cells.get('rows', place)
+        of, place = f'{self.scans} {json.dumps(made_with)}', name.replace(' ', '_')
+        found: dict[str, Any] | None = self.cells.get(self.table, place)
         if found is None or found['of'] != of:
             row = compute()
             found = dict(of=of, rms=row.rms, view=row.view.tolist())
-            self.cells.put('rows', place, found)
+            self.cells.put(self.table, place, found)
         return Explained(name, found['rms'], np.array(found['view'], np.float32))
 
 

@@ -13,7 +13,6 @@ is not computed again.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import os
 import time
@@ -162,15 +161,11 @@ class Study:
                     self.cells.put(_case(count), method, found)
 
     def _require_same_scan(self) -> None:
-        scan, path = self.dataset.train, self.folder / 'scan.txt'
-        rays, geometry = scan.geometry.rays(), scan.geometry
-        found = hashlib.blake2b(repr((geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)).encode(), digest_size=16)
-        for part in (scan.projections, rays.source, rays.corner, rays.u, rays.v):
-            found.update(np.ascontiguousarray(part).tobytes())
-        if path.exists() and path.read_text(encoding='utf-8').strip() != found.hexdigest():
+        path, digest = self.folder / 'scan.txt', self.dataset.train.digest()
+        if path.exists() and path.read_text(encoding='utf-8').strip() != digest:
             raise InputError(f'{self.folder}: has the volumes of another scan; choose another --out')
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_text(path, found.hexdigest() + '\n')
+        write_text(path, digest + '\n')
 
     def volume(self, views: int, method: str) -> np.ndarray:
         """The volume [x, y, z] of a stored cell."""

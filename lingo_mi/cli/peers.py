@@ -7,9 +7,9 @@
 Every method gets the same few, evenly spaced views. The table says how well its volume predicts the views that are left, as root
 mean square of line integrals; how near it is to the FDK of all views, or to the true volume if it is known; and how long it took.
 Each volume is stored as NIfTI when it is done, and the same command goes on after an interruption. The table, as Markdown, is
-renewed after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but
-MBIRJAX's sharpness and the weight of RTK's total variation are each chosen among four values by views that are held out, which
-their times include.
+renewed after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but MBIRJAX's densities
+are kept from being negative, and its sharpness and the weight of RTK's total variation are each chosen among four values by
+views that are held out, which their times include.
 """
 
 import argparse

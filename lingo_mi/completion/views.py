@@ -94,7 +94,7 @@ def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
     require_circle(scan, 'the completion of a scan')
     if views > MOST_VIEWS:
         raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
-    check_memory(scan.geometry.slab(0, 1), views=views)  # the volume is the algorithm's
+    check_memory(scan.geometry.slab(0, 1), views=views)  # of the views: no volume is made here
     return insert_views(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
 
 

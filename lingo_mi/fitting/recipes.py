@@ -110,5 +110,6 @@ def settings_of(method: str, **values: Any) -> Settings:
     name, _, changes = method.partition(':')
     if name not in METHODS:
         raise InputError(f'{method}: there is no such recipe; use one of {", ".join(METHODS)}')
+    # Not every comma ends a setting: rates are two numbers.
     own = {setting: value for setting, _, value in (c.partition('=') for c in re.split(r',(?=\w+=)', changes) if c)}
     return METHODS[name].changed(**values).changed(**own)

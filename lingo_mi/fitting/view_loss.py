@@ -115,7 +115,7 @@ def differentiate(
 
 def _sum(a, b):
     total = a[0] + b[0], a[1] + b[1]
-    dr.eval(total)  # or the optimiser's kernel would sum over all bundles
+    dr.eval(total)  # one by one, as below
     return total
 
 

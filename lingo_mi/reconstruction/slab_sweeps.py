@@ -294,11 +294,7 @@ class _Volume:
 
 def _digest(scan, updates, noneg, thickness):
     """Of all that the result depends on."""
-    geometry, rays = scan.geometry, scan.geometry.rays()
-    numbers = geometry.nVoxel, geometry.dVoxel, geometry.offOrigin, geometry.nDetector, is_circular(scan)
-    found = hashlib.sha256(repr((numbers, noneg, thickness)).encode())
+    found = hashlib.sha256(repr((scan.digest(), is_circular(scan), noneg, thickness)).encode())
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
-    for array in (rays.source, rays.corner, rays.u, rays.v, scan.projections, scan.valid):
-        found.update(b'' if array is None else np.ascontiguousarray(array).data)
     return found.hexdigest()

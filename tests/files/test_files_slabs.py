@@ -168,7 +168,6 @@ import numpy as np
 import lingo_mi as lm
 from lingo_mi.runtime import use_variant
 use_variant('llvm_ad_mono')
-from lingo_mi.files.scans import write_scan
 from lingo_mi.files.slabs import write_slabs
 
 def go(nz, out):

@@ -1,6 +1,7 @@
 """The table of what explains a scan's error: rows in order, a drift that is known to be there explains most."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,7 +48,16 @@ def test_stored_rows_are_those_of_their_scan_and_numbers(tmp_path, monkeypatch):
     again = rows()
     assert not computed and [row.rms for row in again] == [row.rms for row in first]
     np.testing.assert_array_equal(again[1].view, first[1].view)
-    (tmp_path / 'rows' / 'as_given.json').write_text('{"rms": 1')  # cut off
+    (tmp_path / 'corrected' / 'as_given.json').write_text('{"rms": 1')  # cut off
     assert rows()[0].rms == first[0].rms and computed == ['as given']
     other = lm.Dataset(dataset.train, lm.Scan(dataset.test.geometry, 1.1 * dataset.test.projections))
     assert rows(other)[0].rms > first[0].rms and computed[1:] == [row.name for row in first]
+    turned = lm.Scan(
+        replace(dataset.train.geometry, angles=dataset.train.geometry.angles + 0.1), dataset.train.projections
+    )
+    computed.clear()
+    assert rows(lm.Dataset(turned, dataset.test)) and computed[0] == 'as given'
+    monkeypatch.setattr(explain, 'WITH_CLOUD', {'as given': {}})
+    list(explain.cloud_rows(dataset, tmp_path, progress=lambda name: None, iterations=2, n_points=50))
+    kept = {path.parent.name for path in tmp_path.rglob('as_given.json')}
+    assert kept == {'corrected', 'with_the_cloud'}  # both have a row of this name
