@@ -47,6 +47,7 @@ class Progress:
     def __enter__(self) -> Progress:
         self._began = self._drawn = time.monotonic()
         self._shown = self.start  # steps at the latest drawing
+        self._first = None  # when the first step was done, and its number
         if not self._quiet and self._file.isatty() and os.environ.get('TERM') != 'dumb':
             self._bar = _bar(self._file)
             self._task = self._bar.add_task(self.description, total=self.total, completed=self.start, fields='')
@@ -72,6 +73,7 @@ class Progress:
         if fields:
             self._fields = fields
         now = time.monotonic()
+        self._first = self._first or (now, iteration)
         if self._bar:
             due = now - self._drawn >= REDRAW
         else:
@@ -90,8 +92,15 @@ class Progress:
         share = self._done / self.total if self.total else 1.0
         parts = [f'{self._done}/{self.total} ({share:.0%})', *shown, f'{clock(elapsed)} elapsed']
         if self.start < self._done < self.total:
-            parts.append(f'{clock(elapsed * (self.total - self._done) / (self._done - self.start))} left')
+            parts.append(f'{clock(self._left(now))} left')
         print(f'{self.description}: {", ".join(parts)}', file=self._file, flush=True)
+
+    def _left(self, now):
+        """Seconds at the pace since the first step, which compiles kernels, or goes on where earlier work has ended."""
+        since, before = self._began, self.start
+        if self._first is not None and self._first[1] < self._done:
+            since, before = self._first
+        return (now - since) * (self.total - self._done) / (self._done - before)
 
 
 def _bar(file):

@@ -76,6 +76,17 @@ def test_resumed_loop_counts_its_own_pace(capsys, monkeypatch):
     assert capsys.readouterr().err == 'Fit: 900/1000 (90%), 0:10 elapsed, 0:10 left\n'
 
 
+def test_the_time_left_goes_by_the_steps_after_the_first(capsys, monkeypatch):
+    """The first may compile kernels, and may say that earlier work goes on far from its start."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
+    with Progress('SART', 1000) as p:
+        for done, seconds in ((601, 30.0), (700, 129.0)):
+            now[0] = seconds
+            p.update(done)
+    assert capsys.readouterr().err.splitlines()[-1] == 'SART: 700/1000 (70%), 2:09 elapsed, 5:00 left'
+
+
 def test_values_are_read_only_when_drawn(capsys, monkeypatch):
     ticking(monkeypatch, 0.02)
     calls = []
