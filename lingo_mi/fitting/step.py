@@ -110,21 +110,23 @@ class Stepper:
         gaussians = self.forward.gaussians(state.values)
         # Views and cube accumulate derivatives in these. Then one pass propagates them to the raw parameters.
         leaf = leaves(gaussians)
-        total = mi.Float(0)
+        total, factors = mi.Float(0), []
         targets = self.coarse if iteration < self.coarse_until else self.targets
         for view in views:
             target = targets[view]
             if self.poses is not None:
                 rays = self.poses.correct(target.rays, view)
                 place(target.view, rays)
-            loss, norm, visible = self._view(leaf, target, len(views))
+            loss, norm, visible, factor = self._view(leaf, target, len(views))
             total += loss
+            factors.append(factor)
             state.gradient += norm
             state.visits += visible
             if self.poses is not None:
                 self.poses.step(view, rays, gathered(target.view), s.rate('pose', iteration), s.adam)
         if s.loss.lambda_tv > 0:
-            total += random_cube_variation(leaf, self.geometry, s, rng)
+            factor = sum(factors) if s.loss.loss_scale == 'dynamic' else None
+            total += random_cube_variation(leaf, self.geometry, s, rng, factor)
         pass_on(gaussians, map(dr.grad, leaf))
         gradients = {name: dr.grad(value) for name, value in state.values.items()}
         if self.flat:

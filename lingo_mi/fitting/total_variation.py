@@ -17,12 +17,15 @@ from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
 
-def random_cube_variation(gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator) -> Any:
+def random_cube_variation(
+    gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator, factor: Any = None
+) -> Any:
     """Total variation of a randomly placed cube of samples.
 
     Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
 
     gaussians   centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame
+    factor      on the loss (`loss_scale`), Float [1], which the gradient has and the value has not; None: 1
     geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
     """
     s, half, extent = settings.loss, geometry.half, settings.model.extent
@@ -43,6 +46,6 @@ def random_cube_variation(gaussians: Sequence, geometry: Geometry, settings: Set
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
     cube = voxelize(*chosen, grid=Grid(low, vector64(voxel), shape), extent=extent)
     loss = s.lambda_tv * losses.tv(cube, (nz, ny, nx))
-    dr.backward(loss)
+    dr.backward(loss if factor is None else factor * loss)
     evaluate(gaussians)
     return dr.detach(loss)

@@ -71,15 +71,16 @@ class Target:
 
 def differentiate(
     gaussians: tuple, target: Target, settings: Settings, batch: int, signal: Any = None, share: Any = None
-) -> tuple[Any, Any, Any]:
+) -> tuple[Any, Any, Any, Any]:
     """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
 
     batch   views per step; the loss is their mean
     signal  `ExpectedSignal` of the detector; None: line integrals
     share   of the second of two materials in every Gaussian, Float [N]; None: one material
 
-    Returns the view's part of the loss, Float [1], and of the densification statistic, Float [N] each: the norm of the
-    gradient by the projected centre, and 1 if the Gaussian is visible.
+    Returns the view's part of the loss, Float [1], without the factor; of the densification statistic, Float [N] each: the norm
+    of the gradient by the projected centre, and 1 if the Gaussian is visible; and of the factor on the loss, Float [1], or
+    None where there is none.
     """
     s, view, forward = settings.loss, target.view, forward_model(settings)
     bundles = []  # of rays: one, or several if the signal is a mean over them
@@ -95,10 +96,10 @@ def differentiate(
     compared = target.masked(image), target.pixels, view.height, view.width
     loss = losses.combined(*compared, s.lambda_ssim, s.lambda_gradient, s.lambda_l1)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
-    weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
+    weight = (factor if s.loss_scale == 'dynamic' else mi.Float(1)) * (1 / batch)
     # Bundles share the graph from the pose, so its edges must be kept until the last bundle.
     flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
-    dr.backward(loss * weight * (1 / batch), flags=flags)
+    dr.backward(loss * weight, flags=flags)
     # Outside `suspend_grad`, where gradients read as zero.
     gx, gy = functools.reduce(_sum, [(dr.grad(leaf[-2]), dr.grad(leaf[-1])) for _, leaf, _ in bundles])
     footprints = bundles[len(bundles) // 2][0]
@@ -110,7 +111,7 @@ def differentiate(
         with full_float64():
             cut.pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate((*gaussians, view.source, view.corner, view.u, view.v))
-    return dr.detach(loss) * (1 / batch), norm, visible
+    return dr.detach(loss) * (1 / batch), norm, visible, weight if s.loss_scale == 'dynamic' else None
 
 
 def _sum(a, b):

@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import bounded as limits
-from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting import checkpoint, step, view_loss
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
@@ -185,6 +186,37 @@ def test_total_variation_is_of_every_nth_voxel(scan, stride):
     volume = model.volume(state)[::stride, ::stride, ::stride] / model.unit
     wanted = np.concatenate([np.diff(volume, axis=i).ravel() for i in range(3)])
     np.testing.assert_allclose(found, settings.loss.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
+
+
+@pytest.mark.parametrize('batch', [1, 2])
+def test_the_dynamic_factor_is_on_the_whole_loss(scan, batch, monkeypatch):
+    """On L1, SSIM and total variation alike (paper, section III-C): the step's gradient is the plain one times the factor.
+
+    With a batch of views, the total variation has the mean of their factors.
+    """
+    factors = iter([3.0, 5.0][:batch])
+    monkeypatch.setattr(view_loss, 'loss_scale', lambda image: mi.Float(next(factors)))
+
+    def gradients(views, **changes):
+        found = {}
+        monkeypatch.setattr(step, 'adam_step', lambda state, gradients, *_: found.update(gradients))
+        settings = SHORT.changed(tv_size=9, batch=batch, **changes)
+        stepper, start = step.Stepper(scan, settings), some_points(scan.geometry)
+        state = DeviceState(stepper.start(start, np.random.default_rng(0)))
+        with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+            stepper.step(state, views, 0, np.random.default_rng(7))
+        return {name: x.numpy() for name, x in found.items()}
+
+    views = list(range(batch))
+    scaled = gradients(views, loss_scale='dynamic')
+    both = gradients(views, lambda_tv=0.0, loss_scale='none'), gradients(views, loss_scale='none')
+    variation = {name: both[1][name] - both[0][name] for name in scaled}
+    single = [gradients([view], lambda_tv=0.0, loss_scale='none') for view in views]
+    for name in ('centre', 'density', 'scale'):  # spheres have no rotation
+        found = scaled[name]
+        wanted = sum(f * one[name] for f, one in zip((3, 5), single)) / batch + (3, 4)[batch - 1] * variation[name]
+        assert np.abs(variation[name]).max() > 1e-3 * np.abs(found).max(), name
+        np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=1e-4 * np.abs(wanted).max(), err_msg=name)
 
 
 # ------------------------------------------------------------------------------------------------------------

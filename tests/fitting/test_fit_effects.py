@@ -63,8 +63,8 @@ def plain_view(self, gaussians, target, batch):
     compared = target.masked(image), target.pixels, view.height, view.width
     loss = losses.combined(*compared, s.lambda_ssim, s.lambda_gradient, s.lambda_l1)
     factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
-    weight = factor if s.loss_scale == 'dynamic' else mi.Float(1)
-    dr.backward(loss * weight * (1 / batch))
+    weight = (factor if s.loss_scale == 'dynamic' else mi.Float(1)) * (1 / batch)
+    dr.backward(loss * weight)
     gx, gy = dr.grad(leaf[-2]), dr.grad(leaf[-1])
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
@@ -73,7 +73,7 @@ def plain_view(self, gaussians, target, batch):
     with full_float64():
         cut.pass_on(footprints.values, map(dr.grad, leaf))
     evaluate(gaussians)
-    return dr.detach(loss) * (1 / batch), norm, seen
+    return dr.detach(loss) * (1 / batch), norm, seen, weight if s.loss_scale == 'dynamic' else None
 
 
 @pytest.mark.parametrize(
