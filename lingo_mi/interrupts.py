@@ -34,6 +34,7 @@ def between_steps() -> Iterator[Callable[[], None]]:
     before = signal.signal(signal.SIGINT, press)
     try:
         yield check
+        check()  # pressed after the last step
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from lingo_mi.errors import InputError, shown
 
+MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
+
 
 def parse(name: str, text: str, like: Any) -> Any:
     """The value that `text` says, of the kind of `like`: text, true or false, a whole number, a number, or two numbers, of
@@ -72,6 +74,14 @@ def whole(name: str, value: Any, least: int) -> int:
         number = least - 1
     if number < least or isinstance(value, bool):
         raise InputError(f'{name} must be a whole number from {least} on, not {shown(value)}')
+    return number
+
+
+def seed(value: Any, name: str = 'seed') -> int:
+    """A seed that every generator of random numbers takes. Raises InputError, in the name of `name`."""
+    number = whole(name, value, 0)
+    if number > MOST_SEED:
+        raise InputError(f'{name} must be at most {MOST_SEED}, not {shown(value)}')
     return number
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import replacing
-from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.fitting.recipes import changes_of, settings_of
 from lingo_mi.metrics import current_names
 
 Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
@@ -85,7 +85,7 @@ class Comparison:
     def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""
         name, _, own = method.partition(':')
-        changes = [*self.changes, *filter(None, own.split(','))]
+        changes = [*self.changes, *changes_of(own)]
         if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
             changes.append(f'iterations={self.iterations}')
         folder = self.folder / '_'.join([Path(scene).stem, str(self.views), name, *changes])

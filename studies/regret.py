@@ -149,7 +149,7 @@ class Study:
             raise InputError(
                 f'{MEASURED} is measured: it has its own detail and noise, so give --finer 1 and --photons 0'
             )
-        parameters = dict(voxels=str(self.size), voxel=f'{128 * 0.305 / self.size}')
+        parameters = dict(voxels=str(self.size), voxel_size=f'{128 * 0.305 / self.size}')
         every = load_scene(scene_path(MEASURED), parameters).scanner.dataset
         assert every is not None  # it has no object
         train = every.train.binned(max(1, round(256 / (2 * self.size))))

@@ -60,10 +60,12 @@ class Calibration:
             raise InputError('this calibration is that of a scan by another scanner: calibrate this one')
         if not self.needed:
             return scan
-        p, response = scan.projections, self.found.response
+        response = self.found.response
         if response is not None:
-            p = response.undone(p, scan.geometry)
-        return replace(scan, projections=p, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
+            if scan.effects is not None:  # it was found on line integrals
+                scan = linearised(scan, scan.effects)
+            scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
+        return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
 
     def lines(self) -> list[str]:
         """What was found, in sentences."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi import parsing
 from lingo_mi.arrays import as_numpy
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path
@@ -61,7 +62,7 @@ def simulate(
         data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
     """
     ensure_variant()
-    seed = whole('seed', seed, 0)
+    seed = parsing.seed(seed)
     views = 0 if views is None else whole('views', views, 1)
     for name, given in (('geometry', geometry), ('held_out', held_out)):
         if given is not None:

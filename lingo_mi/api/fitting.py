@@ -8,6 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from lingo_mi import parsing
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, require_writable, writing
@@ -18,7 +19,6 @@ from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import between_steps
 from lingo_mi.output_folder import CHECKPOINT
-from lingo_mi.parsing import whole
 from lingo_mi.progress import Progress
 from lingo_mi.results.measure import quick_measure
 from lingo_mi.results.watch import watched
@@ -64,7 +64,7 @@ def fit(
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
     require_type('recipe', recipe, (str, Settings))
-    seed = whole('seed', seed, 0)
+    seed = parsing.seed(seed)
     dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
     if isinstance(recipe, Settings):
         name, chosen = 'settings', recipe.changed(**settings)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 EPILOG = """\
@@ -57,6 +58,7 @@ def main() -> None:
         for file in written:
             if file.exists() and not args.force:
                 raise InputError(f'{file}: exists already; give --force to overwrite it')
+        require_writable(args.out.parent, args.out, 'choose another --out')
     use_variant(args.variant)
     from lingo_mi.api.calibration import calibrate
     from lingo_mi.files.scans import read_scan, write_scan
@@ -70,5 +72,6 @@ def main() -> None:
         print('nothing to correct was found')
     if args.out is not None:
         history = dict(calibrated_from=Path(args.scan).name, calibration=calibration.lines())
+        args.out.parent.mkdir(parents=True, exist_ok=True)
         write_scan(args.out, calibration.corrected(scan), 'npy', history)
         print(args.out)

@@ -16,13 +16,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from lingo_mi import parsing
 from lingo_mi.errors import InputError, brief, shown
 from lingo_mi.file_access import leftovers, require_writable, write_text
 from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import noticed
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
-
-MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 
 
 class Parser(argparse.ArgumentParser):
@@ -120,8 +119,7 @@ def _of_numbers(dtype: str) -> bool:
 
 def check_seed(seed: int) -> None:
     """Raises InputError for a --seed that not every generator of random numbers takes."""
-    if not 0 <= seed <= MOST_SEED:
-        raise InputError(f'--seed must not be negative, nor above {MOST_SEED}, but is {shown(seed)}')
+    parsing.seed(seed, '--seed')
 
 
 def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0, slab: int = 0) -> Any:

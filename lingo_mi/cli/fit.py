@@ -132,7 +132,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
                 resume=args.resume,
                 title=title,
                 method=args.method,
-                command=command_line(),
+                command=command_line(without=('--resume', '--force')),
                 watchers=watchers,
             )
         except KeyboardInterrupt:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
 
 EPILOG = """\
 examples:
@@ -78,13 +79,15 @@ def main() -> None:
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
     written = [args.out, args.out.with_suffix('.yml'), args.out.with_name(args.out.stem + '.valid.npy')]
-    if Path(args.geometry).resolve() in [file.resolve() for file in written]:
-        raise InputError(
-            f'{args.geometry}: would be overwritten by the geometry of {args.out}; give --out another name'
-        )
+    for given in filter(None, (args.frames, args.geometry, args.flats, args.darks, args.angles, args.exposure)):
+        if Path(given).resolve() in [file.resolve() for file in written]:
+            raise InputError(
+                f'{given}: would be overwritten by {args.out} or a file beside it; give --out another name'
+            )
     for file in written:
         if file.exists() and not args.force:
             raise InputError(f'{file}: exists already; give --force to overwrite it')
+    require_writable(args.out.parent, args.out, 'choose another --out')
     exposure = 1.0
     if args.exposure is not None:
         try:
@@ -97,6 +100,7 @@ def main() -> None:
         pixel=args.pixel,
     )  # fmt: skip
     scan, history = import_raw(args.frames, args.geometry, options)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     write_scan(args.out, scan, 'npy', history)
     left_out = 0.0 if scan.valid is None else 1 - scan.valid.mean()
     photons = history.get('photons_from_flats', history['photons_from_views'])

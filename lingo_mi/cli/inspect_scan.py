@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, writable_file
+from lingo_mi.errors import InputError
 
 EPILOG = """\
 examples:
@@ -16,7 +17,12 @@ def main() -> None:
     parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('scan', help='a scan in any format that --projections of fit reads')
     parser.add_argument('--out', type=Path, metavar='F.png', help='where to draw (default: the name of the scan, .png)')
+    parser.add_argument('--force', action='store_true', help='replace an earlier picture')
     args = parser.parse_args()
+    out = args.out or Path(Path(args.scan).stem + '.png')
+    if out.suffix.lower() != '.png':
+        raise InputError(f'{out}: the picture is a PNG; give an --out that ends in .png')
+    writable_file(out, args.force)
     from lingo_mi.files.scans import read_scan
     from lingo_mi.inspection.measure import look
     from lingo_mi.inspection.sheet import draw
@@ -27,6 +33,6 @@ def main() -> None:
     print('\nto correct:' if found.advice else '\nnothing to correct was found')
     for line in found.advice:
         print(f'- {line}')
-    out = args.out or Path(Path(args.scan).stem + '.png')
+    out.parent.mkdir(parents=True, exist_ok=True)
     draw(out, scan, found)
     print(f'\n{out}')

@@ -39,6 +39,7 @@ import numpy as np
 from lingo_mi.cli.common import (
     Parser,
     check_input,
+    check_seed,
     command_line,
     definitions,
     input_arguments,
@@ -145,8 +146,9 @@ def output(path: Path, force: bool) -> Path:
 
 def beside(out: Path) -> tuple[Path, Path]:
     """The files of `best` beside its volume: the plan and the map of errors."""
-    name = out.name.removesuffix('.gz').removesuffix('.nii')
-    return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{out.name.removeprefix(name)}')
+    ending = next(ending for ending in (*NIFTI, *ZARR) if out.name.endswith(ending))
+    name = out.name.removesuffix(ending)
+    return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{ending}')
 
 
 def check_page(path: Path, force: bool) -> None:
@@ -161,8 +163,8 @@ def check_page(path: Path, force: bool) -> None:
 def check_arguments(args: argparse.Namespace) -> None:
     """Raises InputError where the arguments contradict each other."""
     check_input(args)
-    if args.seed is not None and args.seed < 0:
-        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    if args.seed is not None:
+        check_seed(args.seed)
     if args.slab is not None and args.report is not None:
         raise InputError('--report needs the whole volume: leave out --slab')
     if args.slab is not None and (args.slab < 1 or args.algorithm not in IN_SLABS):

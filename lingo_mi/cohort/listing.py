@@ -16,13 +16,12 @@ from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import reading
 from lingo_mi.files.scans import load_yaml, reader_of
 from lingo_mi.fitting.recipes import METHODS
-from lingo_mi.parsing import nearest
+from lingo_mi.parsing import MOST_SEED, nearest
 from lingo_mi.scene.load import defaults
 from lingo_mi.scene.shipped import scene_path, scenes
 
 RESERVED = 'results.csv', 'results.parquet', 'batch.log'  # names in the output folder
 MOST_NAME = 100  # bytes of a name
-MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 _ENDINGS = '.nii.gz', '.npy.gz', '.raw.gz'
 _NAME = re.compile(
     r'\w(?:[\w .+,=@()-]*[\w)+@-])?'
@@ -87,14 +86,14 @@ def _records(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     except UnicodeDecodeError as error:
         line = content.count(b'\n', 0, error.start) + 1
         raise InputError(f'{path}, line {line}: is not UTF-8; save it as CSV in UTF-8') from None
-    if not text.strip():
-        raise InputError(f'{path}: is empty; its first line must name the columns, such as file,geometry,views')
-    first = next(line for line in text.splitlines() if line.strip())
+    first = next((line for line in text.splitlines() if line.strip()), '')
     reader = csv.reader(io.StringIO(text, newline=''), delimiter=max(',;\t', key=first.count), strict=True)
     try:
         found = [(reader.line_num, cells) for cells in reader if any(map(str.strip, cells))]
     except csv.Error as error:
         raise InputError(f'{path}, line {reader.line_num}: is no CSV ({error}); mend its quotes') from None
+    if not found:
+        raise InputError(f'{path}: is empty; its first line must name the columns, such as file,geometry,views')
     header = [name.strip() for name in found[0][1]]
     _check_header(path, header)
     if len(found) == 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, requir
 
 # How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
 COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'
+CONTENT = 'content of the geometry'  # in a request
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,9 @@ class Row:
         size = path.stat().st_size if path is not None and path.is_file() else None
         settings = {name: value for name, value in self.fit_settings().flat().items() if name != 'checkpoint_seconds'}
         kept = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
+        geometry = Path(self.folder) / self.geometry
+        if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
+            kept[CONTENT] = hashlib.sha256(geometry.read_bytes()).hexdigest()
         return json.loads(json.dumps(kept | dict(bytes=size, settings=settings)))  # as a file has it
 
 
@@ -88,7 +93,8 @@ def stored(out: Path, row: Row) -> dict | None:
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):
         raise InputError(f'{folder}: holds a result that is none of a list; give another name')
-    if changed := [k for k in wanted if asked.get(k) != wanted[k]]:
+    known = {CONTENT: wanted[CONTENT]} | asked if CONTENT in wanted else asked  # of older results it is not known
+    if changed := [k for k in wanted if known.get(k) != wanted[k]]:
         if changed == ['settings']:
             changed = [k for k, v in wanted['settings'].items() if asked['settings'].get(k) != v]
         raise InputError(

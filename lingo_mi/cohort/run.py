@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lingo_mi.cohort.listing import BadList
 from lingo_mi.cohort.row import Row, stored
-from lingo_mi.cohort.table import Log, Table
+from lingo_mi.cohort.table import CSV, PARQUET, Log, Table
 from lingo_mi.cohort.work import fit_row
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers
@@ -48,11 +48,13 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
 
     A scan that fails is tried once more after all others. After KeyboardInterrupt, or a kill, the same call goes on.
     """
-    for leftover, _ in leftovers(out):  # of the table: the lock is ours
-        leftover.unlink(missing_ok=True)
+    for leftover, target in leftovers(out):
+        if target in (CSV, PARQUET):  # the lock is ours
+            leftover.unlink(missing_ok=True)
     table, log, numbers = Table(out, rows), Log(out), dict(done)
     for name, found in done.items():
         table.done(name, found)
+    table.renew()  # a log without a table would be a stranger's
     log.add(f'batch of {len(rows)} scans, {len(done)} of them done')
 
     def tell(event: Event) -> None:

@@ -30,6 +30,9 @@ class Table:
             with reading(path), open(path, encoding='utf-8', errors='replace') as file:
                 if path.is_symlink() or not file.readline().startswith(','.join(FIRST)):
                     raise InputError(f'{path}: is no table of a batch; move it away, or choose another --out')
+        for other in (out / PARQUET, out / LOG):
+            if other.is_symlink() or other.exists() and not (path.exists() and other.is_file()):
+                raise InputError(f'{other}: is not that of a batch; move it away, or choose another --out')
 
     @staticmethod
     def _asked(row: Row) -> dict:
@@ -68,7 +71,7 @@ class Table:
             arrow, parquet = map(importlib.import_module, ('pyarrow', 'pyarrow.parquet'))
         except ImportError:
             return [self.out / CSV]
-        columns = {name: [row.get(name) for row in self._rows.values()] for name in self._columns()}
+        columns = {name: _alike([row.get(name) for row in self._rows.values()]) for name in self._columns()}
         with replacing(self.out / PARQUET) as temporary:
             parquet.write_table(arrow.table({name: arrow.array(values) for name, values in columns.items()}), temporary)
         return [self.out / CSV, self.out / PARQUET]
@@ -77,13 +80,17 @@ class Table:
         return list(dict.fromkeys([*FIRST, *(name for row in self._rows.values() for name in row)]))
 
 
+def _alike(values: list) -> list:
+    """Values of one column: all as text where one is, since a list gives as text what a result gives as a number."""
+    text = any(isinstance(value, str) for value in values)
+    return [None if value is None else str(value) for value in values] if text else values
+
+
 class Log:
     """A line for every event, with its time; lines of earlier runs stay."""
 
     def __init__(self, out: Path):
         self._path = out / LOG
-        if self._path.is_symlink() or self._path.exists() and not self._path.is_file():
-            raise InputError(f'{self._path}: is a link or a folder; move it away, or choose another --out')
 
     def add(self, text: str) -> None:
         with open(self._path, 'a', encoding='utf-8', errors='backslashreplace') as file:

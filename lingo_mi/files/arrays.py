@@ -93,5 +93,13 @@ def _claimed(stream: IO[bytes], size: int) -> int:
 
 def save(path: PathLike | str, array: np.ndarray) -> None:
     """Writes a .npy file, whole or not at all. Raises InputError if that is impossible."""
-    with replacing(path) as temporary, open(temporary, 'wb') as stream:
+    with replacing(path) as temporary:
+        write(temporary, array)
+
+
+def write(path: PathLike | str, array: np.ndarray) -> None:
+    """Writes a .npy file in place, whose content is on the disk afterwards."""
+    with open(path, 'wb') as stream:
         np.save(stream, array, allow_pickle=False)
+        stream.flush()
+        os.fsync(stream.fileno())

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -223,6 +224,11 @@ def _geometry_of(path, geometry):
     return found
 
 
+def rows_run_up(values: dict) -> bool:
+    """Whether the rows of the projections that go with a geometry file's values run up: RTK's do, this package's run down."""
+    return str(values.get('poses')).lower().endswith('.xml')
+
+
 def _read_npy(path, geometry):
     values = load_yaml(geometry)
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
@@ -230,7 +236,7 @@ def _read_npy(path, geometry):
     if valid is not None:
         projections = np.where(valid, projections, 1)  # a value with a logarithm
     g = posed_geometry(values, len(projections), geometry)
-    if str(values.get('poses')).lower().endswith('.xml'):
+    if rows_run_up(values):
         projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
     return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path, valid))
 
@@ -249,13 +255,15 @@ def _write_npy(path, dataset, history=None):
     more: dict = {'input': 'line_integral'}
     if history is not None:
         more['history'] = history
+    content = {path: dataset.train.projections}
     if dataset.train.valid is not None:
         more['valid'] = path.stem + '.valid.npy'
-        arrays.save(path.with_name(more['valid']), dataset.train.valid)
-    # Geometry first: a geometry file without projections is never read as a scan.
-    with replacing(path.with_suffix('.yml')) as temporary:
-        _dump_yaml(temporary, dataset.train.geometry, **more)
-    arrays.save(path, dataset.train.projections)
+        content[path.with_name(more['valid'])] = dataset.train.valid
+    # An earlier scan stays whole until all of the new one is on the disk.
+    with ExitStack() as files:
+        for file, values in content.items():
+            arrays.write(files.enter_context(replacing(file)), values)
+        _dump_yaml(files.enter_context(replacing(path.with_suffix('.yml'))), dataset.train.geometry, **more)
 
 
 # ---- EXR folders -------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model, stepper_of
+from lingo_mi.fitting.measured import modelled_effects
 from lingo_mi.fitting.resume import require_same_fit
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.stopping import Search
@@ -56,14 +57,15 @@ def run(
     begin = path if initial is None else initial
     if begin is None:
         raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
-    settings = bounded(settings, scan)
-    search = Search(scan, settings) if settings.stopping.stop == 'on' else None
+    given, settings = settings, bounded(settings, scan)
+    search = Search(scan, given) if settings.stopping.stop == 'on' else None
     rng = np.random.default_rng(seed)
     average = Average(settings.adam.average)
     scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
     if isinstance(begin, Path):
         host, extra, arrays = checkpoint.load(begin)
-        require_same_fit(extra, settings, scanned, seed, begin)
+        modelled = modelled_effects(scan, settings)
+        require_same_fit(extra, settings, scanned, seed, begin, bool(modelled and modelled.scatter))
         rng.bit_generator.state = extra['rng']
         points, order = arrays['initial'], [int(i) for i in arrays['order']]
         iteration, seconds, info = (extra[k] for k in ('iteration', 'seconds', 'info'))

@@ -110,6 +110,10 @@ def settings_of(method: str, **values: Any) -> Settings:
     name, _, changes = method.partition(':')
     if name not in METHODS:
         raise InputError(f'{method}: there is no such recipe; use one of {", ".join(METHODS)}')
-    # Not every comma ends a setting: rates are two numbers.
-    own = {setting: value for setting, _, value in (c.partition('=') for c in re.split(r',(?=\w+=)', changes) if c)}
+    own = {setting: value for setting, _, value in (change.partition('=') for change in changes_of(changes))}
     return METHODS[name].changed(**values).changed(**own)
+
+
+def changes_of(text: str) -> list[str]:
+    """'setting=value,...' one by one. Not every comma ends a setting: rates are two numbers."""
+    return [change for change in re.split(r',(?=\w+=)', text) if change]

@@ -12,19 +12,24 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting.settings import Settings
 
 
-def extensible(settings: Settings) -> bool:
-    """Whether a longer fit repeats the steps of a shorter one, so that it can continue from its checkpoint."""
+def extensible(settings: Settings, scatters: bool = False) -> bool:
+    """Whether a longer fit repeats the steps of a shorter one, so that it can continue from its checkpoint.
+
+    scatters   whether the fit models scattered light, which is renewed at shares of the iterations
+    """
     plain = settings.coarse_share == 0 and settings.adam.average == 0 and settings.stopping.stop == 'off'
-    return plain and settings.decay_steps > 0
+    return plain and settings.decay_steps > 0 and not settings.calibration.responds and not scatters
 
 
-def require_same_fit(extra: dict, settings: Settings, scanned: dict, seed: int, path: Path) -> None:
-    """Raise InputError if a checkpoint, by its plain values, belongs to another fit."""
+def require_same_fit(
+    extra: dict, settings: Settings, scanned: dict, seed: int, path: Path, scatters: bool = False
+) -> None:
+    """Raise InputError if a checkpoint, by its plain values, belongs to another fit. scatters: as of `extensible`."""
     now = settings.flat()
     # Settings that the checkpoint does not know are newer than it; what they stand at changes nothing.
     before = Settings().flat() | {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
     free = {'checkpoint_seconds'}
-    if extensible(settings) and extra['iteration'] <= settings.iterations:
+    if extensible(settings, scatters) and extra['iteration'] <= settings.iterations:
         free.add('iterations')
     changed = [k for k in now if before.get(k) != now[k] and k not in free]
     if extra['seed'] != seed:

@@ -90,6 +90,7 @@ class Stepper:
             host = densify(host, self.settings, self.half, rng, self.flat, largest)
             if len(host) == 0:
                 raise InputError('every Gaussian was pruned: the projections may be empty, or prune_density too high')
+        self.share = None  # other Gaussians, or in another order
         return DeviceState(reset_opacity(host) if resetting else host)
 
     def step(self, state: DeviceState, views: Sequence[int], iteration: int, rng: np.random.Generator) -> Any:
@@ -98,7 +99,7 @@ class Stepper:
         `iteration` counts from 0. `rng` places the cube of the total variation.
         """
         s = self.settings
-        if self.share is None or iteration % SHARES_RENEWED == 0 or dr.width(self.share) != len(state):
+        if self.share is None or iteration % SHARES_RENEWED == 0:
             self.share = self.model.shares(state)
         lit = self.model.signal is not None and self.model.signal.scattered
         if lit and iteration in {round(x * s.iterations) for x in LIGHT_RENEWED}:

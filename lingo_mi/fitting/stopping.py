@@ -44,7 +44,7 @@ class Search:
     """
 
     def __init__(self, scan: Scan, settings: Settings):
-        """settings: of the whole fit, `bounded`. Raises InputError for fewer than four views."""
+        """settings: of the whole fit, before they are `bounded`. Raises InputError for fewer than four views."""
         self.seen, self.held_out = split(trusted(scan, settings), HELD_OUT)
         self.settings, self.on = settings, True
         self.all = power(self.held_out.projections).mean() or 1.0

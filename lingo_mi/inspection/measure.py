@@ -226,7 +226,10 @@ def _angles(found, scan, air):
             f'consistency of the views: not measured, as {plane}; lingo-mi calibrate finds an axis off centre all the same'
         )
         return
-    index = np.array([i for i in range(n) if i not in found.suspects])
+    index = np.array([i for i in range(n) if i not in found.suspects], int)
+    if len(index) < 2:
+        found.facts.append('consistency of the views: not measured, as too few of them show anything')
+        return
     index = index[:: max(1, -(-len(index) // VIEWS))]
     plane = plane.subset(index)
     shift, best = best_shift(plane, plane.angles, 0.08 * np.ptp(plane.u))

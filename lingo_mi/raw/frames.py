@@ -93,7 +93,7 @@ def open_recording(path: PathLike | str) -> Recording:
     if suffix == '.npy':
         return Recording(_array(path))
     if suffix in HDF5:
-        return _hdf5(path)
+        return _checked(path, lambda: _hdf5(path))
     if suffix in RTK:
         raise InputError(f'{path}: is one frame; give the folder of the frames')
     if suffix in IMAGES:
@@ -174,6 +174,8 @@ def _array(path):
             stack = np.load(path, mmap_mode='r', allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise InputError(f'{path}: is damaged or not a NumPy file ({one_line(error)[:120]}); write it again') from None
+    if not isinstance(stack, np.ndarray) or stack.ndim != 3:
+        raise InputError(f'{path}: is no array [n, v, u]; write the frames with numpy.save')
     arrays.numeric(stack[:1], path, 3, finite=False)
     return Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i])
 
@@ -194,7 +196,7 @@ def _checked(path, read):
 
 def _hdf5(path):
     h5py = optional('h5py')
-    file = _checked(path, lambda: h5py.File(path, 'r'))
+    file = h5py.File(path, 'r')
 
     def stack(data):
         if data.ndim == 2:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.files import scanner_dict
-from lingo_mi.files.scans import load_yaml, posed_geometry
+from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.progress import Progress
 from lingo_mi.raw.frames import Frames, open_recording
@@ -71,7 +71,7 @@ def import_raw(
     views, n = recording.views, len(recording.views)
     flats = recording.flats if options.flats is None else open_recording(options.flats).views
     darks = recording.darks if options.darks is None else open_recording(options.darks).views
-    given, white, mirrored = _geometry(geometry, options, recording.angles, views)
+    given, white, (down, across) = _geometry(geometry, options, recording.angles, views)
     i0 = options.i0 if options.i0 is not None else white if flats is None and _no_air(options) else None
     if sum(x is not None for x in (options.air, options.percentile, i0)) > 1:
         raise InputError('air, percentile and i0 all say the air level; give one of them')
@@ -98,7 +98,14 @@ def import_raw(
         limit = np.iinfo(views.dtype).max if views.dtype.kind in 'ui' else np.inf
 
     v0, v1, u0, u1 = crop
-    out = _placed(given, crop if not mirrored else (v0, v1, views.shape[1] - u1, views.shape[1] - u0))
+    (nv, nu), rows, columns = views.shape, (v0, v1), (u0, u1)
+    out = _placed(
+        given, (*(rows if down > 0 else (nv - v1, nv - v0)), *(columns if across > 0 else (nu - u1, nu - u0)))
+    )
+
+    def kept(image):  # before binning, which drops what is left over at the end
+        return _cut(image, crop)[::down, ::across]
+
     bins = out.bins(options.binning)
     out = out.binned(options.binning).subset(chosen)
     if not _grid_given(geometry):
@@ -106,15 +113,15 @@ def import_raw(
     p = np.zeros((len(chosen), *out.nDetector), np.float32)
     valid = np.zeros(p.shape, bool)
     levels, black, above = np.ones(len(chosen)), [], []
-    part = replace(panel, dark=_cut(panel.dark, crop), good=_cut(panel.good, crop))
-    part = replace(part, flat=None if panel.flat is None else _cut(panel.flat, crop))
+    part = replace(panel, dark=kept(panel.dark), good=kept(panel.good))
+    part = replace(part, flat=None if panel.flat is None else kept(panel.flat))
     with Progress('Import', len(chosen), shown=progress) as bar:
         for k, i in enumerate(chosen):
             frame = views[i]
             level = 1.0
             if air is not None or options.percentile is not None:  # of the whole frame: air may lie outside the crop
                 level = _air_level(frame, panel, air, options.percentile, float(exposure[i]), limit)
-            p[k], valid[k] = line_integrals(_cut(frame, crop), part, bins, float(exposure[i] * level), limit)
+            p[k], valid[k] = line_integrals(kept(frame), part, bins, float(exposure[i] * level), limit)
             levels[k] = level
             seen = p[k][valid[k]]
             if not seen.size:
@@ -122,8 +129,6 @@ def import_raw(
             elif (seen < BELOW).mean() > OFTEN:
                 above.append(i)
             bar.update(k + 1)
-    if mirrored:
-        p, valid = p[:, :, ::-1], valid[:, :, ::-1]
     if len(black) == len(chosen):
         raise InputError(f'{path}: no view is brighter than the dark frames; are the right dark frames given?')
     if black:
@@ -137,7 +142,7 @@ def import_raw(
             'exposure? Give --exposure, or --air',
             stacklevel=3,
         )
-    scan = Scan(out, np.ascontiguousarray(p), np.ascontiguousarray(valid))
+    scan = Scan(out, p, valid)
     history: dict[str, Any] = dict(
         frames=str(path),
         geometry=str(geometry) if not isinstance(geometry, Geometry) else 'given in Python',
@@ -228,8 +233,8 @@ def _grid_given(geometry):
     return suffix in ('.yml', '.yaml') and load_yaml(geometry).get('nVoxel') is not None
 
 
-def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, float | None, bool]:
-    """The geometry of whole frames, Nikon's white level, and whether its columns run the other way."""
+def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, float | None, tuple[int, int]]:
+    """The geometry of whole frames, Nikon's white level, and the steps (1 or -1) that put rows and columns in its order."""
     n, shape = len(frames), frames.shape
     angles = recorded
     if options.angles is not None:
@@ -242,7 +247,7 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
             raise InputError(
                 f'{frames.where}: {n} frames of {shape} pixels, but the geometry has {len(source)} views of {source.nDetector}'
             )
-        return source, None, False
+        return source, None, (1, 1)
     path = Path(source)
     suffix = path.suffix.lower()
     grid: dict[str, Any] = dict(nVoxel=[shape[1], shape[1], shape[0]], dVoxel=1.0)
@@ -252,9 +257,9 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
         found = Geometry.from_rtk(path, nDetector=shape, dDetector=options.pixel, **grid)
         if len(found) != n:
             raise InputError(f'{path}: describes {len(found)} views, but there are {n} frames; these must agree')
-        return found, None, False
-    white, mirrored = None, suffix == '.xtekct'
-    if mirrored:
+        return found, None, (-1, 1)
+    white, nikon = None, suffix == '.xtekct'
+    if nikon:
         values, white = read_xtekct(path)
     elif suffix in ('.yml', '.yaml'):
         values = load_yaml(path)
@@ -272,13 +277,13 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
         raise InputError(
             f'{path}: no angles: neither here nor with the frames; add angles or totalAngle, or give --angles'
         )
-    if mirrored:
+    if nikon:
         if len(values['angles']) != n:
             raise InputError(
                 f'{path}: describes {len(values["angles"])} views, but there are {n} frames; these must agree'
             )
-        return scanner_dict.to_geometry(values, np.radians(values['angles']), path), white or None, True
-    return posed_geometry(values, n, path), None, False
+        return scanner_dict.to_geometry(values, np.radians(values['angles']), path), white or None, (1, -1)
+    return posed_geometry(values, n, path), None, (-1 if rows_run_up(values) else 1, 1)
 
 
 def _placed(geometry: Geometry, crop) -> Geometry:

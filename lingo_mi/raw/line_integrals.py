@@ -50,19 +50,24 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None) -
         for i in range(len(darks)):
             dark += darks[i] / len(darks)
     good = np.isfinite(dark)
+    if not good.any():
+        raise InputError(f'{darks.where if darks else ""}: no pixel of the dark frames holds a number; give others')
+    dark = np.where(good, dark, np.median(dark[good]))
     if flats is None:
         return Fields(dark, None, good & _near(dark, np.ptp(np.percentile(dark, [5, 95]))), None)
     total, square = np.zeros(shape), np.zeros(shape)
     bright = np.zeros(len(flats))
     for i in range(len(flats)):
         frame = flats[i] - dark
-        bright[i] = np.median(frame)
+        good &= np.isfinite(frame)
+        bright[i] = np.median(frame[np.isfinite(frame)]) if np.isfinite(frame).any() else 0.0
         if not bright[i] > 0:
             raise InputError(
                 f'{flats.where}: flat {i} is not brighter than the dark frames; are flats and darks swapped?'
             )
-        total += frame / bright[i]
-        square += (frame / bright[i]) ** 2
+        frame = np.where(good, frame / bright[i], 1.0)
+        total += frame
+        square += frame**2
     n = len(flats)
     mean = total / n
     flat = mean * bright.mean()

@@ -12,7 +12,8 @@ from helpers.cohorts import BATCH, events, results
 from helpers.script import FIT, SCENE, run
 from lingo_mi.cohort import work
 from lingo_mi.cohort.listing import BadList, read_list
-from lingo_mi.cohort.row import stored
+from lingo_mi.cohort.row import Row, stored
+from lingo_mi.cohort.table import Table
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import write_volume
@@ -75,6 +76,40 @@ def test_parquet(home):
     table = parquet.read_table(home / 'out' / 'results.parquet').to_pylist()
     assert table[0]['psnr_2d'] == float(results(home)['tiny']['psnr_2d']) and table[0]['lambda_tv'] == '0.1'
     assert table[0]['error'] is None and table[0]['views'] == 8
+
+
+def test_columns_of_text_and_numbers(tmp_path):
+    """A setting that one row gives, and the others' results: the Parquet file has one kind of value in a column."""
+    parquet = pytest.importorskip('pyarrow.parquet')
+    rows = [Row('a', 2, '.', settings=dict(iterations='2000')), Row('b', 3, '.')]
+    table = Table(tmp_path, rows)
+    table.done('a', dict(iterations=2000, views=5, psnr_2d=40.5))
+    table.done('b', dict(iterations=1400, views=6, psnr_2d=41))
+    table.finish()
+    found = parquet.read_table(tmp_path / 'results.parquet').to_pylist()
+    assert [row['iterations'] for row in found] == ['2000', '1400'] and [row['psnr_2d'] for row in found] == [40.5, 41]
+
+
+@pytest.mark.parametrize('name', ['results.parquet', 'batch.log'])
+def test_files_of_a_stranger_are_left_alone(home, name):
+    (home / 'out').mkdir()
+    (home / 'out' / name).write_text('mine')
+    code, _, err = batch(home)
+    assert code == 2 and f'{name}: is not that of a batch' in err and err.count('\n') == 1
+    assert (home / 'out' / name).read_text() == 'mine' and len([*(home / 'out').iterdir()]) <= 2
+
+
+def test_another_scene_of_the_same_name_is_another_request(home):
+    (home / 'list.csv').write_text('name,geometry,views\na,tiny.xml,5\n')
+    assert batch(home)[0] == 0
+    (home / 'tiny.xml').write_text(SCENE.replace('</scene>', '\n</scene>'))
+    code, _, err = batch(home)
+    assert code == 2 and 'holds a result of other values of content of the geometry' in err
+    path = home / 'out' / 'a' / METRICS
+    known = json.loads(path.read_text())
+    del known['request']['content of the geometry']  # as older versions wrote it
+    path.write_text(json.dumps(known))
+    assert batch(home)[0] == 0
 
 
 def test_projections_and_volumes(home):
@@ -166,6 +201,7 @@ def test_lists_that_spreadsheets_write(home, content):
 
 
 @pytest.mark.parametrize('content, message', [
+    (b',,\n,\n', 'is empty'),
     (b'', 'is empty'), (b'\xef\xbb\xbf\n \n', 'is empty'), (b'file\n', 'no scan below'), (b'name,views\na,3\n', 'no column file'),
     (b'file,file\na,b\n', "2 columns 'file'"), (b'file,,views\na,b,3\n', 'column 2 has no name'),
     ('file\nä\n'.encode('latin-1'), 'line 2: is not UTF-8'), ('file\na\n'.encode('utf-16'), 'UTF-16'),

@@ -1,5 +1,6 @@
 """Scans of every kind through `read_scan` and `write_scan`."""
 
+import errno
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import yaml
 
 from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
+from lingo_mi.files import arrays
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.reconstruction import CGLS
 from lingo_mi.scan import Dataset, Scan
@@ -53,6 +55,29 @@ def test_a_scan_alone(tmp_path, kind, name):
     back = read_scan(tmp_path / name)
     assert_same_scan(back.train, scan.subset([1]))
     assert back.test is None and back.volume is None
+
+
+@pytest.mark.parametrize('failing', [0, 1])
+def test_an_earlier_scan_stays_whole_where_the_disk_is_full(tmp_path, monkeypatch, failing):
+    """Neither the mask nor the geometry of the new one goes with the old projections."""
+    old, calls = small_dataset().train, []
+    old = replace(old, valid=np.arange(old.projections.size).reshape(old.projections.shape) > 0)
+    write_scan(tmp_path / 'a.npy', old, 'npy')
+    before, write = {p.name: p.read_bytes() for p in tmp_path.iterdir()}, arrays.write
+
+    def full(*args):
+        calls.append(args)
+        if len(calls) == failing + 1:
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        write(*args)
+
+    monkeypatch.setattr(arrays, 'write', full)
+    new = replace(
+        old, geometry=old.geometry.with_volume(5, 2.0), valid=np.flip(old.valid), projections=old.projections + 1
+    )
+    with pytest.raises(InputError, match='No space left'):
+        write_scan(tmp_path / 'a.npy', new, 'npy')
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
 def test_write_refuses(tmp_path):

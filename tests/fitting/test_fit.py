@@ -21,6 +21,7 @@ from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import CLOUDS, METHODS
+from lingo_mi.fitting.resume import extensible
 from lingo_mi.fitting.state import activate
 from lingo_mi.fitting.state import start as start_state
 from lingo_mi.fitting.total_variation import random_cube_variation
@@ -435,6 +436,16 @@ def test_files_that_are_no_fit(scan, stored):
     del extra['effects']  # as earlier versions wrote it
     write_as_before(stored, content, extra)
     assert len(Fitted.from_checkpoint(stored).state) == len(content['born'])
+
+
+def test_what_renews_something_in_shares_of_its_steps_is_not_made_longer(tmp_path):
+    """A gain of the views, or scattered light: half of a longer fit is another fit."""
+    scan, path = tiny_scan(geometry()), tmp_path / 'checkpoint.npz'
+    settings = SHORT.changed(iterations=2, decay_steps=100, fit_gain='view')
+    run(scan, settings, some_points(scan.geometry), path=path)
+    with pytest.raises(InputError, match='other values of iterations'):
+        run(scan, settings.changed(iterations=4), None, path=path)
+    assert extensible(SHORT.changed(decay_steps=100)) and not extensible(SHORT.changed(decay_steps=100), scatters=True)
 
 
 def test_progress_shows_the_absolute_measures(tmp_path):

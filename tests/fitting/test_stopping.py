@@ -92,6 +92,14 @@ def test_resumed_it_is_the_same(scan, whole, tmp_path, where):
     np.testing.assert_array_equal(stored.state.values['centre'], whole.state.values['centre'])
 
 
+def test_the_search_has_the_rates_of_the_fit(scan):
+    """Those of alpha compositing are in units of the radius of the scene, which fewer views tell a little otherwise."""
+    given = METHODS['3dgs'].changed(stop='on')
+    settings = bounded(given, scan)
+    assert Search(scan, given).stepper().settings.adam.rate_centre == pytest.approx(settings.adam.rate_centre, rel=0.1)
+    assert settings.adam.rate_centre[0] > 2 * given.adam.rate_centre[0]
+
+
 def test_what_is_told(scan, whole):
     numbers = measure(whole).numbers
     assert numbers['iterations'] == whole.steps and numbers['search']['kept'] == whole.steps
@@ -136,14 +144,14 @@ def test_bad_options(views, changes, message):
 
 
 def test_views_that_are_held_out_are_not_seen(scan):
-    search = Search(scan, bounded(SETTINGS, scan))
+    search = Search(scan, SETTINGS)
     assert len(search.seen) == 10 and len(search.held_out) == 2
     seen = {view.tobytes() for view in search.seen.projections}
     assert not any(view.tobytes() in seen for view in search.held_out.projections)
     other = scan.projections.copy()
     other[[2, 7]] += 1  # those held out
     start = search.begin(search.stepper().start(some_points(scan.geometry), np.random.default_rng(0)), 3)[1]
-    changed = Search(replace(scan, projections=other), bounded(SETTINGS, scan))
+    changed = Search(replace(scan, projections=other), SETTINGS)
     again = changed.begin(changed.stepper().start(some_points(scan.geometry), np.random.default_rng(0)), 3)[1]
     assert_equal_states(start, again)
 

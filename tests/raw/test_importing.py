@@ -10,7 +10,9 @@ import yaml
 
 import lingo_mi as lm
 from helpers.raw_frames import raw_frames
+from lingo_mi.cli import main
 from lingo_mi.errors import InputError
+from lingo_mi.geometry import rtk
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.importing import Options, import_raw
 from lingo_mi.raw.line_integrals import photons_of_images
@@ -281,3 +283,80 @@ def test_import_writes_a_scan_with_its_history(tmp_path, raw, scan_yml, monkeypa
     assert history['views'] == [0, 5, 2] and history['bad_pixels'] == 8 and history['flats'].endswith('flats.npy (20)')
     before = out.read_bytes()
     assert run() == 2 and 'exists already; give --force' in capsys.readouterr().err and out.read_bytes() == before
+
+
+@pytest.mark.parametrize('which', ['darks', 'flats'])
+def test_dead_pixels_that_are_nan(tmp_path, raw, scan_yml, which):
+    """In floating-point darks or flats they are masked, and change nothing else."""
+    paths = save(tmp_path, raw)
+    frames = getattr(raw, which).astype(np.float32)
+    plain = load(tmp_path / 'views.npy', scan_yml, **paths)
+    frames[:, 3, 5] = np.nan
+    np.save(tmp_path / f'{which}.npy', frames)
+    scan = load(tmp_path / 'views.npy', scan_yml, **paths)
+    assert not scan.valid[:, 3, 5].any()
+    same = np.ones(scan.valid.shape[1:], bool)
+    same[3, 5] = False
+    np.testing.assert_array_equal(scan.valid[:, same], plain.valid[:, same])
+    valid = plain.valid & same
+    np.testing.assert_allclose(scan.projections[valid], plain.projections[valid], atol=1e-4)
+
+
+@pytest.mark.parametrize('content', ['number', 'group', 'text', 'angles'])
+def test_files_of_another_structure(tmp_path, scan_yml, content):
+    """One line, whatever they hold in the place of frames."""
+    h5py = pytest.importorskip('h5py')
+    path = tmp_path / ('a.npy' if content == 'number' else 'a.h5')
+    if content == 'number':
+        np.save(path, np.float32(3))
+    else:
+        with h5py.File(path, 'w') as file:
+            if content == 'group':
+                file.create_group('exchange/data')
+            else:
+                file['exchange/data'] = np.ones((2, 3, 4)) if content == 'angles' else 'frames'
+                file['exchange/theta'] = 'a, b'
+    with pytest.raises(InputError, match='a.npy|a.h5') as caught:
+        load(path, scan_yml, i0=1.0)
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('out', ['views.npy', 'flats.npy'])
+def test_what_is_imported_is_not_overwritten(tmp_path, raw, scan_yml, monkeypatch, capsys, out):
+    paths, before = save(tmp_path, raw), (tmp_path / out).read_bytes()
+    command = ['import', tmp_path / 'views.npy', '--geometry', scan_yml, '--out', tmp_path / out, '--force']
+    monkeypatch.setattr(sys, 'argv', ['lingo-mi', *map(str, command), '--flats', str(paths['flats'])])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2 and f'{out}: would be overwritten' in capsys.readouterr().err
+    assert (tmp_path / out).read_bytes() == before
+
+
+# ---- frames in another order than ours -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('named', ['itself', 'in a .yml'])
+def test_rows_of_rtk_run_up(tmp_path, named):
+    """RTK's geometry goes with frames whose rows run up: turned round, cut and binned, every pixel keeps its ray."""
+    shape = (11, 17)
+    geometry = lm.Geometry.cone(
+        DSO=100, DSD=150, nDetector=shape, dDetector=1.5, nVoxel=8, dVoxel=1, angles=np.radians([0, 70, 200])
+    )
+    p = np.random.default_rng(0).uniform(0, 2, (3, *shape)).astype(np.float32)
+    np.save(tmp_path / 'frames.npy', (1000 * np.exp(-p[:, ::-1])).astype(np.float32))
+    source, options = tmp_path / 'geometry.xml', dict(i0=1000.0, pixel=1.5)
+    rtk.write(source, geometry.rays(), shape)
+    if named != 'itself':
+        values, options = dict(dDetector=[1.5, 1.5], nVoxel=[8, 8, 8], dVoxel=1, poses='geometry.xml'), dict(i0=1000.0)
+        source = tmp_path / 'scan.yml'
+        source.write_text(yaml.safe_dump(values))
+    scan = load(tmp_path / 'frames.npy', source, **options)
+    np.testing.assert_allclose(scan.projections, p, atol=1e-5)
+    np.testing.assert_allclose(scan.geometry.rays().corner, geometry.rays().corner, atol=1e-9)
+    # Frame rows 1 to 8 are our rows 3 to 10, of which binning by 3 keeps the first six.
+    part = load(tmp_path / 'frames.npy', source, **options, crop=(1, 8, 2, 12), binning=3)
+    mean = np.exp(-p[:, 3:9, 2:11]).reshape(3, 2, 3, 3, 3).mean((2, 4))
+    np.testing.assert_allclose(part.projections, -np.log(mean), atol=1e-5)
+    rays = geometry.rays()
+    np.testing.assert_allclose(part.geometry.rays().corner, rays.corner + 3 * rays.v + 2 * rays.u, atol=1e-9)
+    np.testing.assert_allclose(part.geometry.rays().v, 3 * rays.v, atol=1e-9)

@@ -49,6 +49,17 @@ def test_scan(tmp_path, xtekct):
     np.testing.assert_allclose(part.geometry.rays().corner, (scan.geometry.rays().corner + 5 * scan.geometry.rays().u))
 
 
+def test_binning_that_leaves_columns_over(tmp_path, xtekct):
+    """Eight columns by three: those that the panel's pixels leave out are not counted, wherever they stand in the frame."""
+    p = np.random.default_rng(0).uniform(0, 2, (4, 6, 8)).astype(np.float32)  # in our order
+    np.save(tmp_path / 'v.npy', 60000 * np.exp(-p[:, :, ::-1]))
+    scan = lm.load_raw(tmp_path / 'v.npy', xtekct, progress=False, binning=3)
+    mean = np.exp(-p[:, :, :6]).reshape(4, 2, 3, 2, 3).mean((2, 4))
+    np.testing.assert_allclose(scan.projections, -np.log(mean), atol=1e-5)
+    whole = lm.load_raw(tmp_path / 'v.npy', xtekct, progress=False).geometry
+    np.testing.assert_allclose(scan.geometry.rays().corner, whole.rays().corner, atol=1e-9)
+
+
 def test_centre_of_rotation(xtekct):
     """Millimetres on the panel become millimetres at the object."""
     xtekct.write_text(TEXT.format(top=1.12))

@@ -51,6 +51,15 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     assert code == 0 and '99.00' in text and f'{cells[BEST]["psnr_3d"]:.2f} (' in text, err
 
 
+def test_the_measured_walnut(data, tmp_path):
+    """On the voxels asked for, which are as large as all together need; its truth is the FDK of all views."""
+    found = Study(tmp_path, 8).dataset(Case('walnut', views=30))
+    geometry = found.train.geometry
+    assert tuple(geometry.nVoxel) == (8, 8, 8) and len(found.train) == 30
+    np.testing.assert_allclose(8 * np.array(geometry.dVoxel), 128 * 0.305)
+    assert found.volume.shape == (8, 8, 8) and found.volume.max() > 0.01
+
+
 def test_noise_is_that_of_photons():
     views = np.full((40, 40, 40), 2.0, np.float32)
     found = noisy(views, 1000.0)
