@@ -54,6 +54,7 @@ def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
 
 
 def _refined(scan: Scan) -> np.ndarray:
+    """For objects finer than the voxels, as measured ones are (docs/how_to/few_views.md)."""
     return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=_cloud(scan)).volume
 
 
@@ -106,7 +107,7 @@ METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
     'rtk-tv': ('RTK, total variation', _rtk_tv),
     'mbirjax': ('MBIRJAX', _qggmrf),
     'fast': ("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
-    'refined': ('`fast`, then `refined`', _refined),
+    'refined': ('`fast`, then `refined`, `finer=2`', _refined),
     'best': ('`best`', lambda scan: Best().run(scan).volume),
 }
 NEEDS = {

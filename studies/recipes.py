@@ -78,7 +78,7 @@ class Comparison:
                 command.append('--resume')
             print(' '.join(command), file=sys.stderr)
             if code := run_command(command):
-                raise InputError(f'{scene}: lingo-mi fit --method {method} failed with exit code {code}')
+                raise InputError(f'{scene}: lingo-mi fit --recipe {method} failed with exit code {code}')
         found = current_names(json.loads((folder / 'metrics.json').read_text(encoding='utf-8')))
         return found | dict(history=[current_names(entry) for entry in found['history']])
 
@@ -90,7 +90,7 @@ class Comparison:
             changes.append(f'iterations={self.iterations}')
         folder = self.folder / '_'.join([Path(scene).stem, str(self.views), name, *changes])
         program = [sys.executable, '-m', 'lingo_mi', 'fit', str(scene)]
-        options = ['--method', name, '--views', str(self.views), '--out', str(folder)]
+        options = ['--recipe', name, '--views', str(self.views), '--out', str(folder)]
         return folder, program + options + [word for change in changes for word in ('-D', change)]
 
 

@@ -1,7 +1,7 @@
 """Fit a cloud of 3D Gaussians, or a neural field, to a CT scan, and make a volume and new views of it.
 
     lingo-mi fit x3d_foot
-    lingo-mi fit x3d_foot --method lingo --views 25 --iterations 5000
+    lingo-mi fit x3d_foot --recipe lingo --views 25 --iterations 5000
     lingo-mi fit chest --volume my_ct.nii.gz --views 25
     lingo-mi fit x3d_foot --projections foot_50.pickle
 
@@ -25,7 +25,7 @@ from lingo_mi.cli.common import (
     writable_folder,
 )
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
 from lingo_mi.output_folder import CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
@@ -38,11 +38,12 @@ def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument(
+        '--recipe',
         '--method',
-        choices=METHODS,
         default='fast',
-        help='recipe: fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
-        'composite opacities and make views but no volume, and naf, a neural field',
+        metavar='R',
+        help='fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
+        'composite opacities and make views but no volume, and naf, a neural field; R:setting=value,... changes it',
     )
     p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
@@ -92,14 +93,14 @@ def main() -> None:
     if twice := given.keys() & options.keys():
         raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
     given |= options
-    known = METHODS[args.method].flat()
+    known = settings_of(args.recipe).flat()
     if unknown := [k for k in given if k not in known]:
         names = ', '.join(sorted(own)) or 'it has none'
         raise InputError(
             f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor a setting of the fit'
             + (nearest(unknown[0], [*own, *known]) or '; the documentation of Settings lists those')
         )
-    settings = METHODS[args.method].changed(**given)
+    settings = settings_of(args.recipe, **given)
     folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume)
     with locked(folder):
         clear_leftovers(folder)
@@ -131,7 +132,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
                 bar.update,
                 resume=args.resume,
                 title=title,
-                method=args.method,
+                method=args.recipe,
                 command=command_line(without=('--resume', '--force')),
                 watchers=watchers,
             )

@@ -1,6 +1,6 @@
 """The balanced splat: footprints to an image and back, with work shared out by pixel count.
 
-Each lane works on one detector row of a Gaussian, or on an eighth of it on a GPU; `balance` shares the rows out.
+Each lane works on one detector row of a Gaussian, on a GPU on a half or an eighth of it; `balance` shares the rows out.
 
 The backward pass is a gather: the derivative of a footprint's eleven numbers is a sum over its pixels, kept in registers.
 Only the footprints are stored between the two passes.

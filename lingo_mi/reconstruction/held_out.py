@@ -6,8 +6,8 @@ the frequency w along the detector's rows,
 
     integral of f^2  ~  integral over the angles and w of |w| |P(angle, w)|^2
 
-(Natterer, "The Mathematics of Computerized Tomography", 1986, theorem II.1.1 and section II.5). So the difference between
-predicted and measured views is weighted by |w| before its norm is taken; a fan or a cone is nearly parallel for this purpose.
+(Natterer, "The Mathematics of Computerized Tomography", 1986, theorem II.1.1 and section II.5). So the squared difference between
+predicted and measured views is weighted by |w|; a fan or a cone is nearly parallel for this purpose.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--views', '0'], '--views'),
         (['--views', '9'], '9 views'),
         (['--views', 'x'], '--views'),
-        (['--method', 'magic'], '--method'),
+        (['--recipe', 'magic'], 'there is no such recipe'),
         (['--init', 'magic'], '--init'),
         (['--variant', 'magic'], 'variant'),
         (['--variant', 'scalar_rgb'], 'variant'),

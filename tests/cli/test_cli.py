@@ -164,7 +164,7 @@ def test_options(scene, tmp_path):
         '3',
         '--seed',
         '5',
-        '--method',
+        '--recipe',
         'lingo',
         '--init',
         'r2',

@@ -27,7 +27,7 @@ CHANGES = dict(
     rate_network='3e-3,3e-4',
     epsilon=1e-10,
 )
-OPTIONS = ['--method', 'naf', '--views', '4', *(part for k, v in CHANGES.items() for part in ('-D', f'{k}={v}'))]
+OPTIONS = ['--recipe', 'naf', '--views', '4', *(part for k, v in CHANGES.items() for part in ('-D', f'{k}={v}'))]
 
 
 @pytest.fixture(scope='module')
@@ -114,7 +114,7 @@ def test_what_a_field_cannot_do_is_one_line(fitted, scene, tmp_path):
         (['--init', 'lingo'], "'network'"),
         (['-D', 'field_samples=0'], 'field_samples'),
     ):
-        code, _, err = fit(scene, '--method', 'naf', *changes, '--out', tmp_path / 'out')
+        code, _, err = fit(scene, '--recipe', 'naf', *changes, '--out', tmp_path / 'out')
         assert code == 2 and said in err and err.count('\n') == 1, err
         assert not (tmp_path / 'out').exists()
     code, _, err = fit(scene, '--init', 'network', '--out', tmp_path / 'out')

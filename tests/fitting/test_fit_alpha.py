@@ -298,7 +298,7 @@ def result(scene):
         (folder / stale).write_text('of an earlier fit')
     code, out, err = fit(
         scene,
-        '--method',
+        '--recipe',
         '3dgs',
         '--views',
         '4',
@@ -403,7 +403,7 @@ def test_help_names_every_method():
 
 
 def test_bad_combination_on_the_command_line(scene, tmp_path):
-    code, _, err = fit(scene, '--method', '3dgs', '--init', 'r2', '--out', tmp_path / 'a')
+    code, _, err = fit(scene, '--recipe', '3dgs', '--init', 'r2', '--out', tmp_path / 'a')
     assert code == 2 and err.count('\n') == 1 and 'init is' in err and not list(tmp_path.iterdir())
 
 

@@ -81,7 +81,7 @@ def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypat
     (folder / 'checkpoint.npz').touch()
     code, _, err = recipes('--methods', 'fast')
     assert code == 2 and '--resume' in commands[0]
-    assert err.splitlines()[-1] == 'error: a.xml: lingo-mi fit --method fast failed with exit code 3'
+    assert err.splitlines()[-1] == 'error: a.xml: lingo-mi fit --recipe fast failed with exit code 3'
 
 
 @pytest.mark.parametrize('method', ['nerf', 'r2:V=1', 'r2:V_S'])
