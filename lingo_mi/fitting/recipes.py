@@ -11,10 +11,10 @@ from lingo_mi.fitting.settings import Settings
 # Zha et al., "R2-Gaussian: Rectifying Radiative Gaussian Splatting for Tomographic Reconstruction", NeurIPS 2024.
 R2 = Settings()
 LINGO = R2.changed(init='lingo', loss_scale='dynamic')
-# Tuned on the foot and chest phantoms. Differences from LINGO: initial densities from an FDK volume; no factor on the loss; rates 5
-# to 30 times higher that fall over the run; shorter memory of the moments, and a mean of the last steps; more weight on SSIM, for fine
-# detail; total variation of eight times the volume (with short moments, each Gaussian must be smoothed more often than once
-# in 64 steps); earlier densification, limited by the scan's size; an early stop where the noise is known.
+# Tuned on the foot and chest phantoms. Differences from LINGO: initial densities from an FDK volume; no factor on the loss; rates
+# 5 to 30 times higher that fall over the run; shorter memory of the moments, and a mean of the last steps; more weight on SSIM,
+# for fine detail; total variation of eight times the volume (with short moments, each Gaussian must be smoothed more often than
+# once in 64 steps); earlier densification, limited by the scan's size; an early stop where the noise is known.
 FAST = R2.changed(
     init='lingo',
     init_density='fdk',
