@@ -15,7 +15,7 @@ examples:
       prints what was found; changes nothing
   lingo-mi calibrate scan.npy --drift 3 --out calibrated.npy
       also a drift over the scan; writes the scan with the geometry that was found
-  lingo-mi fit x3d_foot --projections calibrated.npy"""
+  lingo-mi fit calibrated.npy"""
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from lingo_mi.file_access import leftovers, require_writable, write_text
 from lingo_mi.folder_lock import LOCK, locked
 from lingo_mi.interrupts import noticed
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
+from lingo_mi.scene.shipped import scenes
 
 
 class Parser(argparse.ArgumentParser):
@@ -67,11 +68,22 @@ def command_line(*options: str, without: Collection[str] = ()) -> str:
     return ' '.join([program, shlex.join([*(a for a in sys.argv[1:] if a not in without), *options])])
 
 
+SCANNER = 'scanner'  # the shipped scene of projections that come without one
+
+
+def input_name(args: argparse.Namespace) -> str:
+    """What results are named after: the scene, or the scan that was given in its place."""
+    scene = Path(args.scene).stem
+    return Path(args.projections).stem if scene == SCANNER and args.projections else scene
+
+
 def input_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that say what is scanned: scene, --projections, --volume and what goes with them."""
     parser.add_argument(
         'scene',
-        help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml, or the name of a shipped one, x3d_foot',
+        metavar='SCENE|SCAN',
+        help='a Mitsuba scene with a ct_scanner, such as scenes/x3d_foot.xml; the name of a shipped one, x3d_foot; or measured '
+        'projections, as --projections takes them',
     )
     parser.add_argument(
         '--projections',
@@ -96,7 +108,17 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check_input(args: argparse.Namespace) -> None:
-    """Raises InputError where the arguments of `input_arguments` and --views contradict each other."""
+    """Raises InputError where the arguments of `input_arguments` and --views contradict each other.
+
+    A scan in the place of the scene becomes --projections, with a scanner that has no effects.
+    """
+    scene = Path(args.scene)
+    if scene.suffix.lower() != '.xml' and args.scene not in scenes() and scene.exists():
+        if args.projections or args.volume:
+            raise InputError(
+                f'{args.scene}: is no scene, which --projections and --volume go with; leave one of them out'
+            )
+        args.projections, args.scene = args.scene, SCANNER
     for name in ('projections', 'volume'):
         if getattr(args, name) == '':  # an unset variable of the shell's
             raise InputError(f'--{name} names no file')

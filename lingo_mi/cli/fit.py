@@ -3,12 +3,13 @@
     lingo-mi fit x3d_foot
     lingo-mi fit x3d_foot --recipe lingo --views 25 --iterations 5000
     lingo-mi fit chest --volume my_ct.nii.gz --views 25
-    lingo-mi fit x3d_foot --projections foot_50.pickle
+    lingo-mi fit foot_50.pickle
 
-The scene says what is scanned and by which scanner. Projections are rendered from its object, or read from a file of
-measured ones; a cloud is initialised from them, fitted, and written to the output folder with a report (report.html), a
-volume in mm (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and
-metrics.json. The baselines 3dgs and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
+The scene says what is scanned and by which scanner; the projections are rendered from its object. A file of measured ones takes
+its place, or with --projections that of the object alone, where a scene's tube and detector are to be modelled. A cloud is
+initialised from the projections, fitted, and written to the output folder with a report (report.html), a volume in mm
+(volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json. The baselines 3dgs
+and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from lingo_mi.cli.common import (
     command_line,
     definitions,
     input_arguments,
+    input_name,
     read_input,
     writable_folder,
 )
@@ -101,7 +103,7 @@ def main() -> None:
             + (nearest(unknown[0], [*own, *known]) or '; the documentation of Settings lists those')
         )
     settings = settings_of(args.recipe, **given)
-    folder = writable_folder(args.out or Path('out') / Path(args.scene).stem, args.force, args.resume)
+    folder = writable_folder(args.out or Path('out') / input_name(args), args.force, args.resume)
     with locked(folder):
         clear_leftovers(folder)
         fit_scene(folder, args, settings, {k: v for k, v in defined.items() if k in own})

@@ -15,7 +15,7 @@ examples:
       NXtomo or DXchange, with its own flats, darks and angles
   lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
       Nikon, with the air level of every view from a region without object
-  lingo-mi fit x3d_foot --projections scan.npy"""
+  lingo-mi fit scan.npy"""
 
 
 def arguments() -> argparse.Namespace:

@@ -6,7 +6,7 @@
     lingo-mi reconstruct x3d_foot --algorithm voxelize --complete out/x3d_foot/result.xml
     lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot/result.xml --views 100
     lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot/result.xml
-    lingo-mi reconstruct x3d_foot --projections large.npy --algorithm fdk --slab 64 --out large.ome.zarr
+    lingo-mi reconstruct large.npy --algorithm fdk --slab 64 --out large.ome.zarr
     lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
 The input is what `lingo-mi fit` takes. With --complete, the views that the cloud was fitted to are kept, those missing to --views
@@ -43,6 +43,7 @@ from lingo_mi.cli.common import (
     command_line,
     definitions,
     input_arguments,
+    input_name,
     read_input,
     writable_file,
     writing_file,
@@ -218,7 +219,7 @@ def main() -> None:
     if args.start and args.algorithm == 'refined':  # there are no completed views
         chosen = dict(completed_niter='0') | chosen
     algorithm = algorithm_of(args.algorithm, chosen)
-    out = output(args.out or Path('out') / f'{Path(args.scene).stem}-{args.algorithm}.nii.gz', args.force)
+    out = output(args.out or Path('out') / f'{input_name(args)}-{args.algorithm}.nii.gz', args.force)
     if args.algorithm == 'best':
         for path in beside(out):
             writable_file(path, args.force)
@@ -305,7 +306,7 @@ def write_page(path: Path, found: Reconstruction, truth: np.ndarray | None, args
     geometry = found.geometry
     numbers = found.metrics(truth) if truth is not None else {}
     data = ReportData(
-        title=f'{Path(args.scene).stem}, {args.algorithm}',
+        title=f'{input_name(args)}, {args.algorithm}',
         metrics=numbers | dict(method=args.algorithm, views=len(geometry), seconds=found.seconds),
         volume=found.volume,
         truth=truth,

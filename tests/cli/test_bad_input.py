@@ -58,7 +58,7 @@ def test_not_a_scene(tmp_path, text, says):
 
 def test_missing_scene(tmp_path):
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml')
-    assert f'{tmp_path}: is a folder' in refused(tmp_path, tmp_path)
+    assert f'{tmp_path}: has neither meta_data.json' in refused(tmp_path, tmp_path)  # as a scan in the place of a scene
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml', '-D', 'size=16')
     assert 'a device or a pipe' in refused(tmp_path, '/dev/zero')
 

@@ -15,7 +15,8 @@ import nibabel
 import numpy as np
 import pytest
 
-from helpers.script import FIT, SCENE, fit, fit_process
+from helpers.fits import geometry, tiny_scan
+from helpers.script import FIT, SCENE, fit, fit_process, run
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import write_scan
@@ -312,3 +313,18 @@ def test_metal_part_has_a_truth():
     again = grid.project(scan.volume, scan.train.geometry)
     assert again.sum() == pytest.approx(scan.train.projections.sum(), rel=2e-3)
     assert np.abs(again - scan.train.projections).mean() < 0.04 * scan.train.projections.mean()  # blurred edges
+
+
+def test_a_scan_in_the_place_of_a_scene(tmp_path, monkeypatch):
+    """Results are named after it; a scene does not go with it, and it needs to be there."""
+    write_scan(tmp_path / 'hand.npy', tiny_scan(geometry(8)), 'npy')
+    monkeypatch.chdir(tmp_path)
+    code, text, err = fit('hand.npy', *QUICK)
+    assert code == 0, err
+    assert 'out/hand/: ' in text and metrics_of(tmp_path / 'out' / 'hand')['views'] == 8
+    code, text, err = run(FIT.with_name('reconstruct.py'), 'hand.npy', '--algorithm', 'fdk')
+    assert code == 0 and 'out/hand-fdk.nii.gz' in text, err
+    code, _, err = fit('hand.npy', '--projections', 'hand.npy')
+    assert code == 2 and 'hand.npy: is no scene, which --projections and --volume go with' in err
+    code, _, err = fit('foot.npy')
+    assert code == 2 and 'foot.npy: there is no such scene' in err
