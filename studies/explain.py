@@ -182,15 +182,17 @@ def _row(name, test, expected):
 def _ideal(dataset):
     """The scan of what all its views reconstruct, with its noise in air."""
     g, n = dataset.train.geometry, len(dataset.train)
-    every = Scan(g.joined(dataset.test.geometry), np.concatenate([dataset.train.projections, dataset.test.projections]))
+    scans = dataset.train, dataset.test
+    valid = np.concatenate([np.ones(s.projections.shape, bool) if s.valid is None else s.valid for s in scans])
+    every = Scan(g.joined(dataset.test.geometry), np.concatenate([s.projections for s in scans]), valid)
     order = np.argsort(every.geometry.angles)
     volume = reconstruct(every.subset(order), OSSART(niter=10, blocksize=4)).volume
     p = grid.project(volume, every.geometry)
-    photons = photons_of_images(every.projections, None)
+    photons = photons_of_images(every.projections, every.valid)
     if np.isfinite(photons):
         rng = np.random.default_rng(0)
         p = p + rng.normal(size=p.shape).astype(np.float32) * np.sqrt(np.exp(p) / photons).astype(np.float32)
-    clean = Scan(every.geometry, p)
+    clean = Scan(every.geometry, p, every.valid)
     return Dataset(clean.subset(slice(0, n)), clean.subset(slice(n, None)))
 
 

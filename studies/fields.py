@@ -81,9 +81,8 @@ def main() -> None:
                     label = ' '.join([method, *args.define])
                 elif settings.decay_steps:
                     settings = settings.changed(iterations=STEPS)
-                path = (
-                    args.out / f'{name}_{views}_{label.replace(":", "_").replace(" ", "_")}_{settings.iterations}.json'
-                )
+                of = label.replace(':', '_').replace(' ', '_')
+                path = args.out / f'{name}_{args.scale}_{views}_{of}_{settings.iterations}_{args.test}.json'
                 if not path.exists():
                     dataset = choose_views(cells.dataset(name), views)
                     found = dict(object=name, views=views, method=label, scale=args.scale, test=args.test)

@@ -67,7 +67,7 @@ class Study:
         self.dataset = functools.lru_cache(1)(self._dataset)
 
     def name(self, case: Case) -> str:
-        scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
+        scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:.17g}_photons'
         steps = '' if self.iterations == FAST.iterations else f'_{self.iterations}_steps'
         return f'{scan}{steps}'
 

@@ -162,7 +162,8 @@ class Study:
                     self.cells.put(_case(count), method, found)
 
     def _require_same_scan(self) -> None:
-        path, digest = self.folder / 'scan.txt', self.dataset.train.digest()
+        scans = [scan for scan in (self.dataset.train, self.dataset.test) if scan is not None]
+        path, digest = self.folder / 'scan.txt', ' '.join(scan.digest() for scan in scans)
         if path.exists() and path.read_text(encoding='utf-8').strip() != digest:
             raise InputError(f'{self.folder}: has the volumes of another scan; choose another --out')
         self.folder.mkdir(parents=True, exist_ok=True)

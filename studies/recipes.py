@@ -68,6 +68,10 @@ class Comparison:
         methods = list(methods)
         for method in methods:
             settings_of(method)
+        scenes = list(scenes)
+        names = [Path(scene).stem for scene in scenes]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f'{twice[0]}: two scenes have this name, by which results are told apart; rename one')
         return {(Path(scene).stem, method): self.result(scene, method) for scene in scenes for method in methods}
 
     def result(self, scene: PathLike | str, method: str) -> dict:

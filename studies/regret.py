@@ -77,7 +77,7 @@ class Study:
         self._cloud = functools.lru_cache(1)(self._fitted)
 
     def name(self, case: Case) -> str:
-        return f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:g}_photons'
+        return f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:.17g}_photons'
 
     def get(self, case: Case, setting: str) -> dict | None:
         """A stored cell, or None where there is none that can be read."""
@@ -144,11 +144,15 @@ class Study:
         geometry, views, truth = simulated(case.object, self.size, 5 * self.size // 3, case.views, case.finer)
         return Dataset(Scan(geometry, noisy(views, case.photons) if case.photons else views), None, truth)
 
-    def _measured(self, case: Case) -> Dataset:
-        if case.finer != 1 or case.photons:
+    @staticmethod
+    def check(case: Case) -> None:
+        """Raises InputError for a case that there is not."""
+        if case.object == MEASURED and (case.finer != 1 or case.photons):
             raise InputError(
                 f'{MEASURED} is measured: it has its own detail and noise, so give --finer 1 and --photons 0'
             )
+
+    def _measured(self, case: Case) -> Dataset:
         parameters = dict(voxels=str(self.size), voxel_size=f'{128 * 0.305 / self.size}')
         every = load_scene(scene_path(MEASURED), parameters).scanner.dataset
         assert every is not None  # it has no object

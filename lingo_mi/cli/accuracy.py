@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, docs_arguments, docs_of
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 
@@ -36,6 +37,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
+    require_writable(args.out, args.out, 'choose another --out')
     document, figures = docs_of(args)
     use_variant(args.variant)
     from lingo_mi.studies.accuracy import FULL, QUICK, measure, measure_presets

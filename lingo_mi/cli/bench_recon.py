@@ -21,7 +21,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 from lingo_mi.runtime import use_variant
 
 os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # idle threads of one package must not slow the next one's
@@ -38,6 +38,8 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
+    if args.json:
+        require_writable(args.json.parent, args.json, 'choose another --json')
     if min(args.size, args.views, args.repeats) < 1 or args.size < 8:
         raise InputError('--size must be at least 8, --views and --repeats at least 1')
     use_variant('llvm_ad_mono')

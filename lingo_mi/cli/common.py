@@ -319,20 +319,23 @@ def writable_file(path: Path, force: bool) -> Path:
 def renewed_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[str], None]]:
     """The table of a study that stores its cells one by one, as Markdown in a file whose folder is locked meanwhile.
 
-    Gives a function to call with a line after each cell: it prints the line and writes the table anew. At the end the table is
-    printed, and its provenance is written beside it. After KeyboardInterrupt the same command goes on.
+    Gives a function to call with a line after each cell: it prints the line and writes the table anew, with its provenance. At
+    the end the table is printed. After KeyboardInterrupt the same command goes on.
     """
     from lingo_mi.studies.provenance import write_provenance
 
     def renew(line: str) -> None:
         print(line, flush=True)
+        write()
+
+    def write() -> None:
         write_text(file, table() + '\n')
+        write_provenance(file)
 
     with locked(file.parent):
         try:
             yield renew
         except KeyboardInterrupt:
             raise KeyboardInterrupt('the same command goes on from here') from None
-        write_text(file, table() + '\n')
-        write_provenance(file)
+        write()
     print(table())

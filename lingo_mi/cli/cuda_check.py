@@ -17,7 +17,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 
 
 def arguments() -> argparse.Namespace:
@@ -43,6 +43,8 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
+    if args.markdown:
+        require_writable(args.markdown.parent, args.markdown, 'choose another --markdown')
     from lingo_mi.studies.cell_files import CellFiles
     from lingo_mi.studies.cuda.assemble import find_ptxas
     from lingo_mi.studies.cuda.page import page

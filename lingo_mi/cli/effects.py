@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, docs_arguments, docs_of
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 
@@ -30,6 +31,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
+    require_writable(args.out, args.out, 'choose another --out')
     document, figures = docs_of(args)
     use_variant(args.variant)
     from lingo_mi.studies.effects.experiments import EXPERIMENTS, experiment_of, measure

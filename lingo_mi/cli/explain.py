@@ -15,6 +15,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import require_writable
 from lingo_mi.runtime import use_variant
 
 KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
@@ -46,6 +47,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
+    require_writable(args.out, args.out, 'choose another --out')
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
     use_variant(args.variant)

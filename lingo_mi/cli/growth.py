@@ -62,8 +62,8 @@ def main() -> None:
     stored = args.out / 'growth.json'
     with locked(args.out), Progress('Stages', len(DEPENDS)) as bar:
 
-        def after(found):
-            write_text(stored, json.dumps(found, indent=1) + '\n')
+        def after(found, others):
+            write_text(stored, json.dumps(found + others, indent=1) + '\n')
             bar.update(len({row['stage'] for row in found}), last=found[-1]['stage'])
 
         found = sweep(args.large, read(stored), after)

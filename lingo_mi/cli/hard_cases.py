@@ -18,7 +18,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 from lingo_mi.runtime import use_variant
 
 
@@ -37,6 +37,8 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
+    for path in filter(None, (args.markdown, args.json)):
+        require_writable(path.parent, path, 'choose another file')
     if args.steps < 1:
         raise InputError(f'--steps must be at least 1, not {args.steps}')
     variant = use_variant(args.variant)

@@ -23,7 +23,7 @@ from lingo_mi.runtime import use_variant
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
-    p.add_argument('--finer', nargs='+', type=int, default=[1, 2], metavar='N', help='(default: 1 2)')
+    p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; of the walnut 1)')
     p.add_argument('--views', nargs='+', type=int, default=[25], metavar='N', help='(default: 25)')
     p.add_argument(
         '--photons', nargs='+', type=float, default=[0.0], metavar='N', help='a pixel (default: 0, no noise)'
@@ -37,7 +37,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     args = arguments()
-    ranges = (('--finer', args.finer, 1, 8), ('--views', args.views, 4, 5000), ('--size', [args.size], 12, 512))
+    ranges = (('--finer', args.finer or (), 1, 8), ('--views', args.views, 4, 5000), ('--size', [args.size], 12, 512))
     for name, values, low, high in ranges:
         if not all(low <= value <= high for value in values):
             raise InputError(f'{name} must be from {low} to {high}, not {" ".join(map(str, values))}')
@@ -51,6 +51,14 @@ def main() -> None:
     names = [*(available(simulated, print) if simulated else []), *(n for n in args.objects if n == MEASURED)]
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size)
-    cases = [Case(n, f, v, p) for n in names for f in args.finer for v in args.views for p in args.photons]
+    cases = [
+        Case(n, f, v, p)
+        for n in names
+        for f in (args.finer or ((1,) if n == MEASURED else (1, 2)))
+        for v in args.views
+        for p in args.photons
+    ]
+    for case in cases:
+        study.check(case)
     with renewed_table(args.out / 'regret.md', lambda: study.table(cases)) as renew:
         study.compute_missing(cases, args.clouds, renew)

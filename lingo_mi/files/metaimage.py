@@ -15,6 +15,7 @@ from lingo_mi.file_access import beside, reading
 from lingo_mi.files.voxels import read_voxels
 
 _LONGEST_HEADER = 1 << 16
+UNITS = {'mm': 1.0, 'um': 1e-3, 'cm': 10.0, '?': 1.0}  # in mm
 _TYPES = {
     'MET_CHAR': 'i1',
     'MET_UCHAR': 'u1',
@@ -84,8 +85,12 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     affine = np.eye(4)
     # A row of TransformMatrix is the direction of an axis.
     matrix = numbers(['TransformMatrix', 'Rotation', 'Orientation'], np.eye(3).ravel(), 9).reshape(3, 3)
-    affine[:3, :3] = matrix.T * numbers(['ElementSpacing'], [1, 1, 1])
+    affine[:3, :3] = matrix.T * numbers(['ElementSpacing', 'ElementSize'], [1, 1, 1])
     affine[:3, 3] = numbers(['Offset', 'Position', 'Origin'], [0, 0, 0])
+    unit = fields.get('DistanceUnits', 'mm')
+    if unit not in UNITS:
+        fail(f'DistanceUnits must be one of {", ".join(UNITS)}, not {shown(unit)}')
+    affine[:3] *= UNITS[unit]
     return data, affine
 
 

@@ -30,6 +30,7 @@ _TYPES = {
 }
 _NAMES = {name: kind for kind, names in _TYPES.items() for name in names.split(', ')}
 _PACKINGS = {'raw': None, 'gzip': 'deflate', 'gz': 'deflate', 'bzip2': 'bzip2', 'bz2': 'bzip2'}
+_UNITS = {'mm': 1.0, 'um': 1e-3, 'microns': 1e-3, 'micron': 1e-3, 'nm': 1e-6, 'cm': 10.0, 'm': 1e3, '': 1.0}  # in mm
 # Signs that turn the space's axes into left, posterior, superior; those of others are taken as they are.
 _TO_LPS = {
     'right-anterior-superior': (-1, -1, 1),
@@ -105,6 +106,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         fail('axis mins and maxs are not read; say the voxel size by spacings or space directions')
     else:
         affine[:3, :3] = np.diag(numbers('spacings', [1, 1, 1], 3))
+    units = re.findall(r'"([^"]*)"', fields.get('space units', fields.get('units', '')))
+    if unknown := [unit for unit in units if unit.lower() not in _UNITS] or len(set(units)) > 1:
+        fail(f'units must be one of {", ".join(filter(None, _UNITS))} for all axes, not {shown(unknown or units)}')
+    affine[:3] *= _UNITS[units[0].lower()] if units else 1.0
     return data, affine
 
 

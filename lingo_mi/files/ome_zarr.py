@@ -41,7 +41,8 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         axes, level = image['axes'], image['datasets'][0]
         names = [str(axis['name']) for axis in axes]
         folder = path / _below(str(level['path']))
-        scale, shift = _placed(level, len(names))
+        everywhere = image.get('coordinateTransformations') or []  # after those of a level
+        scale, shift = _placed([*level['coordinateTransformations'], *everywhere], len(names))
         units = [MILLIMETRES[axis.get('unit')] for axis in axes if axis['name'] in SPACE]
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):
         fail('has no image in the form of OME-Zarr 0.4 or 0.5, or a unit of length unknown here; correct its metadata')
@@ -104,10 +105,10 @@ def _below(name):
     return Path(*parts)
 
 
-def _placed(level, dimensions):
+def _placed(transformations, dimensions):
     """Steps, and the centre of the first voxel."""
     steps, shift = np.ones(dimensions), np.zeros(dimensions)
-    for transformation in level['coordinateTransformations']:
+    for transformation in transformations:
         kind = transformation['type']
         if kind == 'identity':
             continue

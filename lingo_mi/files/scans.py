@@ -224,9 +224,9 @@ def _geometry_of(path, geometry):
     return found
 
 
-def rows_run_up(values: dict) -> bool:
+def rows_run_up(values: dict, name: str = 'poses') -> bool:
     """Whether the rows of the projections that go with a geometry file's values run up: RTK's do, this package's run down."""
-    return str(values.get('poses')).lower().endswith('.xml')
+    return str(values.get(name)).lower().endswith('.xml')
 
 
 def _read_npy(path, geometry):
@@ -299,6 +299,8 @@ def _read_exr_folder(folder):
             )
         projections = _read_stack(folder / split)
         geometry = posed_geometry(values, len(projections), where, split == 'test')
+        if rows_run_up(values, 'poses' if split == 'train' else 'test_poses'):
+            projections = projections[:, ::-1]
         scans[split] = make_scan(geometry, _line_integrals(projections, values, where, folder / split), where)
     volume = folder / 'volume.nii.gz'
     return make_dataset(

@@ -155,6 +155,12 @@ def _stack_dicom(folder, slices):
         ((np.asarray(s.ImagePositionPatient, float) @ normal, file, s) for file, s in slices), key=lambda item: item[0]
     )
     depth = np.array([d for d, _, _ in slices])
+    places = np.array([np.asarray(s.ImagePositionPatient, float) for _, _, s in slices])
+    aside = places - places[0] - np.outer(depth - depth[0], normal)
+    if np.abs(aside).max() > 0.5 * min(row_step, column_step):
+        raise InputError(
+            f'{folder}: the slices are shifted sideways against each other, as by a tilted gantry; resample the series first'
+        )
     steps = np.diff(depth)
     if len(steps) == 0:
         step = float(first.SliceThickness)

@@ -45,10 +45,10 @@ def read_stored(path: PathLike | str) -> Stored:
         read_stored('out/foot').metrics['psnr_3d']
     """
     path = as_path('path', path)
-    if path.is_file():
-        name = path.name.removesuffix('.gz').rsplit('.', 1)[0]
+    if path.is_file() or path.name.lower().endswith('.zarr'):
+        name = path.name.removesuffix('.gz').removesuffix('.zarr').rsplit('.', 1)[0]
         beside = path.with_name(f'{name}-error{path.name.removeprefix(name)}')
-        error_map = read_volume(beside) if beside.is_file() else None
+        error_map = read_volume(beside) if beside.exists() else None
         return Stored(name, volume=read_volume(path), error_map=error_map)
     numbers = path / METRICS
     with reading(path, folder=True):

@@ -79,7 +79,7 @@ def run_tests(
     names      of files in it; they run from the checkout's root
     sm         compute capability times ten
     noise      approximate instructions err by as much as NVIDIA allows, and every address is checked
-    cells      what is done, a file each; a file that it holds is run again only where it had failed
+    cells      what is done, a file each; a file that it holds is run again only where it had failed, or was of another commit
     report     called with a line for every file
     """
     run, known = f'sm_{sm}_noise' if noise else f'sm_{sm}', set()
@@ -87,7 +87,7 @@ def run_tests(
 
     def cell(name):
         found = cells.get(run, name)
-        if found is None or found['outcome']['failed']:
+        if found is None or found['outcome']['failed'] or found['commit'] != commit():
             outcome, compiled = _run_file(stand_in, tests, name, sm, noise, known)
             kept = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], commit=commit())
             cells.put(run, name, kept)

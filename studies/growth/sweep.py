@@ -40,11 +40,11 @@ def planned(stage: str, large: bool) -> list[tuple[str, int]]:
     return [(axis, value) for axis in DEPENDS[stage] for value in sizes(axis, large)]
 
 
-def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict]], object]) -> list[dict]:
+def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict], list[dict]], object]) -> list[dict]:
     """Measurements: stage, axis, number, seconds of CPU time, peak in bytes.
 
     stored       measurements of before; a stage that is whole there is not measured again
-    after_each   called with all measurements so far, after every stage
+    after_each   called after every stage with all measurements so far, and those stored that they do not replace
 
     Raises InputError where a stage fails.
     """
@@ -53,7 +53,8 @@ def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict]], ob
         wanted = [(axis, number(axis, value)) for axis, value in planned(stage, large)]
         kept = [row for row in stored if row['stage'] == stage and (row['axis'], row['number']) in wanted]
         found += kept if len(kept) == len(wanted) else _measured(stage, planned(stage, large))
-        after_each(found)
+        new = [(row['stage'], row['axis'], row['number']) for row in found]
+        after_each(found, [row for row in stored if (row['stage'], row['axis'], row['number']) not in new])
     return found
 
 

@@ -78,6 +78,17 @@ def test_what_the_header_leaves_out(tmp_path):
     np.testing.assert_array_equal(metaimage.read(written(tmp_path / 'v.mha'))[1], np.eye(4))
 
 
+def test_sizes_in_the_place_of_spacings_and_other_units(tmp_path):
+    _, affine = metaimage.read(written(tmp_path / 'v.mha', ElementSize='1 2 3'))
+    np.testing.assert_allclose(affine, np.diag([1, 2, 3, 1]))
+    _, affine = metaimage.read(
+        written(tmp_path / 'v.mha', ElementSpacing='20 20 40', Offset='100 0 0', DistanceUnits='um')
+    )
+    np.testing.assert_allclose(affine[:3, :3], np.diag([0.02, 0.02, 0.04]))
+    np.testing.assert_allclose(affine[:3, 3], [0.1, 0, 0])
+    refused(written(tmp_path / 'v.mha', DistanceUnits='inch'), 'DistanceUnits must be one of')
+
+
 def test_voxels_at_the_end_and_below(tmp_path):
     (tmp_path / 'below').mkdir()
     (tmp_path / 'below' / 'v.raw').write_bytes(b'skipped' + VALUES.astype('u1').tobytes('F'))

@@ -110,6 +110,21 @@ def test_no_header(tmp_path):
             nrrd.read(tmp_path / 'v.nrrd')
 
 
+@pytest.mark.parametrize('space', [False, True])
+def test_units_of_length(tmp_path, space):
+    changes = {'space': 'LPS', 'space directions': '(20,0,0) (0,20,0) (0,0,40)', 'space origin': '(100,0,0)'}
+    changes |= {'space units': '"um" "um" "um"'}
+    if not space:
+        changes = {'spacings': '20 20 40', 'units': '"um" "um" "um"'}
+    _, affine = nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))
+    np.testing.assert_allclose(affine[:3, :3], np.diag([0.02, 0.02, 0.04]))
+    np.testing.assert_allclose(affine[:3, 3], [0.1 if space else 0, 0, 0])
+    for units in ('"inch" "inch" "inch"', '"mm" "mm" "um"'):
+        name = 'space units' if space else 'units'
+        with pytest.raises(InputError, match='units must be one of'):
+            nrrd.read(written(tmp_path / 'v.nrrd', changes=changes | {name: units}))
+
+
 def test_what_the_header_leaves_out(tmp_path):
     """Voxels of 1 mm, the first at the origin; a kind may be none."""
     np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd'))[1], np.eye(4))

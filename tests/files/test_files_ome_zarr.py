@@ -19,13 +19,15 @@ def volume():
     return np.random.default_rng(0).random((7, 6, 5), np.float32) + 1
 
 
-def image(folder, array, axes='zyx', version=3, unit='millimeter', transformations=(SCALE,), **options):
+def image(folder, array, axes='zyx', version=3, unit='millimeter', transformations=(SCALE,), everywhere=(), **options):
     """An OME-Zarr as others write it."""
     group = zarr.open_group(str(folder), mode='w', zarr_format=version)
     stored = group.create_array('0', shape=array.shape, chunks=array.shape, dtype=array.dtype, **options)
     stored[...] = array
     names = [dict(name=a, type='space', unit=unit) if a in 'xyz' else dict(name=a, type='channel') for a in axes]
     found = [dict(axes=names, datasets=[dict(path='0', coordinateTransformations=list(transformations))])]
+    if everywhere:
+        found[0]['coordinateTransformations'] = list(everywhere)
     group.attrs.update(dict(ome=dict(version='0.5', multiscales=found)) if version == 3 else dict(multiscales=found))
     return folder
 
@@ -59,6 +61,20 @@ def test_of_others(tmp_path, volume, version):
     np.testing.assert_allclose(found.data, whole[0].transpose(2, 1, 0) / whole.max(), rtol=1e-6)
     assert found.spacing == (1, 1.5, 2) and found.unit == 'normalised'
     np.testing.assert_allclose(found.affine[:3, 3], [0.02, 0.03, 0.04])
+
+
+def test_transformations_of_all_levels_come_after_those_of_one(tmp_path, volume):
+    shift = dict(type='translation', translation=[4.0, 5.0, 6.0])
+    found = read_volume(
+        image(
+            tmp_path / 'v.zarr',
+            volume.transpose(2, 1, 0),
+            transformations=(SCALE, shift),
+            everywhere=[dict(type='scale', scale=[0.05, 0.1, 0.2])],
+        )
+    )
+    np.testing.assert_allclose(found.spacing, (0.2, 0.15, 0.1))
+    np.testing.assert_allclose(found.affine[:3, 3], [1.2, 0.5, 0.2])
 
 
 def test_other_axes(tmp_path, volume):

@@ -504,6 +504,14 @@ def test_one_dicom_slice_takes_its_thickness(tmp_path):
     assert read_volume(tmp_path / 'ct').spacing == (0.5, 1, 9)
 
 
+def test_slices_of_a_tilted_gantry_are_refused(tmp_path):
+    """Each lies where its position says, a millimetre beside the one before; a volume would be sheared."""
+    (tmp_path / 'ct').mkdir()
+    for k in range(6):
+        dicom_slice(tmp_path / 'ct' / f'{k}.dcm', 2.5 * k, COUNTS[:, :, k].T, ImagePositionPatient=[7, 8 + k, 2.5 * k])
+    refused(tmp_path / 'ct', 'shifted sideways')
+
+
 @pytest.mark.parametrize(
     'changes, match',
     [
