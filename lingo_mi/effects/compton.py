@@ -45,7 +45,7 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     """A table of d mu / d Omega, and its integral over all directions.
 
     energy     keV, 1 to 800
-    material   as for `spectrum.attenuation`: bound electrons with coherent scattering, in 1/mm. None: a free electron,
+    material   as for `spectrum.attenuation`: bound electrons with coherent scattering, in 1/mm. '': a free electron,
                divided by r_e^2
     response   as for `klein_nishina`, for the incoherent part; coherent scattering keeps the energy
 

@@ -180,7 +180,7 @@ class Detector:
         image = mi.TensorXf(image, shape=(view.height, view.width))
         for axis, step in ((0, view.v), (1, view.u)):
             # Rounded, because the taps are compiled into the kernel: no two views may differ in their last digit.
-            sigma = round(self.psf / FWHM / float(dr.detach(dr.norm(step))[0]), 6)
+            sigma = max(round(self.psf / FWHM / float(dr.detach(dr.norm(step))[0]), 6), 1e-6)
             image = dr.convolve(image, taps(sigma), axis=axis, boundary='nearest')
         return image.array
 

@@ -2,9 +2,9 @@
 
 R2-Gaussian's rules: where the mean gradient of the projected centre is large, a small Gaussian is cloned and a large one
 is split in two. A clone and its original get half the density each, which keeps the mass. The two halves of a split are
-smaller by 1.6. R2 gives them half the density too, so three quarters of the mass vanish. If there is not room for all,
-those with the largest gradients go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are removed. Each
-Gaussian keeps its Adam moments; new ones start at zero.
+smaller by 1.6. R2 gives them half the density too, so three quarters of the mass vanish (in a fan beam 61 %). If there is
+not room for all, those with the largest gradients go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are
+removed. Each Gaussian keeps its Adam moments; new ones start at zero.
 
 With birth='halve' (own), every chosen Gaussian is instead cut in two along its longest axis. Mass, mean and covariance stay,
 so images hardly change. Both halves keep the moments.
@@ -22,7 +22,7 @@ import numpy as np
 from lingo_mi.fitting.activations import inverse_scale, inverse_sigmoid
 from lingo_mi.fitting.models import forward_model
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.fitting.state import State, activate
+from lingo_mi.fitting.state import State, activate, within
 
 RESET = 0.01  # 3DGS: largest opacity after `reset_opacity`
 APART = 0.7  # distance of a half's centre from its parent's, in the parent's standard deviations
@@ -79,7 +79,7 @@ def split(state: State, chosen: np.ndarray, settings: Settings, rng: np.random.G
     if flat:
         offset[:, 2] = 0
     children.values['centre'] = (centre[parents] + _rotate(rotation[parents], offset)).astype(np.float32)
-    smaller = np.clip(scale[parents] / shrink, low * 1.01, high * 0.99)
+    smaller = within(scale[parents] / shrink, low * 1.01, high * 0.99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32)
     return _append(_take(state, ~chosen), children)
 
@@ -94,7 +94,7 @@ def halve(state: State, chosen: np.ndarray, settings: Settings, flat: bool = Fal
     children = _take(_shared(state, chosen, 0.5 / np.sqrt(1 - APART**2), settings), parents.repeat(2))
     offset = _rotate(rotation, APART * axis * scale)
     children.values['centre'] = np.stack([centre + offset, centre - offset], 1).reshape(-1, 3).astype(np.float32)
-    smaller = np.clip(scale * shrink, low * 1.01, high * 0.99)
+    smaller = within(scale * shrink, low * 1.01, high * 0.99)
     children.values['scale'] = inverse_scale(smaller, low, high).astype(np.float32).repeat(2, 0)
     children.born[:] = True
     return _append(_take(state, ~chosen), children)

@@ -42,7 +42,7 @@ def start(points: np.ndarray, spacing: np.ndarray, density: np.ndarray | None, s
     """
     low, high = settings.bounds.scale_min, settings.bounds.scale_max
     n = len(points)
-    scale = np.clip(spacing, low + 1e-5, high - 1e-5)[:, None].repeat(3, 1)
+    scale = within(spacing, low + 1e-5, high - 1e-5)[:, None].repeat(3, 1)
     values = dict(
         centre=np.asarray(points),
         scale=inverse_scale(scale, low, high),
@@ -70,3 +70,8 @@ def activate(state: State, settings: Settings) -> tuple[np.ndarray, np.ndarray, 
     centre, scale, rotation = (state.values[k].astype(float) for k in ('centre', 'scale', 'rotation'))
     rotation = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
     return centre, low + (high - low) * sigmoid(scale), rotation, forward_model(settings).amount(state.values)
+
+
+def within(scale: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Standard deviations from `low` to `high`; of bounds so close that these cross, their mean."""
+    return np.clip(scale, low, high) if low < high else np.full_like(scale, (low + high) / 2)

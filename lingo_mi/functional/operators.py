@@ -53,7 +53,8 @@ def project(
     scales       [N, 3] standard deviations along the Gaussians' own axes, mm, positive
     quaternions  [N, 4] rotations from these axes to the world, (x, y, z, w), of any length but zero
     density      [N] values at the centres, in 1/mm for images without a unit
-    geometry     the scan; its rays run from the source (a parallel beam: from infinity) through the pixel centres to the panel
+    geometry     the scan; its rays run from the source through the pixel centres to the panel; those of a parallel beam
+                 begin and end at infinity
     extent       cut-off in standard deviations, 1 to 20; with 5, images are good to 2e-6 and derivatives to 4e-5
                  (relative L2 norms, docs/accuracy.md)
     views        indices of the views to project, n of them; None for all

@@ -354,10 +354,14 @@ class Geometry(ABC):
         """
 
     def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then those of another by the same scanner on the same grid.
+        """The views of this scan, then those of another with as many pixels, on this scan's grid.
 
-        Raises InputError where one is a cone beam and the other parallel.
+        Raises InputError where one is a cone beam and the other parallel, and where the panels differ in pixels.
         """
+        if self.nDetector != other.nDetector:
+            raise InputError(
+                f'views of {self.nDetector} and of {other.nDetector} pixels cannot be in one scan: their panels must agree'
+            )
         return PosedGeometry(poses=self.rays().joined(other.rays()), **self._panel_and_grid())
 
     def with_volume(self, nVoxel: ArrayLike, dVoxel: ArrayLike) -> Geometry:
@@ -502,8 +506,9 @@ class CircularGeometry(Geometry):
         return replace(self, angles=self.angles[checked_views(index, len(self))])
 
     def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then those of another by the same scanner on the same grid."""
-        if isinstance(other, CircularGeometry):
+        """The views of this scan, then those of another: see `Geometry.joined`."""
+        same = 'mode', 'DSO', 'DSD', 'nDetector', 'dDetector', 'offDetector'
+        if isinstance(other, CircularGeometry) and all(getattr(self, name) == getattr(other, name) for name in same):
             return replace(self, angles=np.concatenate([self.angles, other.angles]))
         return super().joined(other)
 

@@ -49,6 +49,15 @@ def truncated(found: Masks, share: float = 0.05) -> np.ndarray:
     An axis of one pixel (a fan beam's rows) is not checked.
     """
     low = found.low
-    sides = [low[:, :, 0], low[:, :, -1]] if low.shape[2] > 1 else []
-    sides += [low[:, 0], low[:, -1]] if low.shape[1] > 1 else []
-    return np.any([side.mean(1) > share for side in sides], 0) if sides else np.zeros(len(low), bool)
+    sides = [side for axis in (2, 1) if low.shape[axis] > 1 for side in _sides(low, found.valid, axis, share)]
+    return np.any(sides, 0) if sides else np.zeros(len(low), bool)
+
+
+def _sides(low, valid, axis, share):
+    """For the first and the last valid pixels along an axis: views, bool [n], with more than `share` of them in the mask."""
+    if valid is None:
+        return [low.take(end, axis).mean(1) > share for end in (0, -1)]
+    lines, last = valid.any(axis), low.shape[axis] - 1
+    ends = valid.argmax(axis), last - np.flip(valid, axis).argmax(axis)
+    found = (np.take_along_axis(low, np.expand_dims(end, axis), axis).squeeze(axis) for end in ends)
+    return [(side & lines).sum(1) > share * np.maximum(lines.sum(1), 1) for side in found]

@@ -15,4 +15,7 @@ def otsu(image: np.ndarray) -> float:
     and pixels *above* it are foreground. For a constant image its value is returned, so no pixel is above it.
     (The paper writes "intra-class variance"; Otsu's criterion is the variance between the classes.)
     """
-    return float(threshold_otsu(np.asarray(image, np.float32), nbins=BINS))
+    image = np.asarray(image, np.float32)
+    if np.ptp(image) < 2 * BINS * np.spacing(np.abs(image).max()):
+        image = image.astype(float)  # constant but for rounding: in float32 its bins have no edges
+    return float(threshold_otsu(image, nbins=BINS))

@@ -130,7 +130,10 @@ def valid_voxels(
     cells = np.arange(total)
     if total > CHUNK:
         # Invalid pixels exclude no cell.
-        possible = masks.low if masks.valid is None else masks.low | ~masks.valid
+        possible = (
+            masks.low | masks.high
+        )  # where thresholds are negative, or low_factor is above 1, low does not hold high
+        possible = possible if masks.valid is None else possible | ~masks.valid
         cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):
         alive = cells[start : start + CHUNK]

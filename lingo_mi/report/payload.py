@@ -233,7 +233,7 @@ def _surfaces(data: ReportData, arrays: Arrays) -> list[dict]:
         inside = volume[volume > least]
         if inside.size < 64 or inside.min() == inside.max():
             break
-        least = float(threshold_otsu(inside))
+        least = float(threshold_otsu(inside.astype(float)))
         size = most
         while True:
             small, by = preview(volume, size)

@@ -1,5 +1,6 @@
 """The detector's noise by chi-square, its blur by edges, and its way back to line integrals."""
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
@@ -7,6 +8,8 @@ from scipy import stats
 from lingo_mi.effects.detector import Detector, taps
 from lingo_mi.effects.focal_spot import FocalSpot, square
 from lingo_mi.errors import InputError
+from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.projectors.view import View
 
 SHAPE = 120, 150
 
@@ -127,6 +130,13 @@ def test_impossible_detectors(change, match):
 
 
 # ---- blur ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_point_spread_of_no_width_changes_nothing(variant):
+    frames = CircularGeometry(DSO=100, DSD=150, nDetector=5, dDetector=1, nVoxel=4, dVoxel=1, angles=[0.0]).rays()
+    image = np.random.default_rng(0).random(25).astype(np.float32)
+    found = detector(psf=1e-6).blurred(mi.Float(image), View.of(frames, 0, 5, 5))
+    np.testing.assert_allclose(found.numpy(), image, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

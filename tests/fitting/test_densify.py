@@ -83,6 +83,16 @@ def test_a_disc_as_large_as_allowed_is_divided(divide):
     assert activate(after, SETTINGS)[1][:, 2] == pytest.approx(0.99 * SETTINGS.bounds.scale_max, rel=1e-5)
 
 
+@pytest.mark.parametrize('divide', [split, halve])
+def test_bounds_of_scales_that_hardly_differ(divide):
+    settings = SETTINGS.changed(scale_min=1e-3, scale_max=1.005e-3)
+    state = start(np.zeros((3, 3), np.float32), np.array([1e-4, 1e-3, 1]), np.ones(3), settings)
+    random = [np.random.default_rng(5)] if divide is split else []
+    for each in (state, divide(state, np.ones(3, bool), settings, *random)):
+        scale = activate(each, settings)[1]
+        assert ((scale >= 1e-3) & (scale <= 1.005e-3)).all()
+
+
 def test_mass_of_a_split():
     """R2's rule gives both halves half the density, and so 1 / 1.6^3 of the mass: a quarter in all."""
     state = state_of(np.random.default_rng(1), 30)

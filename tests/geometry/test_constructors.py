@@ -1,5 +1,6 @@
 """The constructors of `Geometry`: against `scanner_rays`, numbers by hand, and other packages' own formulas."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -168,6 +169,17 @@ def test_binned_rays(tilt):
     assert Geometry.cone(**CONE | dict(nDetector=(8, 7))).bins(4) == (4, 1)
     with pytest.raises(InputError, match='from 1 on'):
         g.binned(0)
+
+
+def test_views_of_other_scanners_keep_their_rays():
+    g = Geometry.cone(DSO=300, DSD=450, nDetector=9, dDetector=4, nVoxel=8, dVoxel=1, angles=[0.0, 1.0])
+    for change in (dict(DSO=310.0), dict(DSD=500.0), dict(dDetector=(4.0, 5.0)), dict(offDetector=(0.0, 2.0))):
+        other = replace(g, **change)
+        same_rays(g.joined(other).rays(), g.rays().joined(other.rays()))
+    with pytest.raises(InputError, match='cone'):
+        g.joined(replace(g, mode='parallel'))
+    with pytest.raises(InputError, match='panels must agree'):
+        g.joined(replace(g, nDetector=(9, 8)))
 
 
 def test_kinds_join():

@@ -101,6 +101,23 @@ def test_masks():
     assert not found.low[2].any()
 
 
+def test_otsu_of_an_image_that_is_constant_but_for_rounding():
+    image = np.ones((5, 6), np.float32)
+    image[2, 3] = np.nextafter(np.float32(1), np.float32(2))
+    assert 1 <= otsu(image) <= image.max()
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+def test_views_that_the_panel_cuts_within_its_valid_pixels(axis):
+    """A frame without valid pixels hides nothing; a line without any does not count."""
+    low, valid = np.zeros((2, 20, 30), bool), np.ones((2, 20, 30), bool)
+    valid[:, [0, -1]], valid[:, :, [0, 1, -1]] = False, False
+    inside = np.moveaxis(low, 1 + axis, 1)
+    inside[1, 1 if axis == 0 else 2, 5:12] = True
+    nothing = np.zeros(2)
+    assert truncated(Masks(low, low, nothing, nothing, valid)).tolist() == [False, True]
+
+
 @pytest.mark.parametrize(
     'shape, axis', [((40, 60), 0), ((40, 60), 1), ((2, 60), 0), ((40, 2), 1), ((1, 60), 0), ((40, 1), 1)]
 )

@@ -51,5 +51,12 @@ def test_few_items_need_no_count():
     assert found([np.zeros(deep() + 1)] * 2, SHAPES[2]) == deep() + 1
 
 
+def test_items_that_are_not_finite_are_not_counted():
+    count = 2 * deep()
+    covered = mi.Float(np.where(np.arange(count) == 3, np.nan, 1).astype(np.float32))
+    axes = [mi.Int32(np.zeros(count, np.int32))] * 2
+    assert float(deepest(axes, covered, SHAPES[2])[0]) == count - 1
+
+
 def test_parts():
     assert [parts_of(mi.Float(x)) for x in (0, 1, deep(), deep() + 1, 3 * deep())] == [1, 1, 1, 2, 3]

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lingo_mi.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.base import CircularGeometry
@@ -395,6 +396,22 @@ def test_gaussians_at_the_source_are_announced_where_options_cannot_hold(options
         dr.eval(line_integrals(*gaussians, View.of(frames, 0, *shape), RenderOptions(EXTENT, **options)))
     said = [str(w.message) for w in caught if w.category is AccuracyWarning]
     assert len(said) == (near and bool(options)) and all(text.startswith('1 Gaussians reach') for text in said)
+
+
+def test_needles_along_the_ray_that_cannot_be_widened_are_announced():
+    """Thinner than a pixel, and long: their integrals are those at the pixels' centres."""
+    view = View.of(*scanner_of(1000, 1500, 65, 1.0))
+    turn = Rotation.align_vectors([[1, 0, 0]], [[0, 0, 1]])[0].as_quat()
+    gaussians = mi.Point3f(0), mi.Vector3f(0.02, 0.02, 100), mi.Vector4f(*turn.tolist()), mi.Float(1)
+    expected = line_integrals(*gaussians, view, RenderOptions(5.0)).numpy()
+    with pytest.warns(AccuracyWarning, match='1 Gaussians reach'):
+        found = line_integrals(*gaussians, view, RenderOptions(5.0, area=True)).numpy()
+    assert expected.max() > 1 and relative(found, expected) < 1e-4
+
+
+def scanner_of(DSO, DSD, n, step):
+    geometry = CircularGeometry(DSO=DSO, DSD=DSD, nDetector=n, dDetector=step, nVoxel=8, dVoxel=1, angles=[0.0])
+    return geometry.rays(), 0, n, n
 
 
 def test_few_items_have_no_depth():
