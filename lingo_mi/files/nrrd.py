@@ -107,8 +107,8 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     else:
         affine[:3, :3] = np.diag(numbers('spacings', [1, 1, 1], 3))
     units = re.findall(r'"([^"]*)"', fields.get('space units', fields.get('units', '')))
-    if unknown := [unit for unit in units if unit.lower() not in _UNITS] or len(set(units)) > 1:
-        fail(f'units must be one of {", ".join(filter(None, _UNITS))} for all axes, not {shown(unknown or units)}')
+    if len(set(units)) > 1 or any(unit.lower() not in _UNITS for unit in units):
+        fail(f'units must be one of {", ".join(filter(None, _UNITS))} for all axes, not {shown(", ".join(units))}')
     affine[:3] *= _UNITS[units[0].lower()] if units else 1.0
     return data, affine
 

@@ -25,8 +25,8 @@ def random_cube_variation(
     Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
 
     gaussians   centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame
-    factor      on the loss (`loss_scale`), Float [1], which the gradient has and the value has not; None: 1
     geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
+    factor      on the loss (`loss_scale`), Float [1], which the gradient has and the value has not; None: 1
     """
     s, half, extent = settings.loss, geometry.half, settings.model.extent
     voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1

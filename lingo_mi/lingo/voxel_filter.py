@@ -129,11 +129,10 @@ def valid_voxels(
     total = int(np.prod(grid))
     cells = np.arange(total)
     if total > CHUNK:
-        # Invalid pixels exclude no cell.
-        possible = (
-            masks.low | masks.high
-        )  # where thresholds are negative, or low_factor is above 1, low does not hold high
-        possible = possible if masks.valid is None else possible | ~masks.valid
+        # With negative thresholds, or low_factor above 1, high is no part of low. Invalid pixels exclude no cell.
+        possible = masks.low | masks.high
+        if masks.valid is not None:
+            possible |= ~masks.valid
         cells = _candidates(matrices, possible, grid, half, misses, outside)
     for start in range(0, len(cells), CHUNK):
         alive = cells[start : start + CHUNK]
