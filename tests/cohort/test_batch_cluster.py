@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 
-import drjit as dr
 import mitsuba as mi
 import pytest
 
@@ -24,9 +23,8 @@ NAMES = [f's{i}' for i in range(4)]
 def home(tmp_path):
     """A folder with a list of four scans, of which each takes seconds and writes a checkpoint several times a second."""
     (tmp_path / 'tiny.xml').write_text(SCENE)
-    # Without births: which Gaussians divide may hang on the last digits, and these on the order of sums.
-    rows = [f'{name},tiny.xml,{i + 3},400,200,0.2,0' for i, name in enumerate(NAMES)]
-    header = 'name,geometry,views,iterations,n_points,checkpoint_seconds,densify_until'
+    rows = [f'{name},tiny.xml,{i + 3},400,200,0.2' for i, name in enumerate(NAMES)]
+    header = 'name,geometry,views,iterations,n_points,checkpoint_seconds'
     (tmp_path / 'list.csv').write_text('\n'.join([header, *rows]))
     return tmp_path
 
@@ -59,20 +57,16 @@ def require_all_done_once(home):
     assert not left
 
 
-def require_same(home, name):
-    """The numbers are those of a fit of as many threads that nothing has interrupted."""
+def require_same(home, name, address):
+    """The numbers are those of a fit on such a worker that nothing has interrupted: to the bit, but on a GPU."""
     found = json.loads((home / 'out' / name / METRICS).read_text())
     rows = (home / 'list.csv').read_text().splitlines()
     (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        code, _, err = run(BATCH, home / 'one.csv', '--out', home / 'alone')
-    finally:
-        dr.set_thread_count(before)
+    code, _, err = run(BATCH, home / 'one.csv', '--out', home / 'alone', '--cluster', address, '--threads', '1')
     assert code == 0, err
     wanted = json.loads((home / 'alone' / name / METRICS).read_text())
-    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=1e-4)
+    tolerance = 0 if mi.variant().startswith('llvm') else 1e-3
+    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=tolerance)
 
 
 def test_a_worker_is_killed(home):
@@ -92,7 +86,7 @@ def test_a_worker_is_killed(home):
         assert line.startswith(f'resumed {name}: ') and int(line.split(': ')[1]) > 1
         assert len({line.split(': ')[1] for lines in begun.values() for line in lines}) == 3  # all three have worked
         require_all_done_once(home)
-        require_same(home, name)
+        require_same(home, name, address)
         # Nothing is left to do.
         code, text, err = run(BATCH, *arguments(home, address))
         assert code == 0 and f'{len(NAMES)} of {len(NAMES)} scans are done already' in text, err

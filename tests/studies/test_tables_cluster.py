@@ -1,11 +1,10 @@
-"""The cells of the paper's tables on three workers, one of which is killed: the same numbers as in one process."""
+"""The cells of the paper's tables on three workers, one of which is killed: the same numbers as of workers that nothing stops."""
 
 import json
 import os
 import signal
 import threading
 
-import drjit as dr
 import mitsuba as mi
 import pytest
 
@@ -72,16 +71,13 @@ def test_a_worker_is_killed(tmp_path):
         # Everything is there: nothing is computed again.
         code, text, err = tables(out, '--cluster', address, '--threads', 1)
         assert code == 0 and {path: path.stat().st_mtime_ns for path in stored} == stored, err
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        assert tables(tmp_path / 'here')[0] == 0
-    finally:
-        dr.set_thread_count(before)
-    here = Cells(tmp_path / 'here', TINY)
+        code, text, err = tables(tmp_path / 'whole', '--cluster', address, '--threads', 1)
+        assert code == 0, err
+    whole = Cells(tmp_path / 'whole', TINY)
+    tolerance = 0 if mi.variant().startswith('llvm') else 1e-3  # a GPU adds in any order
     for fit in FITS:
         for cell in fit, Volume(fit, 'fdk'), Volume(Fit('foot', fit.views, 'none'), 'fdk'):
-            assert cells.get(cell)['psnr_3d_r2'] == pytest.approx(here.get(cell)['psnr_3d_r2'], rel=1e-4)
+            assert cells.get(cell)['psnr_3d_r2'] == pytest.approx(whole.get(cell)['psnr_3d_r2'], rel=tolerance)
 
 
 def test_a_series_that_fails(tmp_path):
