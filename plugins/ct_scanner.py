@@ -61,8 +61,8 @@ class CTScanner(mi.Sensor):
        - Laminography: degrees by which the source is lifted out of the plane of rotation, the panel sunk. (Default: 0)
      * - rotDetector
        - |string|
-       - Roll, pitch and yaw of the panel about its centre in degrees, as in TIGRE: about the vertical, about u, and in its
-         own plane. (Default: 0, 0, 0)
+       - Turns of the panel about its centre in degrees: about the vertical, about u, and in its own plane. TIGRE has the same
+         three in radians and in the opposite order. (Default: 0, 0, 0)
      * - poses
        - |string|
        - Instead of DSO, DSD, angles and the like, a pose for every view: 12 numbers each as in ASTRA (source or beam, centre

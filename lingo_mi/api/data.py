@@ -45,8 +45,8 @@ def simulate(
                 `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
     geometry    for a phantom or a volume: the scanner. A volume must have `geometry.nVoxel` voxels. Without it, a phantom
                 is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out
-    views       how many of the views to fit, evenly spaced; the rest are held out (default: all). Of a phantom without a
-                geometry: how many to scan
+    views       how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
+                has views of its own for that. Of a phantom without a geometry: how many to scan
     held_out    with `geometry`: further views, to measure new views on
     seed        of random angles and of the noise of a scene's detector
     parameters  values for the `<default>` names of a scene file
@@ -112,7 +112,8 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
     path       a pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images,
                `scan.npy` [view, v, u] with `scan.yml` beside it, or the .npz of a public scan
     geometry   the geometry file of an .npy, where it is another than that of the same stem
-    views      how many of the views to fit, evenly spaced; the rest are held out (default: all)
+    views      how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has views of
+               its own for that
 
     Returns a `Dataset` of line integrals ln(I0 / I) [view, v, u]. Raises InputError where the file is missing, damaged, or
     contradicts its geometry.

@@ -67,9 +67,12 @@ def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
 def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.ndarray:
     """Angles (radians) of the views to add, so that `views` in all are spread as evenly as the given ones allow.
 
-    The widest gap is divided first, until there are enough views. An open arc is not extended.
+    The widest gap is divided first, until there are enough views. An open arc is not extended, unless one more gap makes it half
+    a turn or more: then its last view is taken to be left out, as in half a turn of evenly spaced views.
     """
     order, gap, is_open = gaps(replace(geometry, angles=angles), 2 * np.pi)
+    if is_open and gap.sum() < np.pi - 1e-3:
+        order, gap = order[:-1], gap[:-1]
     parts = np.ones(len(gap), int)
     for _ in range(views - len(angles)):
         parts[np.argmax(gap / parts - 1e-9 * np.arange(len(gap)))] += 1

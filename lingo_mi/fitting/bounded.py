@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.measured import knows_noise
-from lingo_mi.fitting.models import forward_model, parameter_shapes
+from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.memory import room
 from lingo_mi.reconstruction.held_out import LEAST_VIEWS
@@ -22,8 +22,8 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     """The settings, limited by a scan.
 
     The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
-    no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. Settings in units of the
-    scene's radius are converted to lengths. `stop` is decided. Those of a neural field stay as they are.
+    no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. `stop` is decided. The other
+    settings of a neural field stay as they are.
 
     Raises InputError if the source is inside the volume, for stop=on where views cannot be held out, for a step of more views
     than the scan has, and for more Gaussians at the start, or a larger field, than this process has memory for.
@@ -42,7 +42,6 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
                 f'{has / 2**30:,.1f} GiB: lower field_entries'
             )
         return settings
-    settings = forward_model(settings).with_lengths(g)
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:
         most = min(max(int(scan.projections.size / control.values_per_gaussian), 1), control.max_gaussians)

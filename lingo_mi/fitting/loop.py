@@ -80,7 +80,7 @@ def run(
         points, order = begin.points.astype(np.float32), []
         iteration, seconds, history, info = 0, 0.0, [], dict(begin.info)
         stepper = stepper_of(scan, settings)
-        host = stepper.start(begin, rng)
+        host = stepper.start(begin, rng.spawn(1)[0])  # takes nothing from the steps, which may begin anew
         if search is not None:
             stepper, host = search.begin(host, seed)
         state = DeviceState(host)

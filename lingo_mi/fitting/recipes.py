@@ -62,7 +62,8 @@ GS3D = R2.changed(
     scale_min=1e-5,
 )
 # Cai et al., "Radiative Gaussian Splatting for Efficient X-ray Novel View Synthesis", ECCV 2024: the same radiance in all
-# directions, a start from the cuboid, and the released settings of its foot scan (threshold 2.7e-5 for 3DGS's loss).
+# directions, a start from the cuboid, and the released settings of its foot scan (threshold 2.7e-5 for 3DGS's loss). Its code
+# divides every view by its own maximum; here one maximum is taken for all, so that views stay comparable.
 XGAUSSIAN = GS3D.changed(
     init='cuboid',
     sh_degree=0,
@@ -79,9 +80,11 @@ XGAUSSIAN = GS3D.changed(
 )
 
 # Zha, Zhang and Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022, and its released
-# settings of the chest: 1500 passes over 50 views. The rates step down to a tenth in the paper; here they fall to it
-# log-linearly. Its lengths are metres, and Adam's epsilon is 1e-8. In the normalised frame of a volume of 256 mm the gradients
-# are (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density and the start are our own.
+# settings of the chest: 1500 passes over 50 views. The rates step down to a tenth in the paper, and not at all in these released
+# settings; here they fall to it log-linearly. Rays are sampled within the volume alone, there between two distances that are
+# the same for all rays and reach beyond it. Its lengths are metres, and Adam's epsilon is 1e-8. In the normalised frame of a
+# volume of 256 mm the gradients are (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density and the
+# start are our own.
 NAF = R2.changed(
     render='field',
     init='network',

@@ -67,7 +67,7 @@ class ModelSettings:
     sh_degree          for `alpha`: degree of the radiance's spherical harmonics, at most 3 (3DGS: 3); 0: the same radiance in
                        all directions (X-Gaussian)
     sh_every           for `alpha`: iterations between the starts of successive degrees (3DGS: 1000)
-    extent             cut-off in standard deviations (R2: 3)
+    extent             cut-off in standard deviations (R2: 3, rounded up to whole tiles of 16 x 16 pixels)
     effects            'model': the fit models the effects that the scene declares (spectrum, focal spot, blur, dead pixels);
                        'ignore': it treats all projections as line integrals
     """

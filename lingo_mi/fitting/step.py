@@ -39,7 +39,8 @@ SHARES_RENEWED = 50  # steps between updates of the shares of two materials
 class Stepper:
     """The optimisation of a cloud on one scan with one set of settings, step by step.
 
-    model       the fit's `CloudModel`
+    settings    as used, with lengths in the normalised frame
+    model       the fit's `CloudModel`, with the settings as given
     targets     the measured views, on the device; `coarse`: the same binned 2 x 2, for the first iterations
     poses       corrections of the views; None if poses are not fitted
     share       current share of the second of two materials in every Gaussian
@@ -51,13 +52,14 @@ class Stepper:
 
     def __init__(self, scan: Scan, settings: Settings):
         """Raises InputError for an empty scan, and for effects that a fit cannot reproduce."""
-        self.settings, self.geometry = settings, scan.geometry
+        self.geometry = scan.geometry
         scan = trusted(scan, settings)
         unit = density_unit(scan, settings)
         self.model = CloudModel(settings, scan.geometry, unit, modelled_effects(scan, settings))
         self.unit = unit
         self.measured = scan if self.model.response is not None else None
-        self.forward = forward_model(settings)
+        self.settings = forward_model(settings).with_lengths(scan.geometry)
+        self.forward = forward_model(self.settings)
         self.share: Any = None
         self.scattered: np.ndarray | None = None
         self.targets = _targets(scan, unit, settings)

@@ -61,7 +61,9 @@ class Search:
     def begin(self, start: State, seed: int) -> tuple[Stepper | FieldStepper, State]:
         """The optimisation, and the state to start it from. start: that of all views, for later."""
         self.start, stepper = dict(start.values), self.stepper()
-        return stepper, stepper.start(initial_cloud(self.seen, self._own(), seed), np.random.default_rng(seed))
+        return stepper, stepper.start(
+            initial_cloud(self.seen, self._own(), seed), np.random.default_rng(seed).spawn(1)[0]
+        )
 
     def due(self, iteration: int) -> bool:
         """Whether to look after so many steps."""

@@ -127,7 +127,8 @@ def initialise(
                  of that cloud of isotropic Gaussians, for the view indices `views`
     fdk          for the init_density 'fdk': the reconstruction [x, y, z]
 
-    Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid. Points of the low set lie at the
+    Points of the high set are jittered by U(-1/2, 1/2) of a cell of the scaled grid (the paper's equation, taken literally, has
+    cells of the scanner's grid, which would leave points in clumps). Points of the low set lie at the
     cell centres, except repeats, which are jittered too (there may be fewer valid cells than points). An axis of one
     cell has no jitter. If the high set is empty, all points come from the low set. A point has its cell's density.
 

@@ -224,7 +224,8 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], cells: 
     finer = f' (scanned on {scale.finer} times as many)' if scale.finer > 1 else ''
     text = (
         f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side{finer}, '
-        f'{scale.pixels} x {scale.pixels} pixels, {scale.n_points:,} Gaussians to start with; seed {cells.seed}; {done} of '
+        f'{scale.pixels} x {scale.pixels} pixels, {scale.n_points:,} Gaussians to start with '
+        f'(`xgaussian`: one on every eighth voxel a side); seed {cells.seed}; {done} of '
         f'{len(planned)} cells.\n\n{markdown(table, table_groups, rows)}\n'
     )
     cells.folder.mkdir(parents=True, exist_ok=True)

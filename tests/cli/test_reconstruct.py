@@ -302,6 +302,8 @@ def test_missing_angles(dataset):
     half = missing_angles(circular(5, 180), 20, geometry)
     np.testing.assert_allclose(np.sort(np.append(circular(5, 180), half)), circular(20, 180))
     assert len(missing_angles(circular(5), 7, geometry)) == 2
+    limited = np.radians([-30.0, 0, 30])  # no view is rendered outside of what was measured
+    np.testing.assert_allclose(np.degrees(np.sort(missing_angles(limited, 7, geometry))), [-20, -10, 10, 20])
     np.testing.assert_allclose(np.sort(missing_angles(np.array([0.0]), 4, geometry)), circular(4)[1:])
 
 

@@ -218,6 +218,13 @@ def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
         assert len(resumed.state) == len(fitted.state)
 
 
+def test_settings_stay_as_they_were_given(scan, whole):
+    """In units of the radius: the settings of a fit make the same fit again."""
+    settings, fitted = whole
+    for name in ('rate_centre', 'split_size', 'prune_size'):
+        assert fitted.settings.flat()[name] == settings.flat()[name]
+
+
 def test_checkpoint_of_another_method_is_refused(scan, tmp_path):
     path = tmp_path / 'fit.npz'
     settings = settings_of('3dgs').changed(iterations=1)

@@ -15,6 +15,7 @@ from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.step import Stepper
 from lingo_mi.fitting.stopping import Search
 from lingo_mi.results.measure import measure, summary
 
@@ -95,9 +96,9 @@ def test_resumed_it_is_the_same(scan, whole, tmp_path, where):
 def test_the_search_has_the_rates_of_the_fit(scan):
     """Those of alpha compositing are in units of the radius of the scene, which fewer views tell a little otherwise."""
     given = METHODS['3dgs'].changed(stop='on')
-    settings = bounded(given, scan)
-    assert Search(scan, given).stepper().settings.adam.rate_centre == pytest.approx(settings.adam.rate_centre, rel=0.1)
-    assert settings.adam.rate_centre[0] > 2 * given.adam.rate_centre[0]
+    used = Stepper(scan, bounded(given, scan)).settings.adam.rate_centre
+    assert Search(scan, given).stepper().settings.adam.rate_centre == pytest.approx(used, rel=0.1)
+    assert used[0] > 2 * given.adam.rate_centre[0]
 
 
 def test_what_is_told(scan, whole):

@@ -1,5 +1,6 @@
 """A fit of a small neural field: it learns, resumes to the bit, compiles nothing late, is kept, and refuses what it must."""
 
+import contextlib
 from dataclasses import replace
 
 import drjit as dr
@@ -107,6 +108,18 @@ def test_resumed_fit_is_the_same_fit(scan, tmp_path, one_thread):
     kept = Fitted.from_checkpoint(path)
     np.testing.assert_array_equal(kept.volume(), whole.volume())
     np.testing.assert_array_equal(kept.render(scan.geometry), whole.render(scan.geometry))
+
+
+def test_a_search_leaves_the_steps_as_they_are(tmp_path, one_thread):
+    """The fit that follows a search for the step to stop at has the steps of a fit without one."""
+    scan, path = tiny_scan(geometry(6)), tmp_path / 'fit.npz'
+    searched = fit(scan, SMALL.changed(iterations=8, stop='on', stop_every=2, stop_patience=2))
+    settings = SMALL.changed(iterations=8, stop='off')
+    with contextlib.suppress(KeyboardInterrupt):
+        fit(scan, settings, path=path, progress=stop_at(searched.steps))
+    plain = Fitted.from_checkpoint(path)
+    for name, values in searched.state.values.items():
+        np.testing.assert_array_equal(values, plain.state.values[name])
 
 
 def test_another_seed_is_another_fit(scan):
