@@ -53,8 +53,8 @@ def project(
     scales       [N, 3] standard deviations along the Gaussians' own axes, mm, positive
     quaternions  [N, 4] rotations from these axes to the world, (x, y, z, w), of any length but zero
     density      [N] values at the centres, in 1/mm for images without a unit
-    geometry     the scan; its rays run from the source through the pixel centres to the panel; those of a parallel beam
-                 begin and end at infinity
+    geometry     the scan; its rays run from the source through the pixel centres and on, so that a virtual panel may stand
+                 within the object (DSD = DSO); those of a parallel beam begin and end at infinity
     extent       cut-off in standard deviations, 1 to 20; with 5, images are good to 2e-6 and derivatives to 4e-5
                  (relative L2 norms, docs/accuracy.md)
     views        indices of the views to project, n of them; None for all
@@ -79,7 +79,7 @@ def project(
     rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        views = (View.of(rays, i, height, width) for i in range(len(index)))
+        views = (View.of(rays, i, height, width, panel=False) for i in range(len(index)))
         found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 

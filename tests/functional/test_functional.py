@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -187,6 +188,14 @@ def test_literals():
     found = project(*equal, dr.full(mi.TensorXf, 0.2, 5), scan())
     one = project(np.zeros((1, 3)), np.full((1, 3), 9), [[0, 0, 0, 1]], [1.0], scan())
     np.testing.assert_allclose(found.numpy(), one, rtol=1e-5)
+
+
+def test_a_virtual_panel_at_the_axis():
+    """The same rays, whose pixels have two thirds of the size there, meet the same Gaussians, those behind the axis, too."""
+    far = scan()
+    virtual = replace(far, DSD=500, dDetector=(7 / 1.5, 4.0))
+    values = columns(gaussians())
+    np.testing.assert_allclose(project(*values, virtual), project(*values, far), rtol=1e-5, atol=1e-6)
 
 
 def test_anything_that_numpy_reads():
