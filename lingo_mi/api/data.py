@@ -102,7 +102,8 @@ def simulate(
     scan = Scan(every, projections)
     if held_out is None:
         return choose_views(Dataset(scan, None, volume), views)
-    train, test = scan.subset(slice(0, len(geometry))), scan.subset(slice(len(geometry), None))
+    # The given geometry, which joining may have turned into one of poses.
+    train, test = Scan(geometry, scan.projections[: len(geometry)]), scan.subset(slice(len(geometry), None))
     return choose_views(Dataset(train, test, volume), views)
 
 

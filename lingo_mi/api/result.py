@@ -140,6 +140,8 @@ class Result:
             result.save_volume('foot.ome.zarr', scan.geometry.with_volume(2048, 0.125))
         """
         path, slab = as_path('path', path), whole('slab', slab, 1)
+        if geometry is not None:
+            require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
         with writing(path):
             if path.exists() and not force:
                 raise InputError(f'{path}: exists already; give force=True to replace it')

@@ -32,8 +32,8 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct a volume on the voxels of a scan's geometry.
 
-    scan        projections and geometry; of a `Dataset` its `train`. Effects of a detector that it knows (beam
-                hardening, scatter, blur) are taken out first
+    scan        projections and geometry; of a `Dataset` its `train`. Effects that it knows are taken out first: beam hardening,
+                scatter, dead pixels; blur together with scatter, or with a result to start from
     algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, `Best`, with its parameters
     start       the `Result` of a fit to this scan, or a volume [x, y, z] in 1/mm, to start from; `Refined` needs a result
     views       with a result: how many views to reconstruct from. Those that were not measured are rendered from the cloud (the

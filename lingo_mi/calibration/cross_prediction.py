@@ -25,7 +25,7 @@ def coarse(scan: Scan, pixels: int) -> Scan:
 
     Where the object reaches over the panel's edge, the volume is wider, so that there is room for what lies beyond.
     """
-    small = scan.binned(max(1, round(max(scan.geometry.nDetector) / pixels)))
+    small = _binned(scan, max(1, round(max(scan.geometry.nDetector) / pixels)))
     g = small.geometry
     at_axis = g.DSO / g.DSD if g.mode == 'cone' else 1.0
     step = max(g.dDetector[1] * at_axis, min(g.dVoxel[:2]))
@@ -40,6 +40,16 @@ def coarse(scan: Scan, pixels: int) -> Scan:
     if g.nVoxel[2] == 1:
         count[2], voxel[2] = 1, g.dVoxel[2]
     return replace(small, geometry=g.with_volume(count, voxel), projections=_smoothed(small))
+
+
+def _binned(scan: Scan, factor: int) -> Scan:
+    """The scan binned by the means of valid pixels; new pixels are valid where half of theirs are."""
+    if scan.valid is None:
+        return scan.binned(factor)
+    valid = scan.valid.astype(np.float32)
+    sums, share = (replace(scan, projections=p, valid=None).binned(factor) for p in (scan.projections * valid, valid))
+    known = share.projections >= 0.5
+    return replace(sums, projections=sums.projections / np.maximum(share.projections, 0.5), valid=known)
 
 
 def _smoothed(scan):

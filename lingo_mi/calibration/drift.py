@@ -19,16 +19,33 @@ def times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     The views of the scan are in the order of their time, at even intervals. Where its angles turn back, or there is one view
     only, angles do not tell the time, and views are taken in their own order.
     """
-    own, n = np.unwrap(geometry.angles), len(geometry)
+    n = len(geometry)
+    if len(angles) == n and np.array_equal(angles, geometry.angles):
+        return np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
+    own = np.asarray(geometry.angles, float)
+    if not _in_order(own):
+        own = np.unwrap(own)
     turns = np.diff(own)
-    if n < 2 or not (np.all(turns > 0) or np.all(turns < 0)):
+    if n < 2 or not _in_order(own):
         return np.linspace(-1, 1, len(angles)) if len(angles) > 1 else np.zeros(len(angles))
     known, x = np.abs(own - own[0]), np.sign(turns[0]) * (angles - own[0])
     if known[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
         x = np.mod(x + NEAR, 2 * np.pi) - NEAR
+    elif (
+        x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi
+    ):  # turns are not counted: every view is soon after the one before
+        x, before = np.mod(x + NEAR, 2 * np.pi) - NEAR, -NEAR
+        for i in range(len(x)):
+            x[i] += 2 * np.pi * max(0.0, np.ceil((before - x[i]) / (2 * np.pi)))
+            before = x[i]
     step = 2 / (n - 1)
     ends = np.append(known, known[-1] + np.median(np.abs(turns)))
     return np.interp(x, ends, np.append(np.linspace(-1, 1, n), 1 + step))
+
+
+def _in_order(angles: np.ndarray) -> bool:
+    turns = np.diff(angles)
+    return bool(np.all(turns > 0) or np.all(turns < 0))
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def look(scan: Scan) -> Findings:
         found.facts.append('noise: none that could be measured')
     highest = float(p[valid].max())
     clipped = float((p[valid] == highest).mean())
-    if clipped > 1e-3 and highest > 0:
+    if clipped > 1e-3 and clipped * valid.sum() > 2 * n and highest > 0:
         found.facts.append(f'saturation: {clipped:.2%} of the pixels have exactly the highest value, {highest:.3g}')
         found.advice.append(
             'pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)'
@@ -81,7 +81,7 @@ def _air_and_truncation(found, p, valid, top):
     if not sides.size:
         return
     low = np.percentile(sides, 5)
-    near = sides[sides < low + 0.1 * (top - low)]
+    near = sides[sides <= low + 0.1 * (top - low)]
     if low > 0.2 * top:
         found.facts.append('air: none beside the object, which fills the panel')
     else:
@@ -182,8 +182,9 @@ def _plane(scan, air):
         return 'the scanner leaves the circle'
     (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
     p = scan.projections.astype(float) - air
+    valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     if geometry.mode == 'parallel':
-        valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
+        known = valid.any(1)
         row = (p * valid).sum(1) / np.maximum(valid.sum(1), 1)
     else:
         middle = nv / 2 - 0.5 + geometry.offDetector[0] / dv
@@ -192,7 +193,10 @@ def _plane(scan, air):
         first = min(max(int(np.floor(middle)), 0), nv - 1)
         last = min(first + 1, nv - 1)
         part = min(max(middle - first, 0.0), 1.0)
-        row = (1 - part) * p[:, first] + part * p[:, last]
+        row, known = (1 - part) * p[:, first] + part * p[:, last], valid[:, first] & valid[:, last]
+    if (~known[:, :-1] & ~known[:, 1:]).any():  # a gap that a mean of neighbours does not fill
+        return 'pixels side by side in the plane of the source are not valid'
+    row = np.stack([_bridged(*line) for line in zip(row, known)])
     by = max(1, nu // COLUMNS)
     columns = nu // by
     row = row[:, : columns * by].reshape(len(p), columns, by).mean(2)
@@ -201,6 +205,12 @@ def _plane(scan, air):
     if row[:, [0, -1]].max() > 0.15 * peak:
         return 'the object reaches over the edge of the panel'
     return Plane(row, geometry.angles, u, geometry.DSD if geometry.mode == 'cone' else 0.0)
+
+
+def _bridged(values, known):
+    """A row with what is not known interpolated between its neighbours."""
+    place = np.arange(len(values))
+    return values if known.all() or not known.any() else np.interp(place, place[known], values[known])
 
 
 def _angles(found, scan, air):

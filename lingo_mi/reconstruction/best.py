@@ -18,7 +18,7 @@ from lingo_mi.reconstruction.held_out import Score, Trial, Watch, split
 from lingo_mi.reconstruction.parameters import check_counts
 from lingo_mi.reconstruction.refined import Refined, structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Scan, values_digest
 
 START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
@@ -53,8 +53,9 @@ class Chosen(Reconstruction):
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
-        """The plan as plain values, for a JSON file."""
+        """The plan as plain values, for a JSON file; with a check sum of the volume that it made."""
         return dict(
+            volume=values_digest(self.volume),
             score='|A x - b| / |b| of the held-out views, weighted by the root of the frequency, after every pass',
             taken=self.taken,
             tried=[trial.record for trial in self.plan],

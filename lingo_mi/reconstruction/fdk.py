@@ -42,12 +42,13 @@ WINDOWS = {
 }
 
 NAME = 'filtered backprojection'  # in messages
+SAME_ANGLE = 1e-6  # radians
 BATCH = 4  # views per launch, which share the index arithmetic and the volume's memory traffic
 
 
 def window_of(filter: str) -> Callable[[np.ndarray], np.ndarray]:
     """One of `WINDOWS`, by its name or TIGRE's (with _ in place of -). Raises InputError for an unknown one."""
-    shape = WINDOWS.get(filter.replace('_', '-'))
+    shape = WINDOWS.get(filter.replace('_', '-')) if isinstance(filter, str) else None
     if shape is None:
         raise InputError(f'filter {filter!r} is unknown: use one of {", ".join(WINDOWS)}')
     return shape
@@ -81,11 +82,15 @@ def view_weights(geometry: Geometry) -> np.ndarray:
     n = len(geometry)
     if n == 1:
         return np.array([np.pi])
-    # A parallel beam repeats after half a turn.
-    order, gap, _ = gaps(geometry, np.pi if geometry.mode == 'parallel' else 2 * np.pi)
-    weight = np.empty(n)
+    turn = np.pi if geometry.mode == 'parallel' else 2 * np.pi  # after which a parallel beam repeats
+    steps = np.round(np.mod(geometry.angles, turn) / SAME_ANGLE) % round(turn / SAME_ANGLE)
+    _, first, repeats, counts = np.unique(steps, return_index=True, return_inverse=True, return_counts=True)
+    if len(first) == 1:
+        return np.full(n, np.pi / n)
+    order, gap, _ = gaps(geometry.subset(first), turn)
+    weight = np.empty(len(first))
     weight[order] = (gap + np.roll(gap, 1)) / 2
-    return weight * min(1.0, np.pi / gap.sum())
+    return (weight / counts)[repeats] * min(1.0, np.pi / gap.sum())
 
 
 def ray_weights(geometry: CircularGeometry) -> np.ndarray:

@@ -29,12 +29,15 @@ PATIENCE = 3  # passes without a better score, after which a trial ends
 
 
 def split(scan: Scan, every: int) -> tuple[Scan, Scan]:
-    """The views to reconstruct from, and those held out: one of `every` consecutive ones, never the first or the last.
+    """The views to reconstruct from, and those held out: one of `every` consecutive ones, never the first or the last. Views
+    without a valid pixel are left out.
 
     Raises InputError for fewer than four views.
 
         kept, held_out = split(scan, 5)
     """
+    if scan.valid is not None:
+        scan = scan.subset(np.flatnonzero(scan.valid.any((1, 2))))
     if len(scan) < LEAST_VIEWS:
         raise InputError(
             f'best holds views out to choose by, and needs at least {LEAST_VIEWS}, but the scan has {len(scan)}: '

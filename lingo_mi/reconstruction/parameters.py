@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
-
-import numpy as np
 
 from lingo_mi.errors import InputError
 
@@ -16,7 +14,7 @@ ORDERS = ('ordered', 'random', 'angularDistance')
 def check_counts(least: int = 1, **counts: float) -> None:
     """Raises InputError for a count that is not an integer, or below `least`."""
     for name, value in counts.items():
-        if not (_number(value) and least <= value < np.inf and value == int(value)):
+        if not (_number(value) and isinstance(value, Integral) and least <= value):
             raise InputError(f'{name} must be an integer from {least} on, not {value!r}')
 
 

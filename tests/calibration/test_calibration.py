@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.calibration.cross_prediction import coarse
 from lingo_mi.calibration.drift import Drift, times
 from lingo_mi.calibration.panel import Panel
 from lingo_mi.calibration.response.response import Response
@@ -181,6 +182,28 @@ def test_times_of_views():
     np.testing.assert_allclose(times(reverse, 1 - between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
     shuffled = replace(geometry, angles=geometry.angles[[0, 2, 1, 3, 4, 5, 6, 7, 8, 9]])
     np.testing.assert_allclose(times(shuffled, between), np.linspace(-1, 1, 10))
+
+
+@pytest.mark.parametrize('total', [720.0, 1440.0])
+def test_times_of_several_turns(total):
+    """Also where angles do not count the turns, as those of poses."""
+    geometry, _ = scanner(10)
+    counted = replace(geometry, angles=circular(48, total))
+    for scan in (counted, replace(counted, angles=np.mod(counted.angles, 2 * np.pi))):
+        own = np.linspace(-1, 1, 48)
+        np.testing.assert_allclose(times(scan, scan.angles), own, atol=1e-9)
+        np.testing.assert_allclose(times(scan, scan.angles[1::3]), own[1::3], atol=1e-6)
+
+
+def test_pixels_that_are_not_valid_leave_the_others():
+    """Few dead pixels spoil nearly every block of a binned scan, which is as good without them."""
+    geometry, data = scanner(8)
+    scan = scanned(geometry, data, Panel())
+    dead = np.random.default_rng(0).random(geometry.nDetector) < 0.1
+    valid = np.broadcast_to(~dead, scan.projections.shape)
+    whole, holed = coarse(scan, 30), coarse(replace(scan, valid=valid), 30)
+    assert holed.valid is None or holed.valid.mean() > 0.9
+    assert np.abs(holed.projections - whole.projections).max() < 0.1 * whole.projections.max()
 
 
 def test_bad_input():

@@ -1,5 +1,7 @@
 """A sound scan raises no alarm; what is wrong is noticed, and a small error is measured."""
 
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -83,6 +85,28 @@ def test_air_and_truncation(foot):
     assert found.air == pytest.approx(3, abs=0.1)
     cut = lm.Scan(replace(foot.geometry, nDetector=(110, 40)), foot.projections[:, :, 28:68])
     assert any('left or right edge' in line and '-D outside=ignore' in line for line in look(cut).advice)
+
+
+def test_pixels_that_are_not_valid_disagree_with_nothing(foot):
+    valid = np.ones(foot.projections.shape, bool)
+    valid[:, :, 30] = False
+    assert only_disagreement(replace(foot, valid=valid)) < only_disagreement(foot) + 0.5  # 5.6 where they count as air
+    valid[:, :, 31] = False
+    assert any('not valid' in line for line in look(replace(foot, valid=valid)).facts)
+
+
+def only_disagreement(scan):
+    """Percent."""
+    (line,) = (line for line in look(scan).facts if 'disagree' in line)
+    return float(re.search(r'([\d.]+) ?%', line)[1])
+
+
+def test_scans_of_nothing_and_of_few_pixels(foot):
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert not any('nan' in line for line in look(replace(foot, projections=0 * foot.projections)).facts)
+    row = foot.subset(slice(10))
+    assert not any('clipped' in line for line in look(lm.Scan(row.geometry.binned(1), row.projections)).advice)
 
 
 def test_air_of_single_views(foot):

@@ -85,6 +85,14 @@ def test_offset_detector_that_sees_little_more_than_half(mode, offset):
     np.testing.assert_allclose(weights[overlap] + np.interp(-u[overlap], *zip(*sorted(zip(u, weights)))), 2, atol=0.05)
 
 
+@pytest.mark.parametrize('views', [np.delete(np.arange(60), 7), np.round(np.arange(40) * 1.5).astype(int)])
+def test_offset_detector_with_views_left_out(views):
+    """A circle without a view or every third one is closed: opposite views still complete the panel."""
+    geo = geometry(nDetector=(64, 40), offDetector=(4.0, 50.0), angles=circular(60)[views])
+    volume, near = FDK().run(ellipsoids(geo, BALL)).volume, np.linalg.norm(centres(geo) - BALL[0], axis=-1)
+    assert abs(volume[near < 12].mean() / 0.02 - 1) < 0.03
+
+
 @pytest.mark.parametrize('values', [0.0, 1.0, -1.0])
 def test_constant_projections(values):
     geo = geometry(angles=circular(6))
@@ -160,6 +168,8 @@ def test_view_weights():
     np.testing.assert_allclose(doubled[0] + doubled[-1], np.pi / 8)
     shuffled = np.random.default_rng(0).permutation(8)
     np.testing.assert_allclose(view_weights(geometry(angles=circular(8)[shuffled])), full)
+    np.testing.assert_allclose(view_weights(geometry(angles=circular(24, 1080))), np.pi / 24)  # three turns
+    np.testing.assert_allclose(view_weights(geometry('parallel', circular(16, 720))), np.pi / 16)
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
