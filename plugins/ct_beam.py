@@ -27,8 +27,9 @@ class CTBeam(mi.Emitter):
         super().__init__(props)
         self.m_flags = mi.EmitterFlags.DeltaPosition
 
-    def aim(self, view: View) -> None:
-        """Shine at the panel of a `lingo_mi.projectors.view.View`."""
+    def aim(self, view: View, reach: float) -> None:
+        """Shine at the panel of a `lingo_mi.projectors.view.View`. reach: from how far parallel rays come to what they light."""
+        self.reach = dr.opaque(mi.Float, reach)
         across = dr.cross(view.u, view.v)
         self.parallel, self.size = view.parallel, dr.opaque(mi.Vector2f, (view.width, view.height))
         self.source, self.corner = mi.Vector3f(view.source), mi.Vector3f(view.corner)
@@ -49,7 +50,7 @@ class CTBeam(mi.Emitter):
         lit = active & (behind >= 0) & (x >= 0) & (x <= self.size.x) & (y >= 0) & (y <= self.size.y)
         ds: Any = dr.zeros(mi.DirectionSample3f)
         distance = dr.norm(along)
-        ds.dist = dr.norm(p - self.corner) + 2 * dr.norm(self.corner) if self.parallel else distance
+        ds.dist = self.reach if self.parallel else distance
         ds.d = -along / distance
         ds.p = mi.Point3f(p + ds.dist * ds.d)
         ds.n, ds.time, ds.pdf, ds.delta = -ds.d, it.time, mi.Float(1), mi.Bool(True)

@@ -70,7 +70,8 @@ class CTScanner(mi.Sensor):
          `lingo_mi.files.poses`), looked for like `projections`. A file that leaves the pixel size open needs dDetector.
      * - test_views
        - |int|
-       - Views held out of the fit, at angles drawn uniformly from the same range with a fixed seed. (Default: 0)
+       - Views held out of the fit, at angles drawn uniformly from the same range, or between the
+         least and the largest of `angles`, with a fixed seed. (Default: 0)
      * - projections
        - |string|
        - A file of measured projections (see `lingo_mi.files.scans`), which then also gives the geometry. It is looked
@@ -115,7 +116,7 @@ class CTScanner(mi.Sensor):
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
         rays = self.geometry.rays()
-        self.frame = View.of(rays, self.index, *self.geometry.nDetector)
+        self.frame = View.of(rays, self.index, *self.geometry.nDetector, panel=False)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
             np.linalg.norm(rays.corner[self.index])

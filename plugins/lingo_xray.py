@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
@@ -104,7 +105,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         if not develop:
             raise InputError('lingo_xray renders with develop=True only: there are no samples to accumulate')
         with dr.suspend_grad():
-            image = self._image(scene, sensor, seed=seed)
+            image = self._image(scene, sensor, seed=int(np.ravel(seed)[0]))  # of any type that Mitsuba takes
             if evaluate:
                 dr.eval(image)
             return image

@@ -30,6 +30,7 @@ from lingo_mi.projectors.view import View
 
 RESPONSES = 'energy', 'count'
 MOST_PHOTONS = 1e15
+MOST_COUNTS = 1e18  # in a pixel, that numpy can draw
 FULL_SCALE = 1.25  # of the converter if no saturation is given; above the open beam with its noise
 DARKEST = 1e-30  # least transmission without noise; float32 holds 1e-38
 _MAPS = 2**63  # added to a seed, so that gain and dead-pixel maps are independent of the noise
@@ -131,6 +132,8 @@ class Detector:
         light = light * gains
         if self.photons:
             rng = np.random.Generator(np.random.Philox(key=[seed, view]))
+            if not (self.photons * light).max(initial=0) < MOST_COUNTS:
+                raise InputError('a view is brighter than can be counted: negative densities, or too many photons')
             light = rng.poisson(self.photons * light) / self.photons
             if self.electronic_noise:
                 light = light + rng.normal(0, self.electronic_noise / self.photons, light.shape)
@@ -145,13 +148,16 @@ class Detector:
         light = self.signal(transmission, view, seed)
         if self.corrected:
             gains, dead = self.maps(light.shape)
-            light = _filled(light / gains, dead)
+            light = filled(light / gains, dead)
         return -np.log(np.maximum(light, self.floor)).astype(np.float32)
 
     def least(self, shape: tuple[int, int]) -> np.ndarray:
-        """The line integrals at which pixels saturate, float64 [v, u]: the smallest that the detector can report."""
-        gains = self.maps(shape)[0] if self.corrected else 1
-        return np.broadcast_to(-np.log(self.saturation / gains), shape)
+        """The smallest line integrals that the detector can report, of saturated pixels, float64 [v, u]."""
+        return self.saturates(shape) if self.corrected else np.full(shape, -np.log(self.saturation))
+
+    def saturates(self, shape: tuple[int, int]) -> np.ndarray:
+        """The true line integrals at which pixels saturate, float64 [v, u]: brighter ones of a larger gain do sooner."""
+        return -np.log(self.saturation / self.maps(shape)[0])
 
     def deviation(self, transmission: ArrayLike) -> np.ndarray:
         """Standard deviation of a line integral -ln(N / I0) from counting noise and rounding to `bits`, to first order.
@@ -206,7 +212,7 @@ def _maps(seed, gain, dead, shape):
     return gains, rng.random(shape) < dead
 
 
-def _filled(light, dead):
+def filled(light, dead):
     """Dead pixels replaced by the mean of their live neighbours, from the edges of a cluster inwards."""
     light = np.where(dead, 0, light)
     if dead.all():

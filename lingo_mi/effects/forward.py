@@ -121,7 +121,7 @@ class Effects:
         """Expected -ln(I / I0) with saturation, Float [height * width]. The derivative of saturated pixels is zero."""
         if not (self.detector and self.detector.saturation):
             return integrals
-        return dr.maximum(integrals, mi.Float(self.detector.least((view.height, view.width)).ravel()))
+        return dr.maximum(integrals, mi.Float(self.detector.saturates((view.height, view.width)).ravel()))
 
     def masked(self, scan: Scan) -> Scan:
         """The scan with dead pixels invalid."""
@@ -165,6 +165,8 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')
     if scatter is not None and geometry is None:
         raise InputError(f'xray_tube {tubes[0].id()!r}: scatter needs a ct_scanner, whose panel it reaches')
+    if spot is not None and max(spot.size) > 0 and geometry is None:
+        raise InputError(f'xray_tube {tubes[0].id()!r}: focal_spot, in mm, needs a ct_scanner, whose panel it blurs')
     if spot is not None and geometry is not None:
         try:
             spot.check(None if geometry.mode == 'parallel' else geometry.DSO)

@@ -80,9 +80,14 @@ class Scatter:
         )
 
     def within(self, geometry: Geometry) -> Scatter:
-        """The same, but nothing scatters outside a geometry's volume."""
+        """The same, but nothing scatters outside a geometry's volume. Raises InputError where the two boxes do not meet."""
         centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
-        return replace(self, box=(tuple((centre - half).tolist()), tuple((centre + half).tolist())))
+        low, high = centre - half, centre + half
+        if self.box is not None:
+            low, high = np.maximum(low, self.box[0]), np.minimum(high, self.box[1])
+        if not (low < high).all():
+            raise InputError('scatter_box lies outside the volume: nothing would scatter')
+        return replace(self, box=(tuple(low.tolist()), tuple(high.tolist())))
 
     @property
     def given(self) -> dict:
@@ -127,7 +132,7 @@ class Scatter:
             ):
                 _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies, self.box)
             low, high, beam, scenes = _LATEST[2]
-            beam.aim(view)
+            beam.aim(view, 2 * float(np.linalg.norm(high - low)))
             rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
             integrator = mi.load_dict(dict(type='volpath', max_depth=self.orders + 1 if self.orders > 0 else -1))
             rng = np.random.Generator(np.random.Philox(key=[self.seed, index]))

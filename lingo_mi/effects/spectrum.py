@@ -103,11 +103,15 @@ def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
     material   a short name of `NAMES`, a compound of the NIST database as xraylib spells it, an element's symbol, or a
                chemical formula with its density in g/cm3: 'CsI @ 4.51'
 
-    Raises InputError for an unknown material, or if xraylib is not installed.
+    Raises InputError for an unknown material, for energies that xraylib does not know, or if it is not installed.
     """
     xraylib = library('xraylib')
     formula, density = compound(material)
-    mass = [xraylib.CS_Total_CP(formula, float(e)) for e in np.atleast_1d(energies)]  # cm2/g
+    try:
+        mass = [xraylib.CS_Total_CP(formula, float(e)) for e in np.atleast_1d(energies)]  # cm2/g
+    except ValueError as error:
+        least, most = np.min(energies), np.max(energies)
+        raise InputError(f'{material}: xraylib has no attenuation from {least:g} to {most:g} keV ({error})') from None
     return np.array(mass) * density / 10
 
 
@@ -137,6 +141,8 @@ def compound(material: str) -> tuple[str, float]:
 def _filters(text: str) -> list[tuple[str, float]]:
     """Materials and thicknesses, mm, from 'Al 2.5, Cu 0.1'."""
     out = []
+    if not isinstance(text, str):
+        raise InputError(f"filtration must be materials and thicknesses in mm, 'Al 2.5, Cu 0.1', not {text!r}")
     for item in filter(None, (part.strip() for part in text.split(','))):
         material, _, number = item.rpartition(' ')
         try:

@@ -44,7 +44,8 @@ def voxelize(triangles: np.ndarray, low: ArrayLike, step: ArrayLike, shape: tupl
     low [3], step [3]   corner of the grid and voxel size, the unit of the triangles
 
     Columns along z are cut by the mesh, 4 x 4 a voxel; between two crossings a voxel is covered by the length it shares
-    with the column. Which way round the mesh is as a whole plays no part.
+    with the column, once for each part of the mesh that it lies in: where parts overlap, shares add up to more than 1. Which way
+    round the mesh is as a whole plays no part.
     """
     low, step, fine = np.asarray(low, float), np.asarray(step, float), 4
     nx, ny, nz = shape
@@ -76,4 +77,5 @@ def voxelize(triangles: np.ndarray, low: ArrayLike, step: ArrayLike, shape: tupl
     data = np.diff(covered, axis=2) / (step[2] * fine * fine)
     data *= np.sign(data.sum())
     data[np.abs(data) < 1e-9] = 0
-    return np.clip(data, 0, 1).astype(np.float32)
+    data[np.abs(data - 1) < 1e-9] = 1
+    return np.maximum(data, 0).astype(np.float32)

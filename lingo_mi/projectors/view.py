@@ -28,9 +28,9 @@ class View:
     source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
     width, height          pixels
     parallel               whether the beam is parallel
-    panel                  whether integrals end at the detector, as in a rendered scene, or continue (a camera, whose image plane
-                           only defines directions; a scan, whose panel may be a virtual one within the object); those of a
-                           parallel beam never end
+    panel                  whether integrals end at the detector, or continue (a camera, whose image plane only defines
+                           directions; a scan, whose panel may be a virtual one within the object); those of a parallel
+                           beam never end
     """
 
     source: Any

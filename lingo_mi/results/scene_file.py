@@ -36,7 +36,11 @@ def write_scene(path: Path, geometry: Geometry, extent: float | None, effects: E
         spot = {}
         if effects.spot is not None:
             spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
-        given = {k: v for k, v in effects.tube.given.items() if not (v is None or v == '' or k.startswith('material'))}
+        given = {
+            k: v
+            for k, v in effects.tube.given.items()
+            if not (v is None or k.startswith('material') or v == '' and k != 'filtration')
+        }
         if effects.tube.hardens or effects.scatter:  # the cloud stands for all shapes
             given['material'] = ' + '.join(effects.tube.fitted())
         scatter = effects.scatter.within(geometry).given if effects.scatter else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -113,10 +114,12 @@ def _counts(props, name):
 
 def own_grid(props: Any, geometry: Geometry) -> Geometry:
     """A geometry with the voxels that a plugin's properties name, where they name any."""
-    if not ('nVoxel' in props or 'dVoxel' in props):
-        return geometry
-    count = _counts(props, 'nVoxel') if 'nVoxel' in props else geometry.nVoxel
-    return geometry.with_volume(count, _numbers(props, 'dVoxel') if 'dVoxel' in props else geometry.dVoxel)
+    if 'nVoxel' in props or 'dVoxel' in props:
+        count = _counts(props, 'nVoxel') if 'nVoxel' in props else geometry.nVoxel
+        geometry = geometry.with_volume(count, _numbers(props, 'dVoxel') if 'dVoxel' in props else geometry.dVoxel)
+    if 'offOrigin' in props:
+        geometry = replace(geometry, offOrigin=_numbers(props, 'offOrigin'))
+    return geometry
 
 
 def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
@@ -163,6 +166,8 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
 
     if not held_out:
         return geometry(angles), None
+    if 'angles' in props and 'totalAngle' not in props:
+        start, total = np.degrees(angles.min()), np.degrees(np.ptp(angles))
     drawn = np.sort(total * np.random.default_rng(0).uniform(0, 1, held_out)) + start
     return geometry(angles), geometry(np.radians(drawn))
 

@@ -67,7 +67,9 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None,
             everything = Scan(every, render_with(effects, objects, every, keys, seed), effects=effects)
         except InputError as error:
             raise InputError(f'{loaded.path}: {error}') from None
-    train = everything.subset(slice(0, len(geometry)))
+    train = replace(
+        everything.subset(slice(0, len(geometry))), geometry=geometry
+    )  # as given: joining may make poses of it
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
     return choose_views(Dataset(train, held_out, true_volume(objects, geometry)), 0 if test is not None else views)
 

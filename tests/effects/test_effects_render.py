@@ -1,5 +1,6 @@
 """Effects in scenes: what they cost, which is nothing where they are absent; images, derivatives, scans and errors."""
 
+from dataclasses import replace
 from functools import partial
 
 import drjit as dr
@@ -7,12 +8,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import lingo_mi as lm
 from helpers.effects import XML, direct, kernels, physics
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
 from lingo_mi.effects.bands import band
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.effects.hardening import hardened
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
 from lingo_mi.errors import InputError
+from lingo_mi.projectors.objects import find_objects
+from lingo_mi.reconstruction.effects_correction import corrected, linearised
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import take_scan
 
@@ -313,3 +319,54 @@ def test_second_material_of_a_mesh():
         scene = scene_of(dict(thing=thing), tube)
         with pytest.raises(InputError, match=match):
             through_mitsuba(scene)
+
+
+@physics
+def test_simulated_noise_is_not_subtracted(scene_file):
+    """What linearising leaves is the error of expected views, whatever noise the effects have."""
+    loaded = load_scene(scene_file(XML.replace('value="1e4"', 'value="100"')))
+    scan, objects = take_scan(loaded).train, find_objects(loaded.scene)
+    effects = scan.effects
+    quiet = replace(effects, detector=effects.detector.expected)
+    found, wanted = (corrected(scan, e, objects).projections for e in (effects, quiet))
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_dead_pixels_that_are_left_in_are_filled():
+    detector = Detector.of(**(Detector.DEFAULTS | dict(dead=0.05, corrected=False)))
+    geometry = lm.Geometry.parallel(nDetector=(20, 24), dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0, 1.0])
+    view = np.add.outer(np.arange(20), np.arange(24)) / 50
+    seen = np.stack([detector.measure(np.exp(-view), i) for i in range(2)])
+    effects = Effects(detector=detector)
+    dead = detector.maps((20, 24))[1]
+    assert dead.any() and seen[:, dead].min() > 10
+    found = linearised(lm.Scan(geometry, seen, effects=effects), effects).projections
+    np.testing.assert_allclose(found, np.broadcast_to(view, found.shape), atol=0.05)
+
+
+def test_a_focal_spot_needs_a_panel_in_millimetres():
+    camera = dict(type='perspective', to_world=mi.ScalarTransform4f().look_at([0, 0, -5], [0, 0, 0], [0, 1, 0]))
+    scene = mi.load_dict(dict(type='scene', tube=dict(type='xray_tube', energy=60.0, focal_spot='0.5'), camera=camera))
+    with pytest.raises(InputError, match='focal_spot, in mm, needs a ct_scanner'):
+        find_effects(scene, scene.sensors()[0])
+
+
+def test_gains_that_are_left_in_move_the_saturation():
+    detector = Detector.of(**(Detector.DEFAULTS | dict(gain=0.2, saturation=0.5, corrected=False)))
+    gains = detector.maps((8, 9))[0]
+    clipped = detector.signal(np.full((8, 9), 0.5), 0) >= 0.5  # of what the detector measures
+    np.testing.assert_array_equal(clipped, -np.log(0.5) <= detector.saturates((8, 9)) + 1e-12)
+    assert clipped.any() and not clipped.all() and (gains[clipped] >= 1).all()
+
+
+def test_views_too_bright_to_be_counted():
+    detector = Detector.of(**(Detector.DEFAULTS | dict(photons=1e5)))
+    with pytest.raises(InputError, match='brighter than can be counted'):
+        detector.measure(np.full((2, 2), np.exp(40.0)), 0)
+
+
+@physics
+def test_seeds_of_mitsubas_own_type(scene_file):
+    scene = load_scene(scene_file()).scene
+    same = [np.array(mi.render(scene, seed=seed)) for seed in (3, mi.UInt32(3))]
+    np.testing.assert_array_equal(*same)

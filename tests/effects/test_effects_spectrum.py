@@ -94,6 +94,8 @@ def test_missing_library(monkeypatch):
         (lambda: attenuation('unobtainium', [60.0]), 'is unknown'),
         (lambda: attenuation('CsI @ -1', [60.0]), 'positive density'),
         (lambda: attenuation('CsI @ much', [60.0]), 'is unknown'),
+        (lambda: attenuation('water', [2000.0]), 'xraylib has no attenuation'),
+        (lambda: tube_spectrum(120, 12, 2.5), 'filtration'),
     ],
 )
 def test_refusals(call, match):

@@ -24,6 +24,15 @@ def test_corners_on_and_beside_the_lines_that_are_followed(shift):
     assert voxelize(octahedron.triangles, *GRID).sum() * 0.5**3 == pytest.approx(4 / 3, rel=0.02)
 
 
+def test_parts_that_overlap_count_twice():
+    """As the lengths of rays through them do."""
+    one, other = (trimesh.creation.box((2.0, 2.0, 2.0)).triangles + shift for shift in (-0.5, 0.25))
+    assert voxelize(np.concatenate([one, other]), *GRID).max() == pytest.approx(2)
+    np.testing.assert_allclose(
+        voxelize(np.concatenate([one, other]), *GRID), voxelize(one, *GRID) + voxelize(other, *GRID)
+    )
+
+
 def test_a_mesh_over_the_edge_of_the_grid():
     """A box from the middle of the grid to beyond its end, along each axis."""
     for axis in range(3):
