@@ -84,8 +84,8 @@ class Study:
                 if self.get(case, setting) is None:
                     found = self._compute(case, setting)
                     last, best = found['psnr_3d'][-1], max(found['psnr_3d'])
-                    say(f'{case}, {setting}: {last:.2f} dB after {found["steps"][-1]} steps, at best {best:.2f}')
                     self.cells.put(self.name(case), setting, found)
+                    say(f'{case}, {setting}: {last:.2f} dB after {found["steps"][-1]} steps, at best {best:.2f}')
 
     def _compute(self, case: Case, setting: str) -> dict:
         scan, truth = self.dataset(case)
@@ -123,18 +123,21 @@ class Study:
         heads += ['weights 1 / s, all steps', 'weights 1 / s, best'] * weighed
         lines = [f'| object | scanned | photons | {" | ".join(heads)} |', '|---|---:|---:|' + '---:|' * len(heads)]
         for case, found in cells.items():
-            if 'equal' not in found:
+            if not found:
                 continue
-            row, top = [_shown(*_last(found['equal'])), _shown(*_best(found['equal']))], _best(found['equal'])[0]
-            row += ['–', '–'] if 'stopped' not in found else _stopped(found['stopped'], top)
+            equal = found.get('equal')
+            row = [_shown(*of(equal)) if equal else '–' for of in (_last, _best)]
+            row += _stopped(found.get('stopped'), _best(equal)[0] if equal else None)
             if weighed:
                 row += [_shown(*of(found[WEIGHTED])) if WEIGHTED in found else '–' for of in (_last, _best)]
             lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(row)} |')
         return '\n'.join(lines)
 
 
-def _stopped(cell: dict, top: float) -> list[str]:
-    return [_shown(*_last(cell)), f'{top - _last(cell)[0]:+.2f}']
+def _stopped(cell: dict | None, top: float | None) -> list[str]:
+    if cell is None:
+        return ['–', '–']
+    return [_shown(*_last(cell)), '–' if top is None else f'{top - _last(cell)[0]:+.2f}']
 
 
 def _last(cell: dict) -> tuple[float, int]:

@@ -86,10 +86,15 @@ def _best_for(scan: Scan, values: Sequence[float], reconstruct: Callable[[Scan, 
     kept, held_out = split(scan, 5)
 
     def miss(value: float) -> float:
-        found = grid.project(reconstruct(kept, value), held_out.geometry) - held_out.projections
-        return float(np.nan_to_num(np.linalg.norm(found.astype(float)), nan=np.inf))
+        return float(np.nan_to_num(_wrong(reconstruct(kept, value), held_out), nan=np.inf))
 
     return reconstruct(scan, min(values, key=miss))
+
+
+def _wrong(volume: np.ndarray, held_out: Scan) -> float:
+    """Root mean square error of a volume's projections over the valid pixels of views."""
+    wrong = (grid.project(volume, held_out.geometry) - held_out.projections).astype(float)
+    return float(np.sqrt(np.mean(np.square(wrong if held_out.valid is None else wrong[held_out.valid]))))
 
 
 def _mbirjax() -> Any:
@@ -155,11 +160,11 @@ class Study:
             for method in methods:
                 if self.cells.get(_case(count), method) is None:
                     found = self._compute(chosen, method)
+                    self.cells.put(_case(count), method, found)
                     say(
                         f'{count} views, {method}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
                         f'{found["seconds"]:.0f} s'
                     )
-                    self.cells.put(_case(count), method, found)
 
     def _require_same_scan(self) -> None:
         scans = [scan for scan in (self.dataset.train, self.dataset.test) if scan is not None]
@@ -187,14 +192,13 @@ class Study:
         began, processor = time.perf_counter(), time.process_time()
         volume = METHODS[method][1](chosen.train)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
-        wrong = grid.project(volume, chosen.test.geometry) - chosen.test.projections
         Reconstruction(volume, [], seconds, chosen.train.geometry).save(
             self._volume_path(_case(len(chosen.train)), method), force=True
         )
         return dict(
             views=len(chosen.train),
             method=method,
-            held_out_rms=float(np.sqrt(np.mean(wrong.astype(float) ** 2))),
+            held_out_rms=_wrong(volume, chosen.test),
             psnr_3d=psnr_3d(volume, self.reference()),
             seconds=seconds,
             processor_seconds=processor,

@@ -11,6 +11,7 @@ interrupted one continues.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -20,9 +21,10 @@ from os import PathLike
 from pathlib import Path
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import replacing
+from lingo_mi.file_access import reading, replacing, write_text
 from lingo_mi.fitting.recipes import changes_of, settings_of
 from lingo_mi.metrics import current_names
+from lingo_mi.scene.shipped import scene_path
 
 Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
 
@@ -77,6 +79,7 @@ class Comparison:
     def result(self, scene: PathLike | str, method: str) -> dict:
         """The metrics of one fit, run now unless they are there."""
         folder, command = self.plan(scene, method)
+        self._require_same_scene(folder, scene)
         if not (folder / 'metrics.json').exists():
             if (folder / 'checkpoint.npz').exists():
                 command.append('--resume')
@@ -85,6 +88,20 @@ class Comparison:
                 raise InputError(f'{scene}: lingo-mi fit --recipe {method} failed with exit code {code}')
         found = current_names(json.loads((folder / 'metrics.json').read_text(encoding='utf-8')))
         return found | dict(history=[current_names(entry) for entry in found['history']])
+
+    def _require_same_scene(self, folder: Path, scene: PathLike | str) -> None:
+        try:
+            digest = hashlib.sha256(scene_path(scene).read_bytes()).hexdigest()
+        except (InputError, OSError):  # the fit will say so
+            return
+        path, known = self.folder / 'scenes.json', {}
+        if path.exists():
+            with reading(path):
+                known = json.loads(path.read_text(encoding='utf-8'))
+        if known.setdefault(folder.name, digest) != digest:
+            raise InputError(f'{folder}: has the fit of another scene of this name; choose another --out, or remove it')
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(known, indent=1) + '\n')
 
     def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""
@@ -99,8 +116,16 @@ class Comparison:
 
 
 def run_command(command: list[str]) -> int:
-    """Run a command to its end; its exit code."""
-    return subprocess.run(command).returncode
+    """Run a command to its end; its exit code. Ctrl-C, which reaches it, too, waits until it has stored where it is."""
+    process = subprocess.Popen(command)
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        try:
+            process.wait()
+        except KeyboardInterrupt:  # a second one
+            process.kill()
+        raise KeyboardInterrupt('the same command goes on from here') from None
 
 
 def table(results: Results) -> str:

@@ -91,8 +91,8 @@ class Study:
             for setting in [*VOXELS, BEST, *(CLOUDS if clouds else ())]:
                 if self.get(case, setting) is None:
                     found = self._compute(case, setting)
-                    say(f'{case}, {setting}: {found["psnr_3d"]:.2f} dB, {found["seconds"]:.1f} s')
                     self.cells.put(self.name(case), setting, found)
+                    say(f'{case}, {setting}: {found["psnr_3d"]:.2f} dB, {found["seconds"]:.1f} s')
 
     def _compute(self, case: Case, setting: str) -> dict:
         dataset = self.dataset(case)

@@ -25,6 +25,12 @@ def main() -> None:
     )
     parser.add_argument('--truth', type=Path, metavar='F', help='the true volume, to compare with')
     parser.add_argument(
+        '--mu-water',
+        type=float,
+        metavar='MU',
+        help='where the truth has Hounsfield units: the attenuation of water, 1/mm, that the results were made with',
+    )
+    parser.add_argument(
         '--out', type=Path, default=Path('compare.html'), metavar='F.html', help='the page (default: compare.html)'
     )
     parser.add_argument('--title', default='', help='of the page')
@@ -38,9 +44,11 @@ def main() -> None:
         raise InputError(f'{args.out}: a comparison is a page; give a name that ends in .html')
     if args.out.exists() and not args.force:
         raise InputError(f'{args.out}: exists already; give --force to replace it, or another --out')
+    if args.mu_water is not None and args.truth is None:
+        raise InputError('--mu-water goes with --truth')
     require_writable(args.out.parent, args.out)
     found = [read_stored(path) for path in args.results]
-    page = compare_page(found, read_volume(args.truth) if args.truth else None, args.title)
+    page = compare_page(found, read_volume(args.truth, args.mu_water) if args.truth else None, args.title)
     with writing_file(args.out):
         write_text(args.out, page)
     print(args.out)

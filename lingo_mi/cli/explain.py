@@ -34,7 +34,6 @@ def arguments() -> argparse.Namespace:
     p.add_argument(
         '--correct',
         nargs='*',
-        default=list(KINDS),
         choices=KINDS,
         metavar='KIND',
         help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
@@ -50,6 +49,10 @@ def main() -> None:
     require_writable(args.out, args.out, 'choose another --out')
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
+    if args.with_cloud and args.correct is not None:
+        raise InputError('--correct is for corrections before a reconstruction; leave it out with --with-cloud')
+    if args.iterations is not None and not args.with_cloud:
+        raise InputError('--iterations goes with --with-cloud')
     use_variant(args.variant)
     from lingo_mi.api.data import load
     from lingo_mi.studies.explain import binned, cloud_rows, find, report, rows
@@ -63,6 +66,6 @@ def main() -> None:
         found = list(cloud_rows(dataset, args.out, **settings))
         print(report(found, args.out, 'found with the cloud'))
         return
-    calibration = find(dataset, args.correct)
+    calibration = find(dataset, KINDS if args.correct is None else args.correct)
     print('\n'.join(calibration.lines()))
     print(report(list(rows(dataset, calibration, args.out)), args.out, 'corrected'))

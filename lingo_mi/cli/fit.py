@@ -30,7 +30,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
-from lingo_mi.output_folder import CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
+from lingo_mi.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
 from lingo_mi.parsing import nearest
 from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
@@ -139,7 +139,8 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
                 watchers=watchers,
             )
         except KeyboardInterrupt:
-            again = command_line('--resume', without=('--resume', '--force'))
+            begun = (folder / CHECKPOINT).exists()
+            again = command_line(*['--resume'] * begun, without=('--resume', '--force'))
             raise KeyboardInterrupt(f'go on with  {again}') from None
     print(summary(result))
     written = [name for name in (PAGE, VOLUME, CLOUD, SCENE, METRICS) if (folder / name).exists()]

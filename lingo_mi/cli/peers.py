@@ -4,8 +4,9 @@
     lingo-mi peers walnut --views 30 -D voxels=256 -D voxel_size=0.1525 --methods asd-pocs mbirjax best
     lingo-mi peers scenes/mine.xml --projections scan.npy --views 40
 
-Every method gets the same few, evenly spaced views. The table says how well its volume predicts the views that are left, as root
-mean square of line integrals; how near it is to the FDK of all views, or to the true volume if it is known; and how long it took.
+Every method gets the same few, evenly spaced views. The table says how well its volume predicts the views that are left, or those
+that the scan holds out itself, as root mean square of line integrals in valid pixels; how near it is to the FDK of all views, or
+to the true volume if it is known; and how long it took.
 Each volume is stored as NIfTI when it is done, and the same command goes on after an interruption. The table, as Markdown, is
 renewed after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but MBIRJAX's densities
 are kept from being negative, and its sharpness and the weight of RTK's total variation are each chosen among four values by
@@ -22,6 +23,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import require_writable
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.runtime import use_variant
+from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 
@@ -40,6 +42,11 @@ def arguments() -> argparse.Namespace:
     return p.parse_args()
 
 
+def _linear(scan: Scan) -> Scan:
+    """A scan's line integrals, as far as its effects are known."""
+    return scan if scan.effects is None else linearised(scan, scan.effects)
+
+
 def main() -> None:
     args = arguments()
     check_input(args)
@@ -52,8 +59,9 @@ def main() -> None:
     methods = installed(args.methods or METHODS, print)
     scene = scene_path(args.scene)
     dataset = read_input(args, load_scene(scene, definitions(args.define)), None)
-    if dataset.train.effects is not None:
-        dataset = replace(dataset, train=linearised(dataset.train, dataset.train.effects))
+    dataset = replace(
+        dataset, train=_linear(dataset.train), test=None if dataset.test is None else _linear(dataset.test)
+    )
     for count in args.counts:
         if not 4 <= count < len(dataset.train):
             raise InputError(f'--views must be from 4 to {len(dataset.train) - 1}, so that some are left, not {count}')

@@ -102,6 +102,8 @@ def main() -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f'{folder}: is a file, not a folder; choose another --out')
     require_writable(folder, folder, 'choose another --out')
+    if args.threads and args.cluster is None:
+        raise InputError('--threads goes with --cluster')
     cells = Cells(folder, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     planned = plan(rows, objects)

@@ -22,6 +22,7 @@ class ReportData:
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
+    preview         n, where each voxel of `volume` and `truth` is the mean of n^3 of the grid that `shape` and `spacing` describe
     error_map       how far off the volume may be, 1/mm (`reconstruction.best.error_map`), not negative, as `volume`; or None
     centre          of the volume, (x, y, z), mm
     views           [n, v, u] rendered held-out views: line integrals ln(I0/I)
@@ -44,6 +45,7 @@ class ReportData:
     spacing: tuple[float, float, float]
     truth: np.ndarray | None = None
     shape: tuple[int, int, int] | None = None
+    preview: int = 1
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     views: np.ndarray | None = None
     views_truth: np.ndarray | None = None
@@ -80,7 +82,8 @@ class ReportData:
             raise InputError('the report needs a volume, or its shape')
         fix('volume', (None,) * 3)
         if self.volume is not None:
-            object.__setattr__(self, 'shape', self.volume.shape)
+            if self.preview == 1:
+                object.__setattr__(self, 'shape', self.volume.shape)
             fix('truth', self.volume.shape)
             fix('error_map', self.volume.shape)
         for name, n in (('spacing', 3), ('centre', 3), ('pixel', 2)):

@@ -89,14 +89,19 @@ def preview(volume: np.ndarray, most: int = MOST_VOXELS) -> tuple[np.ndarray, in
     n = 1
     while volume.size / n**3 > most:
         n += 1
+    return block_means(volume, n), n
+
+
+def block_means(volume: np.ndarray, n: int) -> np.ndarray:
+    """Means of n^3 voxels; voxels left over at the far end are left out. An axis of fewer than n becomes one voxel."""
     if n == 1:
-        return volume, 1
+        return volume
     mean = volume
     for axis, size in enumerate(volume.shape):  # one by one: all at once takes numpy five times as long
         by = min(n, size)
         whole = np.moveaxis(mean, axis, 0)[: size // by * by]
         mean = np.moveaxis(reduce(np.add, (whole[i::by] for i in range(by))), 0, axis) / np.float32(by)
-    return mean, n
+    return mean
 
 
 def _scale(low: float, high: float, bits: int) -> tuple[float, float]:

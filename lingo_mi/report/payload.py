@@ -10,7 +10,7 @@ import numpy as np
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
-from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, preview
+from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, block_means, preview
 from lingo_mi.report.planes import grey_range, planes, richest
 
 MOST_PIXELS = 60 * 256**2  # of all held-out views in a page, each of rendered and measured
@@ -32,7 +32,12 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
         if data.truth is not None:
             volumes['Truth'] = data.truth
         known['slices'] = slices(
-            volumes, data.spacing, data.centre, arrays, 'Truth' if data.truth is not None else None
+            volumes,
+            data.spacing,
+            data.centre,
+            arrays,
+            'Truth' if data.truth is not None else None,
+            of=(data.shape, data.preview),
         )
         if data.error_map is not None:
             known['slices'] |= error_maps({'Error map': data.error_map}, known['slices'], arrays)
@@ -53,10 +58,13 @@ def slices(
     arrays: Arrays,
     reference: str | None = None,
     budget: float = VOLUME_BYTES,
+    of: tuple | None = None,
 ) -> dict:
     """Volumes [x, y, z] on one grid, with one scale, as previews where they would take more than `budget` bytes.
 
+    spacing     of the grid's voxels, and `centre` of the grid, mm
     reference   the volume that the others are compared with
+    of          the grid's shape, and n, where the volumes are means of n^3 of its voxels already
     """
 
     def candidates():
@@ -66,8 +74,9 @@ def slices(
 
     factor, small = _add('volume', candidates(), arrays, budget)
     shown = next(iter(small.values()))
-    old = next(iter(volumes.values())).shape
-    by = [min(factor, n) for n in old]
+    given = next(iter(volumes.values())).shape
+    old, already = of or (given, 1)
+    by = [min(already, n) * min(factor, m) for n, m in zip(old, given)]
     step = [float(s * b) for s, b in zip(spacing, by)]
     # Blocks begin at the first voxel; voxels left over at the far end are not shown.
     middle = [float(c + (n * b - m) * s / 2) for c, n, b, m, s in zip(centre, shown.shape, by, old, spacing)]
@@ -78,7 +87,7 @@ def slices(
         shape=list(shown.shape),
         spacing=step,
         centre=middle,
-        preview=factor,
+        preview=factor * already,
         axes=axes,
         start=start,
         window=[float(x) for x in window],
@@ -94,9 +103,7 @@ def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict
     known   of these volumes, as `slices` gives it
     """
     for i, values in enumerate(maps.values()):
-        small = preview(np.asarray(values, np.float32), MOST_VOXELS)[0]
-        while small.size > np.prod(known['shape']):  # previews have been made smaller
-            small = preview(values, small.size // 8)[0]
+        small = block_means(np.asarray(values, np.float32), known['preview'])
         arrays.add(f'map{i}', small, 0.0, float(small.max()), MAP_BITS)
     return dict(maps=[dict(name=name, array=f'map{i}') for i, name in enumerate(maps)])
 
@@ -132,6 +139,7 @@ def views(
     return dict(
         shape=list(last.shape[::-1]),
         pixel=[float(p * by) for p in pixel],
+        unit='mm',
         total=len(first),
         binning=by,
         angles=[float(np.asarray(angles)[i]) for i in order],

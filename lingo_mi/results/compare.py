@@ -59,9 +59,21 @@ def compare_page(results: list[Stored], truth: Volume | None = None, title: str 
     if len(shown) > 1 and _same_views(list(shown.values())):
         one = next(iter(shown.values()))
         images: dict[str, np.ndarray] = {name: r.views for name, r in shown.items() if r.views is not None}
-        known['views'] = views(images, one.angles, (1.0, 1.0), arrays, next(iter(images)))
+        pixel = _pixel(one.metrics)
+        known['views'] = views(images, one.angles, pixel or (1.0, 1.0), arrays, next(iter(images)))
+        if pixel is None:
+            known['views']['unit'] = 'pixels'
     title = brief(title or ' · '.join(names), 120)
     return template.page(title, f'{len(results)} results side by side', _tables(names, results), '', known, arrays)
+
+
+def _pixel(metrics: dict) -> list[float] | None:
+    """The size of a detector pixel, (v, u), mm; None where a result does not say, as those of earlier versions."""
+    pixel = metrics.get('pixel')
+    known = (
+        isinstance(pixel, list) and len(pixel) == 2 and all(isinstance(p, float) and 0 < p < math.inf for p in pixel)
+    )
+    return pixel if known else None
 
 
 def _names(results: list[Stored]) -> list[str]:
@@ -131,7 +143,7 @@ def _cells(key: str, metrics: list[dict]) -> list[str]:
     for i, value in enumerate(numeric[1:], 1):
         if first is not None and value is not None and value != first:
             texts[i] += f'  ({value - first:+{QUALITY[key].form.lstrip(",")}})'
-    if key not in ('gaussians', 'ipsd_targets') and len(set(known)) > 1:
+    if key not in ('gaussians', 'ipsd_targets', 'parameters') and len(set(known)) > 1:
         best = (min if key in LOWER_IS_BETTER else max)(known)
         texts = [f'★ {text}' if value == best else text for text, value in zip(texts, numeric)]
     return texts

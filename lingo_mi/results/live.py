@@ -148,32 +148,33 @@ class Live:
                 views_angles=np.degrees(snapshot.test.geometry.angles),
             )
         volume = snapshot.volume
-        truth, spacing = None, np.asarray(geometry.dVoxel)
+        truth, blocks = None, 1
         if volume is not None:
-            small, _ = preview(volume, MOST_VOXELS)
+            volume, blocks = preview(volume, MOST_VOXELS)
             if snapshot.measured is not None:
                 given = snapshot.measured[1]
                 if self._truth is None or self._truth[0] is not given:
                     self._truth = given, preview(given, MOST_VOXELS)[0]
                 truth = self._truth[1]
-            spacing = np.asarray(geometry.sVoxel) / small.shape
-            volume = small
-        centres, scales, quaternions, density = snapshot.gaussians
+        cloud: dict[str, Any] = {}
+        if snapshot.model.settings.cloud:
+            centres, scales, quaternions, density = snapshot.gaussians
+            cloud = dict(
+                cloud_centres=centres, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions
+            )
         return ReportData(
             title=self.title,
             metrics={},
             volume=volume,
             truth=truth,
             shape=geometry.nVoxel,
-            spacing=tuple(spacing),
+            spacing=geometry.dVoxel,
             centre=geometry.offOrigin,
+            preview=blocks,
             pixel=geometry.dDetector,
-            cloud_centres=centres,
-            cloud_density=density,
-            cloud_scales=scales,
-            cloud_quaternions=quaternions,
             cloud_unit='opacity' if volume is None else 'density at the centre [1/mm]',
             scanner=geometry,
+            **cloud,
             **held_out,
         )
 

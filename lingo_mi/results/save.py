@@ -36,7 +36,7 @@ from lingo_mi.output_folder import (
 )
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.page import write_report
-from lingo_mi.results.measure import Measured
+from lingo_mi.results.measure import Measured, comparable
 from lingo_mi.results.scene_file import write_scene
 
 
@@ -91,6 +91,7 @@ def save(
         command=command,
         **_corrections(fitted),
         angles=np.degrees(geometry.angles).tolist(),
+        pixel=list(geometry.dDetector),
         test_angles=[] if measured.test is None else np.degrees(measured.test.geometry.angles).tolist(),
         versions=versions(),
         **({} if request is None else dict(request=request)),
@@ -122,7 +123,8 @@ def report_data(fitted: Fitted, measured: Measured, title: str) -> ReportData:
     more: dict = {}
     if test is not None:
         angles = np.degrees(test.geometry.angles)
-        more = dict(views=measured.views, views_truth=test.projections, views_angles=angles)
+        views = None if measured.views is None else comparable(measured.views, test)
+        more = dict(views=views, views_truth=test.projections, views_angles=angles)
     if fitted.settings.cloud:
         centres, scales, quaternions, density = fitted.world_gaussians()
         more |= dict(cloud_centres=centres, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions)

@@ -15,6 +15,7 @@ from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import Volume, read_volume
 from lingo_mi.metrics import current_names
 from lingo_mi.output_folder import METRICS, VIEWS, VOLUME, require_together
+from lingo_mi.scan import values_digest
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,15 @@ class Stored:
     error_map: Volume | None = None
 
 
+def _planned(plan: Path) -> str | None:
+    """The check sum of the volume that a plan of `best` has made, where there is one that says."""
+    try:
+        found = json.loads(plan.read_text(encoding='utf-8'))
+        return found.get('volume')
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
 def read_stored(path: PathLike | str) -> Stored:
     """A result from the folder that `lingo-mi fit` or `Result.save` wrote, or a volume from a file, such as `reconstruct` writes.
 
@@ -48,8 +58,9 @@ def read_stored(path: PathLike | str) -> Stored:
     if path.is_file() or path.name.lower().endswith('.zarr'):
         name = path.name.removesuffix('.gz').removesuffix('.zarr').rsplit('.', 1)[0]
         beside = path.with_name(f'{name}-error{path.name.removeprefix(name)}')
-        error_map = read_volume(beside) if beside.exists() else None
-        return Stored(name, volume=read_volume(path), error_map=error_map)
+        volume = read_volume(path)
+        of_it = beside.exists() and _planned(path.with_name(f'{name}-plan.json')) in (None, values_digest(volume.data))
+        return Stored(name, volume=volume, error_map=read_volume(beside) if of_it else None)
     numbers = path / METRICS
     with reading(path, folder=True):
         if not numbers.exists():

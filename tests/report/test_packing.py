@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lingo_mi.report.packing import Arrays, bits_within, pack, preview
-from lingo_mi.report.payload import slices
+from lingo_mi.report.payload import error_maps, slices
 
 
 def unpacked(packed):
@@ -47,6 +47,26 @@ def test_bits_are_as_many_as_the_budget_allows():
     assert bits_within([noise], 0, 1, 1.05 * sizes[16]) == 16
     assert bits_within([noise], 0, 1, 1.05 * sizes[12]) == 12
     assert bits_within([noise], 0, 1, 0.5 * sizes[8]) is None
+
+
+def test_a_map_of_errors_is_on_the_grid_of_its_volumes():
+    noise, arrays = np.random.default_rng(0).random((51, 51, 51)).astype(np.float32), Arrays()
+    known = slices({'a': noise, 'b': 1 - noise}, (1, 1, 1), (0, 0, 0), arrays, budget=3e4)
+    assert known['preview'] > 1
+    error_maps({'map': noise}, known, arrays)
+    assert list(arrays['map0'].shape) == known['shape']
+
+
+def test_places_of_a_volume_that_is_a_preview_already():
+    shape, spacing, centre = (10, 10, 7), (2.0, 2.0, 3.0), (1.0, 0.0, -1.0)
+    volume = np.random.default_rng(0).random(shape).astype(np.float32)
+    full = slices({'a': volume}, spacing, centre, Arrays())
+    small, by = preview(volume, 100)
+    known = slices({'a': small}, spacing, centre, Arrays(), of=(shape, by))
+    assert known['preview'] == by and known['spacing'] == [by * s for s in spacing]
+    first = [c - (n - 1) / 2 * s for c, n, s in zip(full['centre'], full['shape'], full['spacing'])]  # a voxel's centre
+    block = [c - (n - 1) / 2 * s for c, n, s in zip(known['centre'], known['shape'], known['spacing'])]
+    np.testing.assert_allclose(block, [f + (by - 1) / 2 * s for f, s in zip(first, spacing)])
 
 
 def test_preview_is_the_mean_of_blocks():

@@ -14,6 +14,7 @@ from lingo_mi.files.images import write_exr
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.results.compare import compare_page
 from lingo_mi.results.stored import read_stored
+from lingo_mi.scan import values_digest
 
 COMPARE = Path(__file__).parents[2] / 'scripts' / 'compare.py'
 SHAPE = 12, 10, 8
@@ -42,6 +43,27 @@ def pair(tmp_path):
 def cells(page, name):
     row = re.search(rf'<tr><th scope="row">{re.escape(name)}</th>(.*?)</tr>', page)[1]
     return re.findall('<td class="value">(.*?)</td>', row)
+
+
+def test_places_in_views_are_mm_where_the_pixels_are_known(tmp_path):
+    known = [
+        read_stored(result(tmp_path / name, i, pixel=[0.5, 2.0], parameters=100 * i + 5)) for i, name in enumerate('ab')
+    ]
+    page = compare_page(known)
+    assert '"pixel":[0.5,2.0]' in page and '"unit":"mm"' in page and '★ 105' not in page and '★ 5' not in page
+    unknown = [read_stored(result(tmp_path / name, 0, pixel='wide')) for name in 'cd']
+    assert '"unit":"pixels"' in compare_page(unknown)
+
+
+def test_a_map_of_errors_is_that_of_its_volume(tmp_path):
+    """Not of another that was there before."""
+    volume, plan = np.random.default_rng(0).random(SHAPE).astype(np.float32), tmp_path / 'v-plan.json'
+    for name in ('v', 'v-error'):
+        write_volume(tmp_path / f'{name}.nii.gz', volume, 2.0, None, 'density per mm')
+    plan.write_text(json.dumps(dict(volume=values_digest(volume))))
+    assert read_stored(tmp_path / 'v.nii.gz').error_map is not None
+    plan.write_text(json.dumps(dict(volume=values_digest(2 * volume))))
+    assert read_stored(tmp_path / 'v.nii.gz').error_map is None
 
 
 def test_numbers_and_what_differs(pair):

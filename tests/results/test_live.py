@@ -211,7 +211,8 @@ def snapshot(data, shift=0.0, truth=True):
     rng = np.random.default_rng(0)
     cloud = rng.random((30, 3)), rng.random((30, 3)) + 0.1, rng.normal(0, 1, (30, 4)), rng.random(30)
     measured = (volume, data.volume) if truth else None
-    return SimpleNamespace(test=data.test, views=views, measured=measured, volume=volume, gaussians=cloud)
+    model = SimpleNamespace(settings=SimpleNamespace(cloud=True))
+    return SimpleNamespace(model=model, test=data.test, views=views, measured=measured, volume=volume, gaussians=cloud)
 
 
 def entry(iteration, **more):

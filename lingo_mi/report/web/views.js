@@ -93,7 +93,7 @@ class Views {
       const values = this.panels.map((p) => `${p.name} ${shown(this.value(p, index), this.images[0].array.step)}`);
       const u = (column + 0.5 - columns / 2) * du;
       const v = (row + 0.5 - rows / 2) * dv;
-      this.readout.textContent = `u = ${u.toFixed(1)} mm, v = ${v.toFixed(1)} mm:  ${values.join(',  ')}`;
+      this.readout.textContent = `u = ${u.toFixed(1)} ${this.known.unit}, v = ${v.toFixed(1)} ${this.known.unit}:  ${values.join(',  ')}`;
     });
   }
 
@@ -135,6 +135,6 @@ class Views {
     const [, , columns] = this.known.shape;
     const u = Array.from({ length: columns }, (_, i) => (i + 0.5 - columns / 2) * this.known.pixel[1]);
     const series = this.images.map((v) => u.map((_, i) => valueAt(v.array, this.index(this.at, 0, i))));
-    lineChart(this.chart, 'u [mm]', u, this.images.map((v, i) => ({ name: v.name, values: series[i] })), { height: 260 });
+    lineChart(this.chart, `u [${this.known.unit}]`, u, this.images.map((v, i) => ({ name: v.name, values: series[i] })), { height: 260 });
   }
 }
