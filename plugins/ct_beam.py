@@ -29,7 +29,7 @@ class CTBeam(mi.Emitter):
 
     def aim(self, view: View, reach: float) -> None:
         """Shine at the panel of a `lingo_mi.projectors.view.View`. reach: from how far parallel rays come to what they light."""
-        self.reach = dr.opaque(mi.Float, reach)
+        self.reach: Any = dr.opaque(mi.Float, reach)
         across = dr.cross(view.u, view.v)
         self.parallel, self.size = view.parallel, dr.opaque(mi.Vector2f, (view.width, view.height))
         self.source, self.corner = mi.Vector3f(view.source), mi.Vector3f(view.corner)

@@ -184,7 +184,7 @@ def _plane(scan, air):
     p = scan.projections.astype(float) - air
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     if geometry.mode == 'parallel':
-        known = valid.any(1)
+        known: np.ndarray = np.any(valid, axis=1)
         row = (p * valid).sum(1) / np.maximum(valid.sum(1), 1)
     else:
         middle = nv / 2 - 0.5 + geometry.offDetector[0] / dv
