@@ -6,8 +6,8 @@
     lingo-mi explain walnut_cone.npz --views 30 --with-cloud
 
 Calibrates the views that are kept, adds what was found kind by kind, and compares predictions of the other views with what was
-measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to --out. A row is
-stored when it is done: the same command goes on.
+measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to a folder of --out with
+the name of the scan and of the options. A row is stored when it is done: the same command goes on.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import require_writable
+from lingo_mi.folder_lock import locked
 from lingo_mi.runtime import use_variant
 
 KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
@@ -39,7 +40,9 @@ def arguments() -> argparse.Namespace:
         help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
     )
     p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the recipe's)")
-    p.add_argument('--out', type=Path, default=Path('out/explain'), metavar='D', help='folder of the results')
+    p.add_argument(
+        '--out', type=Path, default=Path('out/explain'), metavar='D', help='where the folder is made (default: out/explain)'
+    )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
 
@@ -61,11 +64,16 @@ def main() -> None:
     if dataset.test is None:
         raise InputError(f'{args.scan}: no view is held out: give fewer --views')
     dataset = binned(dataset, args.binning)
-    if args.with_cloud:
-        settings = {} if args.iterations is None else dict(iterations=args.iterations)
-        found = list(cloud_rows(dataset, args.out, **settings))
-        print(report(found, args.out, 'found with the cloud'))
-        return
-    calibration = find(dataset, KINDS if args.correct is None else args.correct)
-    print('\n'.join(calibration.lines()))
-    print(report(list(rows(dataset, calibration, args.out)), args.out, 'corrected'))
+    kinds = KINDS if args.correct is None else args.correct
+    options = [f'{args.views}_views', *[f'binned_{args.binning}'] * (args.binning > 1)]
+    options += ['with_cloud'] if args.with_cloud else sorted(kinds)
+    folder = args.out / '_'.join([Path(args.scan).stem, *options])
+    with locked(folder):
+        if args.with_cloud:
+            settings = {} if args.iterations is None else dict(iterations=args.iterations)
+            print(report(list(cloud_rows(dataset, folder, **settings)), folder, 'found with the cloud'))
+        else:
+            calibration = find(dataset, kinds)
+            print('\n'.join(calibration.lines()))
+            print(report(list(rows(dataset, calibration, folder)), folder, 'corrected'))
+    print(f'{folder}/: rms.md, rms.json, residuals.png')

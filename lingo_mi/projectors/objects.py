@@ -92,6 +92,12 @@ class Ellipsoids:
         return cloud.line_integrals(self.centre, self.scale, self.rotation, self.density, view, options, primal)
 
 
+def _holds(volume, tensor) -> bool:
+    """Whether a volume of Mitsuba has these values: an albedo may be a grid, too."""
+    data = dict(mi.traverse(volume)).get('data')
+    return data is not None and data.array.index == tensor.array.index
+
+
 class GridInCube:
     """An axis-aligned `cube` with a heterogeneous medium whose extinction is a scalar `gridvolume`."""
 
@@ -101,7 +107,7 @@ class GridInCube:
         tensor = next((v for k, v in params.items() if k.endswith('sigma_t.data')), None)
         if tensor is None or len(tensor.shape) not in (3, 4) or (len(tensor.shape) == 4 and tensor.shape[3] != 1):
             raise InputError(f'{where} must have a gridvolume with one channel as sigma_t')
-        volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and 'GridVolume' in str(node))
+        volume = next(node for node in params.hierarchy if isinstance(node, mi.Volume) and _holds(node, tensor))
         box: Any = volume.bbox()
         cube: Any = shape.bbox()
         if not (

@@ -536,6 +536,17 @@ def test_grid_outside_a_cube():
 
 
 @pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
+def test_an_albedo_may_be_a_grid_of_its_own_place():
+    values, where = np.random.default_rng(0).random((4, 5, 6)), transform().translate([1, 0, 0]).scale(3)
+    plain, scattering = grid(values), grid(values)
+    albedo = grid(np.full((2, 2, 2), 0.5), where)['interior']['sigma_t']
+    scattering['interior']['albedo'] = albedo
+    np.testing.assert_array_equal(*(render(load(dict(thing=thing))) for thing in (plain, scattering)))
+    scattering['interior']['sigma_t'], scattering['interior']['albedo'] = albedo, plain['interior']['sigma_t']
+    with pytest.raises(InputError, match='must fill an axis-aligned cube'):
+        render(load(dict(thing=scattering)))
+
+
 def test_a_grid_turned_by_less_than_can_be_told(size):
     """Ten thousandth parts of its size are, a hundred thousandth part is not."""
     turned = [grid(values_of(), transform().scale(size).rotate([0, 0, 1], angle)) for angle in (5e-4, 0.05)]
