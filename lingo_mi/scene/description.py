@@ -166,7 +166,7 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
 
     if not held_out:
         return geometry(angles), None
-    if 'angles' in props and 'totalAngle' not in props:
+    if 'angles' in props and 'totalAngle' not in props and len(angles):
         start, total = np.degrees(angles.min()), np.degrees(np.ptp(angles))
     drawn = np.sort(total * np.random.default_rng(0).uniform(0, 1, held_out)) + start
     return geometry(angles), geometry(np.radians(drawn))

@@ -321,7 +321,7 @@ def test_moving_scanners_in_scenes(tmp_path):
         rotDetector=np.radians([1, 2, 3]),
     )
     same_poses(sensor.geometry.rays(), Geometry.per_view(**like, angles=angles, height=helix(angles, 30.0)).rays())
-    held_out = np.sort(np.random.default_rng(0).uniform(0, 2 * np.pi, 4))
+    held_out = np.radians(np.sort(np.random.default_rng(0).uniform(-80, 400, 4)))  # between the first and the last
     same_poses(
         sensor.test_geometry.rays(), Geometry.per_view(**like, angles=held_out, height=helix(held_out, 30.0)).rays()
     )
