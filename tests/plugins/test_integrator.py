@@ -535,7 +535,6 @@ def test_grid_outside_a_cube():
     refused('must fill an axis-aligned cube', dict(thing=dict(thing, to_world=transform().scale(0.7))))
 
 
-@pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
 def test_an_albedo_may_be_a_grid_of_its_own_place():
     values, where = np.random.default_rng(0).random((4, 5, 6)), transform().translate([1, 0, 0]).scale(3)
     plain, scattering = grid(values), grid(values)
@@ -547,6 +546,7 @@ def test_an_albedo_may_be_a_grid_of_its_own_place():
         render(load(dict(thing=scattering)))
 
 
+@pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
 def test_a_grid_turned_by_less_than_can_be_told(size):
     """Ten thousandth parts of its size are, a hundred thousandth part is not."""
     turned = [grid(values_of(), transform().scale(size).rotate([0, 0, 1], angle)) for angle in (5e-4, 0.05)]
