@@ -6,8 +6,8 @@
     lingo-mi explain walnut_cone.npz --views 30 --with-cloud
 
 Calibrates the views that are kept, adds what was found kind by kind, and compares predictions of the other views with what was
-measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to a folder of --out with
-the name of the scan and of the options. A row is stored when it is done: the same command goes on.
+measured. Writes rms.md, its provenance, rms.json and residuals.png, the differences in one held-out view, to a folder of --out
+with the name of the scan and of the options. A row is stored when it is done: the same command goes on.
 """
 
 import argparse
@@ -41,7 +41,11 @@ def arguments() -> argparse.Namespace:
     )
     p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the recipe's)")
     p.add_argument(
-        '--out', type=Path, default=Path('out/explain'), metavar='D', help='where the folder is made (default: out/explain)'
+        '--out',
+        type=Path,
+        default=Path('out/explain'),
+        metavar='D',
+        help='where the folder is made (default: out/explain)',
     )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
