@@ -94,7 +94,7 @@ class Ellipsoids:
 
 def _holds(volume, tensor) -> bool:
     """Whether a volume of Mitsuba has these values: an albedo may be a grid, too."""
-    data = dict(mi.traverse(volume)).get('data')
+    data: Any = dict(mi.traverse(volume)).get('data')
     return data is not None and data.array.index == tensor.array.index
 
 
