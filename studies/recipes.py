@@ -98,10 +98,10 @@ class Comparison:
         if path.exists():
             with reading(path):
                 known = json.loads(path.read_text(encoding='utf-8'))
-        if known.setdefault(folder.name, digest) != digest:
+        if folder.exists() and known.get(folder.name, digest) != digest:
             raise InputError(f'{folder}: has the fit of another scene of this name; choose another --out, or remove it')
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(known, indent=1) + '\n')
+        write_text(path, json.dumps(known | {folder.name: digest}, indent=1) + '\n')
 
     def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""

@@ -31,19 +31,23 @@ def times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     known, x = np.abs(own - own[0]), np.sign(turns[0]) * (angles - own[0])
     if known[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
         x = np.mod(x + NEAR, 2 * np.pi) - NEAR
-    elif (
-        x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi
-    ):  # turns are not counted: every view is soon after the one before
-        x, before = np.mod(x + NEAR, 2 * np.pi) - NEAR, -NEAR
-        for i in range(len(x)):
-            x[i] += 2 * np.pi * max(0.0, np.ceil((before - x[i]) / (2 * np.pi)))
-            before = x[i]
+    elif x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi:  # angles that do not count the turns
+        x = _counted(np.mod(x + NEAR, 2 * np.pi) - NEAR)
     step = 2 / (n - 1)
     ends = np.append(known, known[-1] + np.median(np.abs(turns)))
     return np.interp(x, ends, np.append(np.linspace(-1, 1, n), 1 + step))
 
 
+def _counted(angles: np.ndarray) -> np.ndarray:
+    """Angles of views in the order of their time, from [0, 2 pi), with as many turns added as each must have made: the fewest."""
+    out = angles.copy()
+    for i in range(1, len(out)):
+        out[i] += 2 * np.pi * max(0.0, np.ceil((out[i - 1] - out[i]) / (2 * np.pi)))
+    return out
+
+
 def _in_order(angles: np.ndarray) -> bool:
+    """Whether they rise, or fall, from each to the next."""
     turns = np.diff(angles)
     return bool(np.all(turns > 0) or np.all(turns < 0))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from helpers.script import FIT
+from lingo_mi.errors import InputError
 from lingo_mi.studies import recipes as study
 
 METRICS = dict(
@@ -88,6 +89,19 @@ def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypat
 def test_bad_methods(recipes, fits, method):
     code, _, err = recipes('--methods', 'r2', method)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not fits
+
+
+def test_a_scene_of_the_same_name_is_another(tmp_path):
+    comparison, scene = study.Comparison(tmp_path / 'out'), tmp_path / 'a.xml'
+    folder, _ = comparison.plan(scene, 'r2')
+    for text in ('<scene/>', '<scene version="3.0.0"/>'):
+        scene.write_text(text)
+        comparison._require_same_scene(folder, scene)  # there is no fit yet
+    folder.mkdir()
+    comparison._require_same_scene(folder, scene)
+    scene.write_text('<scene/>')
+    with pytest.raises(InputError, match='another scene of this name'):
+        comparison._require_same_scene(folder, scene)
 
 
 def test_results_stored_with_earlier_names_of_the_measures(tmp_path):
