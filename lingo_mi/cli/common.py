@@ -183,6 +183,14 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check_threads(args: argparse.Namespace) -> None:
+    """Raises InputError for --threads below 1, or without --cluster."""
+    if args.threads < 0:
+        raise InputError(f'--threads must be at least 1, not {args.threads}')
+    if args.threads and args.cluster is None:
+        raise InputError('--threads goes with --cluster')
+
+
 @contextmanager
 def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
     """What runs jobs, by the arguments that `cluster_arguments` added: this process, or a cluster, which is open in the block.
@@ -193,11 +201,8 @@ def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
     """
     from lingo_mi.jobs.in_process import InProcess
 
-    if args.threads < 0:
-        raise InputError(f'--threads must be at least 1, not {args.threads}')
+    check_threads(args)
     if args.cluster is None:
-        if args.threads:
-            raise InputError('--threads goes with --cluster')
         yield InProcess()
         return
     from lingo_mi.jobs.cluster import opened

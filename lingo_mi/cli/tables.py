@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.cli.common import Parser, cluster_arguments, runner_of
+from lingo_mi.cli.common import Parser, check_threads, cluster_arguments, runner_of
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, require_writable
 from lingo_mi.fitting.recipes import METHODS, settings_of
@@ -102,8 +102,7 @@ def main() -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f'{folder}: is a file, not a folder; choose another --out')
     require_writable(folder, folder, 'choose another --out')
-    if args.threads and args.cluster is None:
-        raise InputError('--threads goes with --cluster')
+    check_threads(args)
     cells = Cells(folder, scale, args.seed)
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)
     planned = plan(rows, objects)
