@@ -55,7 +55,7 @@ def main() -> int:
     stand_in, outcomes, kernels = Path(shutil.which(args.stand_in) or '').resolve(), {}, []
     names = SHARE if args.share else all_files(args.tests)
     with tempfile.TemporaryDirectory() as folder:
-        cells = CellFiles(args.out or Path(folder), 'outcome', 'kernels', 'commit')
+        cells = CellFiles(args.out or Path(folder), 'outcome', 'kernels', 'code')
         for i, sm in enumerate(args.sm):
             noise = args.noise and i == 0
             title = f'sm_{sm}, noise, checked' if noise else f'sm_{sm}'

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -15,7 +16,6 @@ from pathlib import Path
 
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.cuda.assemble import Kernel, assemble
-from lingo_mi.studies.provenance import commit
 
 # Of every part that computes on the device, what takes few minutes.
 SHARE = (
@@ -33,6 +33,8 @@ SHARE = (
     'test_memory.py',
 )
 WORKERS = 2  # test files at a time: the stand-in runs one thread
+CODE = ('lingo_mi', 'studies', 'plugins', 'scenes', 'scripts', 'examples', 'tests', 'pyproject.toml')
+ANY = 'any'  # the case of cells that hold on every device
 
 
 @dataclass
@@ -79,34 +81,45 @@ def run_tests(
     names      of files in it; they run from the checkout's root
     sm         compute capability times ten
     noise      approximate instructions err by as much as NVIDIA allows, and every address is checked
-    cells      what is done, a file each; a file that it holds is run again only where it had failed, or was of another commit
+    cells      what is done, a file each; a file that it holds is run again only where it had failed, or was of other code
     report     called with a line for every file
+
+    A file whose tests load no kernel runs once for all devices.
     """
-    run, known = f'sm_{sm}_noise' if noise else f'sm_{sm}', set()
+    run, known, now = f'sm_{sm}_noise' if noise else f'sm_{sm}', set(), _code(tests)
     total, kernels = Outcome(), {}
 
     def cell(name):
-        found = cells.get(run, name)
-        if found is None or found['outcome']['failed'] or found['commit'] != commit():
-            outcome, compiled = _run_file(stand_in, tests, name, sm, noise, known)
-            kept = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], commit=commit())
-            cells.put(run, name, kept)
+        start = time.perf_counter()
+        for case in run, ANY:
+            found = cells.get(case, name)
+            if found is not None and found['code'] == now and not found['outcome']['failed']:
+                outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
+                break
         else:
-            outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
+            outcome, compiled, loads = _run_file(stand_in, tests, name, sm, noise, known)
+            kept = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], code=now)
+            cells.put(run if loads else ANY, name, kept)
         known.update(kernel.name for kernel in compiled)  # spares the next files their assembling
-        return name, outcome, compiled
+        return name, outcome, compiled, time.perf_counter() - start
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        for name, outcome, compiled in pool.map(cell, names):
+        for name, outcome, compiled, seconds in pool.map(cell, names):
             total.add(outcome)
             kernels = {kernel.name: kernel for kernel in compiled} | kernels
             counts = f'{outcome.passed} passed, {outcome.skipped.total()} skipped, {len(outcome.failed)} failed'
-            report(f'{run}: {name}: {counts}; kernels: {len(compiled)}')
+            report(f'{run}: {name}: {counts}; kernels: {len(compiled)}; {seconds:.0f} s')
     return total, list(kernels.values())
 
 
+def _code(tests):
+    """What the tests run, as git names it in the last commit of their checkout; empty where there is none."""
+    command = ['git', 'ls-tree', 'HEAD', *CODE]
+    return subprocess.run(command, cwd=tests.resolve().parent, capture_output=True, text=True).stdout
+
+
 def _run_file(stand_in, tests, name, sm, noise, known):
-    """The outcome of a test file, and its kernels beyond those known."""
+    """The outcome of a test file, its kernels beyond those known, and whether it loads any."""
     with tempfile.TemporaryDirectory() as folder:
         result, dump = Path(folder) / 'result.xml', Path(folder) / 'ptx'
         dump.mkdir()
@@ -120,8 +133,9 @@ def _run_file(stand_in, tests, name, sm, noise, known):
         outcome = _read(result) if result.exists() else Outcome(failed=[f'{name}: ended by itself'])
         if done.returncode not in (0, 5) and not outcome.failed:  # 5: there are no tests
             outcome.failed.append(f'{name}: exit code {done.returncode}')
-        modules = [m for m in sorted(dump.glob('*.ptx')) if m.stem not in known]
-        return outcome, [kernel for module in modules for kernel in assemble(module, sm, name)]
+        modules = sorted(dump.glob('*.ptx'))
+        kernels = [kernel for module in modules if module.stem not in known for kernel in assemble(module, sm, name)]
+        return outcome, kernels, bool(modules)
 
 
 def _read(result: Path) -> Outcome:
