@@ -67,6 +67,11 @@ class CTDetector(mi.Film):
         except InputError as error:
             raise InputError(f'ct_detector {props.id()!r}: {error}') from None
         super().__init__(props)
+        if any(self.crop_size()[i] != self.size()[i] for i in (0, 1)):
+            raise InputError(
+                f'ct_detector {props.id()!r}: has no crop window, since blur, gains and noise are of the whole panel; '
+                'crop the image'
+            )
         self.film = mi.load_dict(
             dict(
                 type='hdrfilm',

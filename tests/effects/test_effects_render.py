@@ -312,6 +312,12 @@ def test_one_line_that_names_element_and_place(scene_file, old, new, match):
     assert '\n' not in str(caught.value) and 'scene.xml' in str(caught.value)
 
 
+def test_a_panel_has_no_crop_window():
+    film = detector(width=40, height=30, crop_offset_x=5, crop_offset_y=0, crop_width=20, crop_height=30)
+    with pytest.raises(RuntimeError, match='has no crop window'):
+        load(dict(cloud=ellipsoids(cloud_of())), dict(type='perspective', film=film))
+
+
 @physics
 def test_second_material_of_a_mesh():
     tube = dict(TUBE, material='soft tissue + bone', split='0.3, 0.7')
