@@ -116,7 +116,7 @@ class CTScanner(mi.Sensor):
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
         rays = self.geometry.rays()
-        self.frame = View.of(rays, self.index, *self.geometry.nDetector, panel=False)
+        self.frame = View.of(rays, self.index, *self.geometry.nDetector)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
             np.linalg.norm(rays.corner[self.index])

@@ -5,8 +5,8 @@ With W = diag(1/s) R^T, w = W (p - o), d = W D, m = w.d / |d|^2 and r = w - m d,
     integral = rho sqrt(2 pi) |D| / |d| exp(-|r|^2 / 2),    d ln(integral) = -r . dw + (m r - d / |d|^2) . dd
 
 Independent of the projector: the general form on explicit rays, without footprints, differentiated by hand. Integrals are along
-the whole line. `lingo_mi.studies.oracle` uses finite differences, Gaussian by Gaussian. It also has integrals that end at the
-source or the panel, and explains why both are needed.
+the whole line. `lingo_mi.studies.oracle` uses finite differences, Gaussian by Gaussian. It also has integrals that begin at the
+source, and explains why both are needed.
 """
 
 from __future__ import annotations

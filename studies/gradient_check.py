@@ -104,7 +104,7 @@ def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 
         slope = -slope * np.exp(-np.array(rendered, float)[..., 0].ravel())
     view = view_of(scene.sensors()[0])
     pose = Pose.of_view(view)
-    rays = *pose.rays(), *pose.ends(view.panel)
+    rays = *pose.rays(), pose.begin
 
     def loss(values):
         """That of one Gaussian alone, (centre, scale, quaternion, density)."""

@@ -6,14 +6,14 @@ Along a ray o + t D every term is a Gaussian in t. With w = W(p - o), d = W D an
 rho exp(-1/2 |w - m d|^2) exp(-1/2 |d|^2 (t - m)^2), which integrates to the error function.
 
 Derivatives are finite differences with a five-point stencil. `lingo_mi.studies.closed_form` differentiates by hand instead. Both
-are needed. Only this module has rays that end at a source or a panel, densities at points, and derivatives by the pose. Only
+are needed. Only this module has rays that begin at a source, densities at points, and derivatives by the pose. Only
 `closed_form` has Gaussians too small for finite differences, whole images of thousands of Gaussians, and means over pixels. Each
 is tested against the other.
 
     rng = np.random.default_rng(0)
     rays = geometry.rays()                       # of a lingo_mi.geometry.base.Geometry
     pose = Pose.of(rays, 0, *geometry.nDetector)
-    image = line_integrals(random_cloud(rng, 5), pose, *pose.ends())
+    image = line_integrals(random_cloud(rng, 5), pose)
 """
 
 from __future__ import annotations
@@ -97,9 +97,10 @@ class Pose:
         source, corner, u, v = (np.array(x, float).ravel() for x in (view.source, view.corner, view.u, view.v))
         return Pose(source, corner, u, v, view.height, view.width, view.parallel)
 
-    def ends(self, panel: bool = True) -> tuple[float, float]:
-        """Where integrals begin and end, in t: at the source and, if `panel`, at the panel; those of a parallel beam nowhere."""
-        return (-np.inf, np.inf) if self.parallel else (0.0, 1.0 if panel else np.inf)
+    @property
+    def begin(self) -> float:
+        """Where integrals begin, in t: at a cone beam's source, where t is 0."""
+        return -np.inf if self.parallel else 0.0
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
         """Starts and directions [height * width, 3] through the pixel centres, row by row; t = 1 is on the panel."""
@@ -115,10 +116,8 @@ def whiten(scale: ArrayLike, rotation: ArrayLike, vectors: np.ndarray) -> np.nda
     return vectors @ Rotation.from_quat(rotation).as_matrix() / scale
 
 
-def one_integral(
-    gaussian: tuple, start: np.ndarray, direction: np.ndarray, t0: float = -np.inf, t1: float = np.inf
-) -> np.ndarray:
-    """Line integrals of one Gaussian along rays, for t in [t0, t1], [M].
+def one_integral(gaussian: tuple, start: np.ndarray, direction: np.ndarray, begin: float = -np.inf) -> np.ndarray:
+    """Line integrals of one Gaussian along rays, for t from `begin` on, [M].
 
     gaussian           its centre, scale, rotation and density, as `rows` gives them
     start, direction   [M, 3]
@@ -129,15 +128,15 @@ def one_integral(
     m = (w * d).sum(1) / dd
     nearest = w - m[:, None] * d
     step = np.sqrt(dd / 2)
-    share = 0.5 * (erf((t1 - m) * step) - erf((t0 - m) * step))
+    share = 0.5 * (1 - erf((begin - m) * step))
     length = np.linalg.norm(direction, axis=1)
     return density * np.sqrt(2 * np.pi / dd) * length * np.exp(-0.5 * (nearest**2).sum(1)) * share
 
 
-def line_integrals(cloud: Cloud, pose: Pose, t0: float = -np.inf, t1: float = np.inf) -> np.ndarray:
+def line_integrals(cloud: Cloud, pose: Pose) -> np.ndarray:
     """The image of a cloud, [height * width], row by row."""
     rays = pose.rays()
-    return sum((one_integral(row, *rays, t0, t1) for row in rows(cloud)), np.zeros(pose.height * pose.width))
+    return sum((one_integral(row, *rays, pose.begin) for row in rows(cloud)), np.zeros(pose.height * pose.width))
 
 
 def rows(cloud: Cloud) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
@@ -151,12 +150,10 @@ def derivative(function: Callable[..., Any], step: Any) -> Any:
     return (a - 8 * b + 8 * c - d) / (12 * step)
 
 
-def gradients(
-    cloud: Cloud, pose: Pose, weights: np.ndarray, t0: float = -np.inf, t1: float = np.inf
-) -> dict[str, np.ndarray]:
+def gradients(cloud: Cloud, pose: Pose, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by all parameters: a dict of arrays shaped like the cloud's."""
     rays = pose.rays()
-    return _gradients(cloud, lambda row: (weights * one_integral(row, *rays, t0, t1)).sum())
+    return _gradients(cloud, lambda row: (weights * one_integral(row, *rays, pose.begin)).sum())
 
 
 def values_at(cloud: Cloud, points: np.ndarray) -> np.ndarray:
@@ -198,9 +195,7 @@ def _gradients(cloud, loss, step=1e-3):
     return out
 
 
-def pose_gradients(
-    cloud: Cloud, pose: Pose, weights: np.ndarray, t0: float = -np.inf, t1: float = np.inf
-) -> dict[str, np.ndarray]:
+def pose_gradients(cloud: Cloud, pose: Pose, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by the view's four vectors."""
     smallest = cloud.scale.min()
     reach = dict(source=1, corner=1, u=pose.width, v=pose.height)
@@ -212,8 +207,7 @@ def pose_gradients(
             [
                 derivative(
                     lambda by: (
-                        weights
-                        * line_integrals(cloud, replace(pose, **{name: getattr(pose, name) + by * axis}), t0, t1)
+                        weights * line_integrals(cloud, replace(pose, **{name: getattr(pose, name) + by * axis}))
                     ).sum(),
                     1e-3 * smallest / times,
                 )

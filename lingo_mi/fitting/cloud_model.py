@@ -76,7 +76,7 @@ class CloudModel:
 
         out = np.empty((len(geometry), height, width), np.float32)
         for i in range(len(geometry)):
-            view = View.of(every, i, height, width, panel=False)
+            view = View.of(every, i, height, width)
             image = along(view)[0] if self.signal is None else self.signal.image(along, view, scattered[i])
             out[i] = image.numpy().reshape(height, width)
             if progress:

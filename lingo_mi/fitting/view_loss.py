@@ -55,9 +55,7 @@ class Target:
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)
-        # The object lies between source and panel, so integrals need not end at the panel. If they did, a Gaussian that
-        # grows to the panel would leave the fast path.
-        return Target(View.of(rays, 0, height, width, panel=False), uploaded(pixels), on_device, valid, rays)
+        return Target(View.of(rays, 0, height, width), uploaded(pixels), on_device, valid, rays)
 
     def masked(self, image: Any) -> Any:
         """The image prepared for comparison: weighted, invalid pixels zero (as in `pixels`).
@@ -135,7 +133,6 @@ def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings,
         height=view.height,
         width=view.width,
         parallel=view.parallel,
-        panel=view.panel,
         settings=settings,
         batch=batch,
     )
@@ -144,10 +141,10 @@ def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings,
     return found
 
 
-def _differentiated(*arrays, height, width, parallel, panel, settings, batch):
+def _differentiated(*arrays, height, width, parallel, settings, batch):
     *gaussians, source, corner, u, v, pixels, weights, valid = arrays
     dr.enable_grad(gaussians)
-    target = Target(View(source, corner, u, v, width, height, parallel, panel), pixels, weights, valid)
+    target = Target(View(source, corner, u, v, width, height, parallel), pixels, weights, valid)
     return *differentiate(tuple(gaussians), target, settings, batch), [dr.grad(x) for x in gaussians]
 
 

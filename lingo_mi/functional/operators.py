@@ -79,7 +79,7 @@ def project(
     rays, options = rays[index], RenderOptions(_extent(extent))
 
     def images(*gaussians):
-        views = (View.of(rays, i, height, width, panel=False) for i in range(len(index)))
+        views = (View.of(rays, i, height, width) for i in range(len(index)))
         found = [line_integrals(*gaussians, view=view, options=options) for view in views]
         return found[0] if len(found) == 1 else dr.concat(found)
 

@@ -61,7 +61,7 @@ def _of_inputs(gaussians, view, options, primal):
     if dr.width(gaussians[-1]) == 0:
         raise InputError('the cloud is empty: it needs at least one Gaussian')
     inputs = *gaussians, view.source, view.corner, view.u, view.v
-    settings = dict(panel=_Panel(view.width, view.height, view.parallel, view.panel), options=options)
+    settings = dict(panel=_Panel(view.width, view.height, view.parallel), options=options)
     return dr.custom(_LineIntegrals, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
 
 
@@ -72,14 +72,13 @@ class _Panel:
     width: int
     height: int
     parallel: bool
-    panel: bool
 
     @property
     def pixels(self) -> int:
         return self.width * self.height
 
     def view(self, pose: Sequence) -> View:
-        return View(*pose, width=self.width, height=self.height, parallel=self.parallel, panel=self.panel)
+        return View(*pose, width=self.width, height=self.height, parallel=self.parallel)
 
 
 class _LineIntegrals(dr.CustomOp):
@@ -98,7 +97,7 @@ class _LineIntegrals(dr.CustomOp):
         if (options.footprint == 'affine' or options.area) and dr.width(straddling):
             warnings.warn(
                 AccuracyWarning(
-                    f'{dr.width(straddling)} Gaussians reach to the source or the panel, or lie along rays: of them the '
+                    f'{dr.width(straddling)} Gaussians reach to the source, or lie along rays: of them the '
                     f'integral along the ray through the pixel\'s centre is taken, whatever "pixel" and "footprint" say'
                 ),
                 stacklevel=5,

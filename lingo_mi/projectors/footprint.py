@@ -124,9 +124,6 @@ def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, 
             quad = near * far
             hidden = far <= 0
             straddles = near < 0.01 * far
-            if view.panel:
-                hidden |= near >= dr.abs(plane)
-                straddles |= far > dr.abs(plane)
             sound = dr.isfinite(half + dr.squared_norm(r) + dr.squared_norm(inverse) + rho)
             straddles = straddles & ~hidden | ~sound
             visible = ~hidden & ~straddles

@@ -69,23 +69,20 @@ class MeshPaths:
 
         view   `view.View`; the lengths have its unit
 
-        A mesh behind the source of a cone beam, or behind the panel (if integrals end there), adds nothing. Not
-        differentiable. Raises InputError if the mesh crosses the panel, or the plane of a cone beam's source parallel
-        to the panel.
+        A mesh behind the source of a cone beam adds nothing. Not differentiable. Raises InputError if the mesh crosses the
+        plane of a cone beam's source parallel to the panel.
         """
         with dr.suspend_grad():
             vertices, t, scale = self._project(view)
             if not view.parallel:
                 low, high = dr.min(t)[0], dr.max(t)[0]
-                if high <= 0 or view.panel and low >= 1:
+                if high <= 0:
                     return dr.zeros(mi.Float, view.height * view.width)
                 if low <= NEAR * high:
                     raise InputError(
                         f'the mesh {self.name!r} reaches through the plane of the source, parallel to '
                         'the panel: move the mesh or the source'
                     )
-                if view.panel and high > 1:
-                    raise InputError(f'the mesh {self.name!r} reaches through the panel: move the mesh or the panel')
             return self._draw(vertices, view) * mi.Float(scale) * view.lengths()
 
     @full_float64()

@@ -1,13 +1,12 @@
 r"""Line integrals of single Gaussians along ray segments, pixel by pixel, for Gaussians without a footprint.
 
-If the source is inside or near a Gaussian, or the Gaussian straddles the plane of the source or of the detector, its footprint
-is not an ellipse. The integral must then stop at the ends of the ray o + tD, t in [t0, t1]:
+If the source is inside or near a Gaussian, or the Gaussian straddles the plane of the source, its footprint is not an ellipse.
+The integral must then begin where the ray o + tD does, at t = 0:
 
 .. math::  \rho \frac{|D|}{|d|} \sqrt{\pi/2} \, e^{-\frac12 |w \times d|^2 / |d|^2}
-           \left[ \mathrm{erf}((t_1 - m) |d| / \sqrt2) - \mathrm{erf}((t_0 - m) |d| / \sqrt2) \right], \quad m = w \cdot d / |d|^2
+           \left[ 1 + \mathrm{erf}(m |d| / \sqrt2) \right], \quad m = w \cdot d / |d|^2
 
-A cone beam runs from the source (t0 = 0) to the panel (t1 = 1), or to infinity without a panel. All in float64: these
-Gaussians are few, and each takes a pass over the image anyway.
+All in float64: these Gaussians are few, and each takes a pass over the image anyway.
 """
 
 from __future__ import annotations
@@ -50,7 +49,5 @@ def _integrate(centre: Any, scale: Any, rotation: Any, density: Any, view: View)
     dd = dr.squared_norm(d)
     length = dr.sqrt(dd)
     middle = dr.dot(w, d) / dd
-    k = length * 0.7071067811865476
-    end = dr.erf((1 - middle) * k) if view.panel else 1
     peak = rho * dr.norm(D) / length * dr.exp(-0.5 * dr.squared_norm(dr.cross(w, d)) / dd)
-    return mi.Float(1.2533141373155001 * peak * (end - dr.erf(-middle * k)))
+    return mi.Float(1.2533141373155001 * peak * (1 + dr.erf(middle * length * 0.7071067811865476)))

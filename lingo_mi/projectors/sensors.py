@@ -47,4 +47,4 @@ def view_of(sensor: Any) -> View:
     centre = origin if kind == 'OrthographicCamera' else origin + z_axis
     corner = centre - left * u - top * v
     source = dr.normalize(z_axis) if kind == 'OrthographicCamera' else origin
-    return View(source, corner, u, v, crop_width, crop_height, parallel=kind == 'OrthographicCamera', panel=False)
+    return View(source, corner, u, v, crop_width, crop_height, parallel=kind == 'OrthographicCamera')

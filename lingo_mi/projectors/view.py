@@ -28,9 +28,8 @@ class View:
     source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
     width, height          pixels
     parallel               whether the beam is parallel
-    panel                  whether integrals end at the detector, or continue (a camera, whose image plane only defines
-                           directions; a scan, whose panel may be a virtual one within the object); those of a parallel
-                           beam never end
+
+    Integrals of a cone beam begin at the source. They do not end at the panel, which may be a virtual one within the object.
     """
 
     source: Any
@@ -40,17 +39,15 @@ class View:
     width: int
     height: int
     parallel: bool = False
-    panel: bool = True
 
     @staticmethod
-    def of(rays: Rays, index: int, height: int, width: int, panel: bool = True) -> View:
+    def of(rays: Rays, index: int, height: int, width: int) -> View:
         """View `index` of `lingo_mi.geometry.rays.Rays`."""
         return View(
             *(vector64(a[index]) for a in (rays.source, rays.corner, rays.u, rays.v)),
             width=width,
             height=height,
             parallel=rays.parallel,
-            panel=panel,
         )
 
     def lengths(self) -> Any:

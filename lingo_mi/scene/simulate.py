@@ -111,7 +111,7 @@ def render_objects(objects: Sequence, geometry: Geometry, extent: float = cutoff
             else:
                 rays = geometry.rays()
                 for i in range(len(geometry)):
-                    view = View.of(rays, i, *geometry.nDetector, panel=False)
+                    view = View.of(rays, i, *geometry.nDetector)
                     total[i] += thing.line_integrals(view, RenderOptions(extent)).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
@@ -131,7 +131,7 @@ def render_with(
     rays = geometry.rays()
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
-            view = View.of(rays, i, *geometry.nDetector, panel=False)
+            view = View.of(rays, i, *geometry.nDetector)
             one = replace(effects, index=int(keys[i]))
             expected = one.line_integrals(objects, view, RenderOptions(extent))
             out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])

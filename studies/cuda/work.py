@@ -62,7 +62,7 @@ def main() -> None:
     *vectors, density = (np.asarray(x, np.float32) for x in cloud)
     types = mi.Point3f, mi.Vector3f, mi.Vector4f
     gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
-    view = View.of(geometry.rays(), VIEW, *geometry.nDetector, panel=False)
+    view = View.of(geometry.rays(), VIEW, *geometry.nDetector)
     if part == 'sizes':
         print(json.dumps(sizes(gaussians, view)))
     else:

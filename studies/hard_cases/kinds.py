@@ -18,7 +18,6 @@ class ViewCase:
     """A cloud in one view.
 
     image, gradient   largest errors allowed
-    panel             whether integrals end at the panel
     copies            how often the cloud is there, at the same place
     warned            whether an AccuracyWarning must come with it
     analytic          whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64
@@ -32,7 +31,6 @@ class ViewCase:
     shape: tuple[int, ...]
     image: float = IMAGE
     gradient: float = GRADIENT
-    panel: bool = True
     copies: int = 1
     warned: bool = False
     analytic: bool = False

@@ -90,17 +90,16 @@ def host(value: Any) -> Any:
 
 
 def image_and_gradients(
-    cloud: Cloud, rays: Rays, shape: tuple[int, int], weights: np.ndarray, panel: bool = True, extent: float = EXTENT
+    cloud: Cloud, rays: Rays, shape: tuple[int, int], weights: np.ndarray, extent: float = EXTENT
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """The device's image of a cloud in the first view of `rays`, float64 [pixels], and derivatives of sum(weights * image) by
     name.
 
     shape     of the image, (v, u)
     weights   [pixels]
-    panel     whether integrals end at the panel
     extent    cut-off in standard deviations
     """
-    view, gaussians = View.of(rays, 0, shape[0], shape[1], panel), on_device(cloud)
+    view, gaussians = View.of(rays, 0, shape[0], shape[1]), on_device(cloud)
     dr.enable_grad(gaussians)
     image = line_integrals(*gaussians, view, RenderOptions(extent))
     dr.backward(dr.sum(image * mi.Float(weights.tolist())))
@@ -164,24 +163,23 @@ def measure(case: ViewCase | VoxelCase | ScanCase) -> Result:
 
 def _measure_view(case):
     weights, pose = weights_of(case.shape), Pose.of(case.rays, 0, *case.shape)
-    ends = pose.ends(case.panel)
     many = case.cloud[np.tile(np.arange(len(case.cloud)), case.copies)] if case.copies > 1 else case.cloud
-    image, gradients = image_and_gradients(many, case.rays, case.shape, weights, case.panel)
-    expected, few = _expected_image(case.cloud, pose, *ends)
+    image, gradients = image_and_gradients(many, case.rays, case.shape, weights)
+    expected, few = _expected_image(case.cloud, pose)
     gradients = {name: g[few] for name, g in gradients.items()}
     cloud = case.cloud[few]
     if case.analytic:
         _, truth = rays_and_gradients([getattr(cloud, name) for name in PARAMETERS], *pose.rays(), weights)
     else:
-        truth = oracle.gradients(cloud, pose, weights, *ends)
+        truth = oracle.gradients(cloud, pose, weights)
     return errors(cloud, image, gradients, case.copies * expected, truth)
 
 
-def _expected_image(cloud, pose, *ends):
+def _expected_image(cloud, pose):
     """`oracle.line_integrals`, for large clouds a ray at a time, and the Gaussians of which derivatives are to be compared: as
     those do not depend on the others, of a large cloud the MOST_COMPARED that give most to the image."""
     if len(cloud) <= MOST_COMPARED:
-        return oracle.line_integrals(cloud, pose, *ends), np.arange(len(cloud))
+        return oracle.line_integrals(cloud, pose), np.arange(len(cloud))
     given = np.zeros(len(cloud))
     turn = Rotation.from_quat(cloud.rotation).inv()
     out = []
@@ -189,7 +187,7 @@ def _expected_image(cloud, pose, *ends):
         w, d = turn.apply(cloud.centre - start) / cloud.scale, turn.apply(direction) / cloud.scale
         dd = (d * d).sum(1)
         m = (w * d).sum(1) / dd
-        share = 0.5 * (erf((ends[1] - m) * np.sqrt(dd / 2)) - erf((ends[0] - m) * np.sqrt(dd / 2)))
+        share = 0.5 * (1 - erf((pose.begin - m) * np.sqrt(dd / 2)))
         peak = cloud.density * np.sqrt(2 * np.pi / dd) * np.linalg.norm(direction)
         each = peak * np.exp(-0.5 * ((w - m[:, None] * d) ** 2).sum(1)) * share
         out.append(each.sum())

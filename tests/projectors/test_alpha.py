@@ -103,7 +103,7 @@ def render(c, view):
 def test_values_are_those_of_the_equations(mode, opacity):
     g, c = geometry(mode), cloud(opacity=opacity)
     frames, (height, width) = g.normalised_rays(), g.nDetector
-    found = render(c, View.of(frames, 0, height, width, panel=False))
+    found = render(c, View.of(frames, 0, height, width))
     truth = literal(c, frames, height, width)
     assert truth.max() > 0.3
     # A pixel on the brink of 1/255 may fall to either side.
@@ -115,7 +115,7 @@ def test_values_are_those_of_the_equations(mode, opacity):
 def test_derivatives_are_those_of_differences(mode):
     g, c = geometry(mode), cloud(12, 3, (0.1, 0.9))
     frames, (height, width) = g.normalised_rays(), g.nDetector
-    view = View.of(frames, 0, height, width, panel=False)
+    view = View.of(frames, 0, height, width)
     weight = np.random.default_rng(1).normal(size=(height, width))
     arrays = on_device(c)
     dr.enable_grad(arrays)
@@ -144,7 +144,7 @@ def test_one_gaussian_in_one_tile(width):
     g = replace(geometry('parallel'), nDetector=(1, width), offDetector=(0.0, 0.0 if width % 2 else 9.0))
     arrays = on_device(c)
     dr.enable_grad(arrays)
-    image = composite(flatten(*arrays, View.of(g.normalised_rays(), 0, 1, width, panel=False)), 1, width)
+    image = composite(flatten(*arrays, View.of(g.normalised_rays(), 0, 1, width)), 1, width)
     assert image.numpy()[width // 2 - 1 + width % 2] == pytest.approx(0.35, rel=1e-5)
     dr.backward(dr.max(image))
     assert dr.grad(arrays[3])[0] == pytest.approx(0.7, rel=1e-5)
@@ -154,7 +154,7 @@ def test_one_gaussian_in_one_tile(width):
 def test_nothing_in_view_is_black():
     c = cloud(3)
     c['centre'] = c['centre'] + [0, 0, 50]
-    view = View.of(geometry().normalised_rays(), 0, 22, 37, panel=False)
+    view = View.of(geometry().normalised_rays(), 0, 22, 37)
     arrays = on_device(c)
     dr.enable_grad(arrays)
     image = composite(flatten(*arrays, view), 22, 37)
@@ -163,7 +163,7 @@ def test_nothing_in_view_is_black():
 
 
 def test_results_repeat_to_the_bit(sums_in_order):
-    view = View.of(geometry().normalised_rays(), 0, 22, 37, panel=False)
+    view = View.of(geometry().normalised_rays(), 0, 22, 37)
     grads = []
     for _ in range(3):
         arrays = on_device(cloud(300, 5))

@@ -43,7 +43,7 @@ def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, primal=Tru
         inputs = *(dr.detach(x) for x in gaussians), *(dr.detach(x) for x in (rays.source, rays.corner, rays.u, rays.v))
         leaves = [inputs[i] for i in wanted]
         dr.enable_grad(leaves)
-        rays = View(*inputs[4:], rays.width, rays.height, rays.parallel, rays.panel)
+        rays = View(*inputs[4:], rays.width, rays.height, rays.parallel)
         image = line_integrals(*inputs[:4], rays, RenderOptions(**{'extent': 4.0, **options}), primal)
         weights = mi.Float(np.random.default_rng(1).normal(size=dr.width(image)).astype(np.float32))
         dr.backward(image * (weights if weight is None else weight))
