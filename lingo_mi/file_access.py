@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
 import re
@@ -55,6 +56,19 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
 # What a kill may leave behind. The suffix stays at the end because several libraries choose the format by it.
 _TEMPORARY = '.lingo_mi-{}-{}'
 _LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
+
+
+def read_object(path: PathLike | str) -> dict[str, Any]:
+    """What a JSON file holds by name. Raises InputError where it cannot be read or holds something else."""
+    with reading(path):
+        text = Path(path).read_text(encoding='utf-8', errors='replace')
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(f'{path}: is damaged; remove it, to make it again')
+    return found
 
 
 @contextmanager

@@ -88,7 +88,7 @@ class Scan:
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
 
-        A side of fewer than two new pixels is not binned. Pixels of which one is not valid are not valid.
+        A side of fewer than two new pixels is not binned. Pixels of which one is not valid, or dead, are not valid.
         """
         geometry, by = self.geometry.binned(factor), self.geometry.bins(factor)
         rows, columns = geometry.nDetector
@@ -96,9 +96,11 @@ class Scan:
         def blocks(values):
             return values[:, : rows * by[0], : columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
 
+        known = self.valid if self.effects is None else self.effects.masked(self).valid
         p = blocks(self.projections).mean((2, 4))
-        valid = None if self.valid is None else blocks(self.valid).all((2, 4))
-        return replace(self, geometry=geometry, projections=p, valid=valid)
+        valid = None if known is None else blocks(known).all((2, 4))
+        effects = self.effects and self.effects.binned(by[0] * by[1])
+        return replace(self, geometry=geometry, projections=p, valid=valid, effects=effects)
 
     def digest(self) -> str:
         """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""

@@ -142,7 +142,8 @@ class Study:
 
     dataset   all measured views to choose from, and the true volume, if known
 
-    `compute_missing` raises InputError where the folder has the cells of another scan.
+    `compute_missing` raises InputError where the folder has the cells of another scan, and where there is nothing to compare
+    with. A method that refuses the scan is left out, with a line that says why.
     """
 
     def __init__(self, dataset: Dataset, folder: Path):
@@ -155,11 +156,16 @@ class Study:
         """Compute and store the cells that are missing: of every number of views, every method."""
         methods = list(methods)
         self._require_same_scan()
+        self.reference()
         for count in views:
             chosen = choose_views(self.dataset, count)
             for method in methods:
                 if self.cells.get(_case(count), method) is None:
-                    found = self._compute(chosen, method)
+                    try:
+                        found = self._compute(chosen, method)
+                    except InputError as error:
+                        say(f'{count} views, {method}: left out: {error}')
+                        continue
                     self.cells.put(_case(count), method, found)
                     say(
                         f'{count} views, {method}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '

@@ -28,7 +28,8 @@ def provenance(of: str | None = None) -> dict:
     of   the command line, where it is another process's
 
     command    the command line
-    commit     the commit of the checkout that `lingo_mi` runs from; None where it is installed
+    commit     the commit of the checkout that `lingo_mi` runs from, with '+' where its files have changed; None where it is
+               installed
     date       now, UTC, ISO 8601
     machine    the processor's name
     versions   of Python and of the packages that numbers depend on
@@ -51,14 +52,16 @@ def write_provenance(table: Path) -> Path:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that `lingo_mi` runs from, or None where it runs from no checkout of its own."""
+    """The commit of the checkout that `lingo_mi` runs from, and '+' if its files have changed since; None where it runs from no
+    checkout of its own."""
     if not (ROOT / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
         return None
     try:
         done = subprocess.run(['git', 'rev-parse', 'HEAD'], cwd=ROOT, capture_output=True, text=True)
+        changed = subprocess.run(['git', 'status', '--porcelain', '-uno'], cwd=ROOT, capture_output=True, text=True)
     except OSError:  # there is no git
         return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    return done.stdout.strip() + '+' * bool(changed.stdout.strip()) if done.returncode == 0 else None
 
 
 def machine() -> str:

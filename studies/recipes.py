@@ -19,9 +19,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from urllib.parse import quote
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, replacing, write_text
+from lingo_mi.file_access import read_object, replacing, write_text
 from lingo_mi.fitting.recipes import changes_of, settings_of
 from lingo_mi.metrics import current_names
 from lingo_mi.scene.shipped import scene_path
@@ -86,7 +87,7 @@ class Comparison:
             print(' '.join(command), file=sys.stderr)
             if code := run_command(command):
                 raise InputError(f'{scene}: lingo-mi fit --recipe {method} failed with exit code {code}')
-        found = current_names(json.loads((folder / 'metrics.json').read_text(encoding='utf-8')))
+        found = current_names(read_object(folder / 'metrics.json'))
         return found | dict(history=[current_names(entry) for entry in found['history']])
 
     def _require_same_scene(self, folder: Path, scene: PathLike | str) -> None:
@@ -94,10 +95,8 @@ class Comparison:
             digest = hashlib.sha256(scene_path(scene).read_bytes()).hexdigest()
         except (InputError, OSError):  # the fit will say so
             return
-        path, known = self.folder / 'scenes.json', {}
-        if path.exists():
-            with reading(path):
-                known = json.loads(path.read_text(encoding='utf-8'))
+        path = self.folder / 'scenes.json'
+        known = read_object(path) if path.exists() else {}
         if folder.exists() and known.get(folder.name, digest) != digest:
             raise InputError(f'{folder}: has the fit of another scene of this name; choose another --out, or remove it')
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +108,8 @@ class Comparison:
         changes = [*self.changes, *changes_of(own)]
         if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
             changes.append(f'iterations={self.iterations}')
-        folder = self.folder / '_'.join([Path(scene).stem, str(self.views), name, *changes])
+        parts = [Path(scene).stem, str(self.views), name, *changes]
+        folder = self.folder / quote('_'.join(parts), safe='=,:+ ')  # a value may be a path
         program = [sys.executable, '-m', 'lingo_mi', 'fit', str(scene)]
         options = ['--recipe', name, '--views', str(self.views), '--out', str(folder)]
         return folder, program + options + [word for change in changes for word in ('-D', change)]

@@ -28,6 +28,7 @@ from lingo_mi.scan import Scan
 FIRST, FINE = 32, (32, 48)  # columns of the binned panel: for trials, and for one step each
 MOST_VIEWS = 60
 REACH = 0.06  # of the panel's width: how far off an axis is looked for
+SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
 LONGEST = 4.0  # steps for differences that a number may change by at a time
 SURE = 3.0  # standard errors from which a number is taken for real
 
@@ -169,11 +170,13 @@ def _determined(scan, degree):
 
 def _step(r, D):
     flat = D.reshape(len(D), -1)
-    return -np.linalg.solve(flat @ flat.T, flat @ r.ravel())
+    return -np.linalg.pinv(flat @ flat.T, rcond=SINGULAR, hermitian=True) @ (flat @ r.ravel())
 
 
 def _standard_errors(r, D):
     flat = D.reshape(len(D), -1)
-    inverse = np.linalg.inv(flat @ flat.T)
+    matrix = flat @ flat.T
+    inverse = np.linalg.pinv(matrix, rcond=SINGULAR, hermitian=True)
     g = np.einsum('knvu,nvu->nk', D, r)
-    return np.sqrt(np.diag(inverse @ (g.T @ g) @ inverse))
+    errors = np.sqrt(np.diag(inverse @ (g.T @ g) @ inverse))
+    return np.where(np.diag(matrix @ inverse) > 0.5, errors, np.inf)  # a number without effect is not known

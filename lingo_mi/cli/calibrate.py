@@ -2,6 +2,7 @@
 detector makes of line integrals."""
 
 import argparse
+import warnings
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
@@ -61,9 +62,15 @@ def main() -> None:
         require_writable(args.out.parent, args.out, 'choose another --out')
     use_variant(args.variant)
     from lingo_mi.api.calibration import calibrate
-    from lingo_mi.files.scans import read_scan, write_scan
+    from lingo_mi.files.scans import history_of, read_scan, write_scan
 
-    scan = read_scan(args.scan).train
+    found = read_scan(args.scan)
+    scan = found.train
+    if args.out is not None and (found.test is not None or found.volume is not None):
+        warnings.warn(
+            f'{args.out}: holds the views to fit alone, not the held-out views or the volume of {args.scan}',
+            stacklevel=2,
+        )
     calibration = calibrate(
         scan, drift=args.drift, air=args.air, gain=args.gain, curve=args.curve, scatter=args.scatter
     )
@@ -72,6 +79,8 @@ def main() -> None:
         print('nothing to correct was found')
     if args.out is not None:
         history = dict(calibrated_from=Path(args.scan).name, calibration=calibration.lines())
+        before = history_of(args.scan)
+        history |= {} if before is None else dict(before=before)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_scan(args.out, calibration.corrected(scan), 'npy', history)
         print(args.out)

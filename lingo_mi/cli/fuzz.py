@@ -9,6 +9,7 @@ The exit code is 1 where one fails.
 """
 
 import argparse
+import math
 import sys
 import time
 from pathlib import Path
@@ -45,7 +46,7 @@ def main() -> int:
     if unknown:
         raise InputError(f'--readers {unknown[0]}: is none of {", ".join(NAMES)}')
     cases = args.cases if args.total is None else -(-args.total // len(names))
-    if min(cases, args.processes, args.seconds, args.memory) <= 0:
+    if not all(0 < x < math.inf for x in (cases, args.processes, args.seconds, args.memory)):
         raise InputError('--cases, --total, --processes, --seconds and --memory must be positive')
     memory, start = int(args.memory * 2**30), time.monotonic()
     with Progress('Read', cases * len(names)) as bar:

@@ -8,7 +8,7 @@ the files. One quantity grows at a time, from 64 voxels and 128 pixels a side, 2
 the CPU, user and system, so that other work on the machine does not count. On Linux, and without a GPU.
 
 Takes a few minutes, with --large half an hour. Writes growth.json, growth.md and growth.png to --out. Every stage is stored
-when it is done; the same command goes on with what is missing. Remove growth.json to measure all of it again.
+when it is done; the same command goes on with what is missing, and measures again what another commit or machine has given.
 """
 
 import argparse
@@ -19,8 +19,9 @@ from lingo_mi.cli.common import Parser, docs_arguments, docs_of
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import reading, require_writable, write_text
 from lingo_mi.folder_lock import locked
+from lingo_mi.studies.provenance import commit, machine, write_provenance
 
-KEYS = 'stage', 'axis', 'number', 'seconds', 'peak'
+KEYS = 'stage', 'axis', 'number', 'seconds', 'peak', 'commit', 'machine'
 
 
 def arguments() -> argparse.Namespace:
@@ -32,15 +33,16 @@ def arguments() -> argparse.Namespace:
 
 
 def read(path: Path) -> list[dict]:
-    """Measurements that an earlier run has stored; none where there are none. Raises InputError for another file."""
+    """Measurements of this commit on this machine that an earlier run has stored. Raises InputError for another file."""
     if not path.exists():
         return []
     with reading(path):
         text = path.read_text(encoding='utf-8', errors='replace')
     try:
-        return [{key: row[key] for key in KEYS} for row in json.loads(text)]
+        rows = [{key: row[key] for key in KEYS} for row in json.loads(text)]
     except (ValueError, TypeError, KeyError):
         raise InputError(f'{path}: holds no measurements of this command; remove it, or choose another --out') from None
+    return [row for row in rows if (row['commit'], row['machine']) == (commit(), machine())]
 
 
 def main() -> None:
@@ -54,7 +56,6 @@ def main() -> None:
     from lingo_mi.studies.growth.stages import DEPENDS
     from lingo_mi.studies.growth.sweep import sweep
     from lingo_mi.studies.markdown import check_places, insert_into
-    from lingo_mi.studies.provenance import write_provenance
 
     if document:
         check_places(document, ['growth'])
@@ -63,7 +64,8 @@ def main() -> None:
     with locked(args.out), Progress('Stages', len(DEPENDS)) as bar:
 
         def after(found, others):
-            write_text(stored, json.dumps(found + others, indent=1) + '\n')
+            made = dict(commit=commit(), machine=machine())
+            write_text(stored, json.dumps([row | made for row in found + others], indent=1) + '\n')
             bar.update(len({row['stage'] for row in found}), last=found[-1]['stage'])
 
         found = sweep(args.large, read(stored), after)

@@ -279,6 +279,7 @@ def reconstruct_into(
         with progress_bar(algorithm, scan) as progress:
             found = reconstruct(scan, algorithm, progress=progress, **inputs)
         of = len(scan)
+    measured = len(cloud.geometry if cloud and (algorithm is None or args.complete) else scan)
     found.save(out, force=True)  # `output` has refused to replace a file without --force
     print(
         f'{args.algorithm} of {of} views: {found.seconds:.1f} s'
@@ -292,7 +293,7 @@ def reconstruct_into(
         print(volume_quality(found.metrics(dataset.volume)))
     print(out)
     if args.report is not None:
-        write_page(args.report, found, dataset.volume, args)
+        write_page(args.report, found, measured, dataset.volume, args)
         print(args.report)
     if isinstance(found, Chosen):
         print(found.report())
@@ -301,13 +302,15 @@ def reconstruct_into(
         replace(found, volume=found.error).save(error, force=True)
 
 
-def write_page(path: Path, found: Reconstruction, truth: np.ndarray | None, args: argparse.Namespace) -> None:
-    """Write the page of a reconstruction."""
+def write_page(
+    path: Path, found: Reconstruction, measured: int, truth: np.ndarray | None, args: argparse.Namespace
+) -> None:
+    """Write the page of a reconstruction from `measured` views."""
     geometry = found.geometry
     numbers = found.metrics(truth) if truth is not None else {}
     data = ReportData(
         title=f'{input_name(args)}, {args.algorithm}',
-        metrics=numbers | dict(method=args.algorithm, views=len(geometry), seconds=found.seconds),
+        metrics=numbers | dict(method=args.algorithm, views=measured, seconds=found.seconds),
         volume=found.volume,
         truth=truth,
         spacing=geometry.dVoxel,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 from lingo_mi.errors import InputError
@@ -16,6 +17,7 @@ from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, requir
 # How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
 COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'
 CONTENT = 'content of the geometry'  # in a request
+SCAN = 'content of the scan'
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,34 @@ class Row:
         geometry = Path(self.folder) / self.geometry
         if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
             kept[CONTENT] = hashlib.sha256(geometry.read_bytes()).hexdigest()
+        if path is not None and path.exists():
+            kept[SCAN] = _digest(_files(path))
         return json.loads(json.dumps(kept | dict(bytes=size, settings=settings)))  # as a file has it
+
+
+def _files(path):
+    """All files of a scan: those of a folder, or of an .npy also those beside it with its name, as its geometry and mask."""
+    if path.is_dir():
+        return [file for file in path.rglob('*') if file.is_file()]
+    if path.suffix.lower() != '.npy':
+        return [path]
+    return [file for file in path.parent.iterdir() if file.is_file() and file.name.startswith(path.stem + '.')]
+
+
+def _digest(files):
+    return _digest_of(tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in sorted(files)))
+
+
+@lru_cache(maxsize=1024)
+def _digest_of(files):
+    """Of the contents of (file, size, time of change): a file that has not changed is read once."""
+    found = hashlib.sha256()
+    for file, *_ in files:
+        found.update(f'{file.name}'.encode(errors='surrogateescape'))
+        with open(file, 'rb') as stream:
+            while part := stream.read(2**24):
+                found.update(part)
+    return found.hexdigest()
 
 
 def stored(out: Path, row: Row) -> dict | None:
@@ -93,7 +122,7 @@ def stored(out: Path, row: Row) -> dict | None:
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):
         raise InputError(f'{folder}: holds a result that is none of a list; give another name')
-    known = {CONTENT: wanted[CONTENT]} | asked if CONTENT in wanted else asked  # of older results it is not known
+    known = {k: wanted[k] for k in (CONTENT, SCAN) if k in wanted} | asked  # of older results they are not known
     if changed := [k for k in wanted if known.get(k) != wanted[k]]:
         if changed == ['settings']:
             changed = [k for k, v in wanted['settings'].items() if asked['settings'].get(k) != v]

@@ -43,7 +43,7 @@ class Table:
         """Enter the metrics of a result; those that are no numbers are left out."""
         asked = self._rows[name]
         found = {k: v for k, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)}
-        self._rows[name] = found | asked | dict(status='done', error=None, views=numbers['views'])
+        self._rows[name] = asked | found | dict(status='done', error=None)
 
     def state(self, name: str, status: str, error: str | None = None) -> None:
         self._rows[name] |= dict(status=status, error=error)

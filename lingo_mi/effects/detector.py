@@ -108,6 +108,11 @@ class Detector:
         gain = self.gain if self.saturation and self.corrected else 0.0  # corrected gains still move the saturation
         return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 
+    def binned(self, pixels: int) -> Detector:
+        """The detector of which that many pixels became one: their photons and read-out noise, without dead pixels and gains."""
+        noise = self.electronic_noise * pixels**0.5
+        return replace(self, photons=self.photons * pixels, electronic_noise=noise, dead=0.0, gain=0.0)
+
     @property
     def floor(self) -> float:
         """The smallest transmission that differs from zero in the signal."""

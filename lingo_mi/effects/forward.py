@@ -131,6 +131,10 @@ class Effects:
         known = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
         return replace(scan, valid=known & alive)
 
+    def binned(self, pixels: int) -> Effects:
+        """The effects of a panel of which that many pixels became one, dead ones left out."""
+        return replace(self, detector=self.detector and self.detector.binned(pixels))
+
     def linearised(self, scan: Scan) -> Scan:
         """A scan's line integrals at the reference energy, corrected pixel by pixel; the result has no effects.
 

@@ -46,6 +46,7 @@ from contextlib import ExitStack
 from functools import partial
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -64,6 +65,7 @@ from lingo_mi.files.scanner_dict import (
     to_geometry,
     to_posed,
 )
+from lingo_mi.files.slices import by_number
 from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry, Geometry
@@ -97,6 +99,9 @@ _KEYS = {
     'history',
     *MOTION,
 }
+
+
+MOST_LISTED = 1000  # poses in a geometry file
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
@@ -198,7 +203,8 @@ def _line_integrals(projections, values, where, projections_path):
     return np.log(i0 / projections.astype(float))
 
 
-def _dump_yaml(path, geometry, test=None, **more):
+def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
+    """Writes a geometry file. poses: the name of a file that holds them; None: they are lines of this one."""
     if isinstance(geometry, CircularGeometry) and (test is None or isinstance(test, CircularGeometry)):
         values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
         if test is not None:
@@ -206,7 +212,7 @@ def _dump_yaml(path, geometry, test=None, **more):
     else:
         values = {'mode': geometry.mode}
         values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
-        values['poses'] = astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
+        values['poses'] = poses or astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
         if test is not None:
             values['test_poses'] = astra.to_vectors(test.rays(), test.nDetector).tolist()
     values |= more
@@ -231,6 +237,11 @@ def rows_run_up(values: dict, name: str = 'poses') -> bool:
 
 def _read_npy(path, geometry):
     values = load_yaml(geometry)
+    for name in ('test_angles', 'test_poses'):
+        if values.get(name) is not None:
+            raise InputError(
+                f'{geometry}: {name} goes with a folder of EXR views; an .npy holds the views to fit alone'
+            )
     projections = arrays.load(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
     if valid is not None:
@@ -259,18 +270,22 @@ def _write_npy(path, dataset, history=None):
     if dataset.train.valid is not None:
         more['valid'] = path.stem + '.valid.npy'
         content[path.with_name(more['valid'])] = dataset.train.valid
+    geometry = dataset.train.geometry
+    if len(geometry) > MOST_LISTED and not isinstance(geometry, CircularGeometry):
+        more['poses'] = path.stem + '.poses.npy'
+        content[path.with_name(more['poses'])] = astra.to_vectors(geometry.rays(), geometry.nDetector)
     # An earlier scan stays whole until all of the new one is on the disk.
     with ExitStack() as files:
         for file, values in content.items():
             arrays.write(files.enter_context(replacing(file)), values)
-        _dump_yaml(files.enter_context(replacing(path.with_suffix('.yml'))), dataset.train.geometry, **more)
+        _dump_yaml(files.enter_context(replacing(path.with_suffix('.yml'))), geometry, **more)
 
 
 # ---- EXR folders -------------------------------------------------------------------------------------------
 
 
 def _read_stack(folder):
-    files = sorted(folder.glob('*.exr'))
+    files = sorted(folder.glob('*.exr'), key=by_number)
     if not files:
         raise InputError(f'{folder}: holds no .exr views; give at least one')
     images = [read_exr(file) for file in files]
@@ -367,6 +382,12 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
 
 
 _WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _write_npy}
+
+
+def history_of(path: PathLike | str) -> Any:
+    """What a scan's geometry file says of how it was made; None where it says nothing. Raises InputError as `read_scan` does."""
+    path = Path(path)
+    return load_yaml(_geometry_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
 
 
 def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:

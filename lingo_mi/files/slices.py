@@ -28,16 +28,16 @@ def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Raises InputError where there are none, or they do not make one volume.
     """
     with reading(folder, folder=True):
-        tiffs = sorted((f for f in folder.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=_natural)
+        tiffs = sorted((f for f in folder.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=by_number)
     if tiffs:
         return read_tiff(tiffs), None
     with quiet('pydicom'):
         return _dicom(folder)
 
 
-def _natural(path):
-    """Sorts slice_9 before slice_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
+def by_number(path: Path) -> list:
+    """A key that sorts slice_9 before slice_10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name.lower())]
 
 
 def require_chain(path: Path) -> None:

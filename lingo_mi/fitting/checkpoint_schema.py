@@ -149,7 +149,7 @@ def _require_plain(extra: Any) -> Settings:
         raise InputError(f'its version is {shown(version)}, but this program reads {VERSION}')
     for name, (wanted, good) in _PLAIN.items():
         if name not in extra:
-            if 'version' not in extra and name in ('unit', 'effects'):
+            if name == 'moments' or 'version' not in extra and name in ('unit', 'effects'):
                 continue
             raise InputError(f'{name} is missing')
         if not good(extra[name]):
@@ -194,6 +194,10 @@ def _is_rng(value: Any) -> bool:
         and _count(value['has_uint32'], 0, 1)
         and _count(value['uinteger'], 0, 2**32 - 1)
     )
+
+
+def _is_moments(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
 
 
 def _is_history(value: Any) -> bool:
@@ -243,6 +247,7 @@ _PLAIN = {
     'views': ('a whole number from 1 on', lambda value: _count(value, 1)),
     'scanner': ('the numbers of a ct_scanner', _is_scanner),
     'signal': ('a number', _number),
+    'moments': ('three numbers', _is_moments),
 }
 
 

@@ -17,7 +17,7 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model, stepper_of
 from lingo_mi.fitting.measured import modelled_effects
-from lingo_mi.fitting.resume import require_same_fit
+from lingo_mi.fitting.resume import moments, require_same_fit
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.stopping import Search
 from lingo_mi.lingo.initialise import InitialCloud
@@ -61,7 +61,12 @@ def run(
     search = Search(scan, given) if settings.stopping.stop == 'on' else None
     rng = np.random.default_rng(seed)
     average = Average(settings.adam.average)
-    scanned = dict(views=len(scan), scanner=describe(scan.geometry), signal=float(scan.projections.mean(dtype=float)))
+    scanned = dict(
+        views=len(scan),
+        scanner=describe(scan.geometry),
+        signal=float(scan.projections.mean(dtype=float)),
+        moments=moments(scan.projections),
+    )
     if isinstance(begin, Path):
         host, extra, arrays = checkpoint.load(begin)
         modelled = modelled_effects(scan, settings)

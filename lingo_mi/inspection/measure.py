@@ -50,6 +50,8 @@ def look(scan: Scan) -> Findings:
         + f'; {1 - valid.mean():.2%} of the pixels are left out'
     )
     top = float(np.percentile(p[valid], 99.5))
+    if -np.percentile(p[valid], 0.5) > 2 * max(top, 0):
+        found.advice.append('line integrals are negative: they look like ln(I / I0); give -ln(I / I0)')
     _air_and_truncation(found, p, valid, top)
     photons = photons_of_images(p, scan.valid)
     if np.isfinite(photons) and photons < 1e8:
@@ -217,7 +219,10 @@ def _angles(found, scan, air):
     """Unit and sense of the angles, the axis, and views out of order."""
     geometry, n = scan.geometry, len(scan)
     if n >= 4 and isinstance(geometry, CircularGeometry):
-        turn = np.ptp(geometry.angles) * n / (n - 1)
+        span = np.ptp(geometry.angles)
+        if span <= 2 * np.pi:  # those of poses jump from pi to -pi
+            span = min(span, np.ptp(np.unwrap(geometry.angles)))
+        turn = span * n / (n - 1)
         found.facts.append(f'angles: {np.degrees(turn):.4g} degrees in all')
         for whole in (np.pi, 2 * np.pi):
             if abs(np.degrees(turn) / whole - 1) < 0.02:

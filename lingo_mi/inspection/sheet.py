@@ -18,19 +18,20 @@ def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
     figure = Figure(figsize=(13, 6.4), layout='constrained')
     FigureCanvasAgg(figure)
     _geometry(figure.add_subplot(2, 4, (1, 6), projection='3d'), scan)
-    high = np.percentile(scan.projections, 99.8)
+    low = min(0.0, float(np.percentile(scan.projections, 0.2)))
+    high = max(float(np.percentile(scan.projections, 99.8)), low + 1e-9)
     (nv, nu), (dv, du) = scan.geometry.nDetector, scan.geometry.dDetector
     aspect = 'auto' if nv < nu / 8 else dv / du  # a row of a fan beam would be a line
     for place, i in zip((3, 4, 7), np.linspace(0, len(scan) - 1, 3).astype(int)):
         axes = figure.add_subplot(2, 4, place)
-        axes.imshow(scan.projections[i], cmap='gray', vmin=0, vmax=high, aspect=aspect)
+        axes.imshow(scan.projections[i], cmap='gray', vmin=low, vmax=high, aspect=aspect)
         axes.set_title(f'view {i}', fontsize=10)
         axes.set(xticks=[], yticks=[])
     axes = figure.add_subplot(2, 4, 8)
     axes.plot(found.mass, '.-', color='#1f77b4', markersize=4, linewidth=0.8)
     axes.plot(found.suspects, found.mass[found.suspects], 'o', color='#d1495b', fillstyle='none')
     axes.set_title('mean line integral of a view', fontsize=10)
-    axes.set(xlabel='view', ylim=(0, 1.2 * max(found.mass.max(), 1e-9)))
+    axes.set(xlabel='view', ylim=(1.2 * min(found.mass.min(), 0), 1.2 * max(found.mass.max(), 1e-9)))
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=100, format='png')
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -13,7 +12,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import one_line, optional, reading
 from lingo_mi.files import arrays
-from lingo_mi.files.slices import read_tiff_file, require_chain
+from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
 
 RTK = '.his', '.hnd', '.hnc', '.xim'  # of Elekta's and Varian's scanners, one frame a file
 IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'} | dict.fromkeys(RTK, 'itk')
@@ -103,12 +102,8 @@ def open_recording(path: PathLike | str) -> Recording:
     )
 
 
-def _natural(path):
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name.lower())]
-
-
 def _folder(path):
-    files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGES), key=_natural)
+    files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGES), key=by_number)
     if not files:
         raise InputError(f'{path}: holds no {", ".join(IMAGES)} images; give the folder of the frames')
     first = _checked(path, lambda: _image(files[0]))
@@ -142,30 +137,25 @@ def _image(path):
 
 
 def _image_stack(path):
-    frame, count = (_edf_frame, _edf_count) if path.suffix.lower() == '.edf' else (_tiff_frame, _tiff_count)
-    n = _checked(path, lambda: count(path))
-    first = _checked(path, lambda: frame(path, 0))
-    return Frames(str(path), n, first.shape, first.dtype, lambda i: frame(path, i))
+    count, frame = _checked(path, lambda: (_edf if path.suffix.lower() == '.edf' else _tiff)(path))
+    first = _checked(path, lambda: frame(0))
+    return Frames(str(path), count, first.shape, first.dtype, frame)
 
 
-def _edf_frame(path, i):
-    with optional('fabio').open(str(path)) as file:
-        return np.asarray(file.get_frame(i).data)
+def _edf(path):
+    file = optional('fabio').open(str(path))
+    return file.nframes, lambda i: np.asarray(file.get_frame(i).data)
 
 
-def _edf_count(path):
-    with optional('fabio').open(str(path)) as file:
-        return file.nframes
-
-
-def _tiff_frame(path, i):
-    return optional('tifffile').imread(path, key=i)
-
-
-def _tiff_count(path):
+def _tiff(path):
     require_chain(path)
-    with optional('tifffile').TiffFile(path) as file:
-        return len(file.pages)
+    tifffile = optional('tifffile')
+    file = tifffile.TiffFile(path)
+    whole = file.series[0]
+    if len(file.pages) == 1 and whole.ndim == 3 and whole.axes.endswith('YX'):  # as ImageJ writes more than 4 GB
+        stack = tifffile.memmap(path, mode='r')
+        return len(stack), lambda i: stack[i]
+    return len(file.pages), lambda i: file.pages[i].asarray()
 
 
 def _array(path):
@@ -217,16 +207,18 @@ def _hdf5(path):
         raise InputError(f'{path}: is neither DXchange (/exchange/data) nor NXtomo (instrument/detector/data)')
     detector = entry['instrument/detector']
     every = stack(detector['data'])
-    key = np.asarray(detector['image_key'], int) if 'image_key' in detector else np.zeros(len(every), int)
+    # ESRF's image_key_control also tells alignment frames (-1), which image_key takes for views.
+    name = 'image_key_control' if 'image_key_control' in detector else 'image_key'
+    key = np.asarray(detector[name], int) if name in detector else np.zeros(len(every), int)
     if key.shape != (len(every),):
-        raise InputError(f'{path}: image_key has {key.size} entries for {len(every)} frames; these must agree')
+        raise InputError(f'{path}: {name} has {key.size} entries for {len(every)} frames; these must agree')
 
     def of(kind):
         return every.subset(np.flatnonzero(key == kind)) if (key == kind).any() else None
 
     views = of(0)
     if views is None:
-        raise InputError(f'{path}: image_key marks no projection (0); nothing can be imported')
+        raise InputError(f'{path}: {name} marks no projection (0); nothing can be imported')
     angles = None
     if 'sample/rotation_angle' in entry:
         data = entry['sample/rotation_angle']
@@ -246,5 +238,5 @@ def _nxtomo(file):
 
 
 def _unit(data):
-    unit = data.attrs.get('units', 'degree')
+    unit = np.ravel(data.attrs.get('units', 'degree'))[0]  # also of an array of one
     return (unit.decode() if isinstance(unit, bytes) else str(unit)).lower()

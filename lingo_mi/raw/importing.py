@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import warnings
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -14,6 +15,8 @@ from lingo_mi.errors import InputError
 from lingo_mi.files import scanner_dict
 from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
 from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.memory import require_room
+from lingo_mi.parsing import checked, whole
 from lingo_mi.progress import Progress
 from lingo_mi.raw.frames import Frames, open_recording
 from lingo_mi.raw.line_integrals import fields, line_integrals, photons_of_images
@@ -54,6 +57,21 @@ class Options:
     angles: Any = None
     pixel: float | None = None
 
+    def __post_init__(self):
+        """Raises InputError for values of another kind; those that depend on the frames are checked with them."""
+        for name in 'percentile', 'i0', 'saturation', 'pixel':
+            if getattr(self, name) is not None:
+                checked(name, getattr(self, name), 0.0)
+        whole('binning', self.binning, 1)
+        try:
+            first, end, step = (0, None, 1) if self.views is None else self.views
+            for value in (first, 0 if end is None else end, step):
+                operator.index(value)
+        except (TypeError, ValueError):
+            raise InputError(
+                f'views must be (first, end, step), the end a number or None, not {self.views!r}'
+            ) from None
+
 
 def import_raw(
     path: PathLike | str, geometry: PathLike | str | Geometry, options: Options, progress: bool = True
@@ -88,14 +106,14 @@ def import_raw(
         raise InputError(f'the percentile of air must be above 0 and at most 100, not {options.percentile:g}')
     chosen = _chosen(options.views, n)
     exposure = _exposure(options.exposure, n)
-    panel = fields(views.shape, flats, darks)
-    if flats is None and i0 is not None:
-        panel = replace(panel, flat=np.full(views.shape, float(i0)))
-    elif flats is not None and i0 is not None:
+    if flats is not None and i0 is not None:
         raise InputError('flats and i0 both say the unattenuated beam; give one of them')
     limit = options.saturation
     if limit is None:
         limit = np.iinfo(views.dtype).max if views.dtype.kind in 'ui' else np.inf
+    panel = fields(views.shape, flats, darks, limit)
+    if flats is None and i0 is not None:
+        panel = replace(panel, flat=np.full(views.shape, float(i0)))
 
     v0, v1, u0, u1 = crop
     (nv, nu), rows, columns = views.shape, (v0, v1), (u0, u1)
@@ -110,6 +128,7 @@ def import_raw(
     out = out.binned(options.binning).subset(chosen)
     if not _grid_given(geometry):
         out = _own_grid(out)
+    require_room(5 * len(chosen) * float(np.prod(out.nDetector)), path)
     p = np.zeros((len(chosen), *out.nDetector), np.float32)
     valid = np.zeros(p.shape, bool)
     levels, black, above = np.ones(len(chosen)), [], []
@@ -239,7 +258,10 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
     angles = recorded
     if options.angles is not None:
         listed = isinstance(options.angles, str | PathLike)
-        angles = read_numbers(options.angles) if listed else np.asarray(options.angles, float)
+        try:
+            angles = read_numbers(options.angles) if listed else np.asarray(options.angles, float)
+        except (TypeError, ValueError):
+            raise InputError('angles must be a list of numbers, in degrees, or the name of a file of them') from None
     if angles is not None and len(angles) != n:
         raise InputError(f'{frames.where}: there are {len(angles)} angles for {n} views; these must agree')
     if isinstance(source, Geometry):
@@ -263,6 +285,11 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
         values, white = read_xtekct(path)
     elif suffix in ('.yml', '.yaml'):
         values = load_yaml(path)
+        for name, wrong in dict(valid=True, I0=True, input=values.get('input') == 'intensity').items():
+            if wrong and values.get(name) is not None:
+                raise InputError(
+                    f'{path}: {name} describes projections, not raw frames; take it out, and give --flats, --i0 or --air'
+                )
     else:
         raise InputError(f'{path}: is no geometry file; give .yml, .xtekct or .xml (RTK)')
     values.setdefault('nDetector', list(shape))
@@ -300,7 +327,19 @@ def _placed(geometry: Geometry, crop) -> Geometry:
 
 
 def _own_grid(geometry: Geometry) -> Geometry:
-    """Voxels as large as a pixel on the axis, as many as the panel sees."""
-    (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
-    by = 1.0 if geometry.mode == 'parallel' else geometry.DSO / geometry.DSD
-    return geometry.with_volume((nu, nu, nv), (du * by, du * by, dv * by))
+    """Voxels as large as a pixel on the axis, around it, as far as the panel sees; without an offOrigin as high as its rows."""
+    (nv, nu), step = geometry.nDetector, geometry.dDetector[1]
+    if geometry.mode == 'cone':
+        step *= geometry.DSO / geometry.DSD
+    rays = geometry.rays()
+    across = np.cross(rays.u, rays.v)
+    corners = np.stack([rays.corner + x * rays.u + y * rays.v for x in (0, nu) for y in (0, nv)])
+    start, along = (corners, rays.source) if rays.parallel else (rays.source, corners - rays.source)
+    # Where they meet the plane through the origin that is parallel to the panel.
+    seen = start - along * ((start * across).sum(-1) / (along * across).sum(-1))[..., None]
+    low, high = seen[..., 2].min(), seen[..., 2].max()
+    if any(geometry.offOrigin):
+        low, high = -(high - low) / 2, (high - low) / 2
+    side, height = (max(1, int(np.ceil(x / step - 1e-6))) for x in (2 * np.hypot(*seen[..., :2].T).max(), high - low))
+    middle = geometry.offOrigin if any(geometry.offOrigin) else (0.0, 0.0, (low + high) / 2)
+    return replace(geometry, nVoxel=(side, side, height), dVoxel=(step,) * 3, offOrigin=middle)

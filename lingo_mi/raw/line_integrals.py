@@ -17,6 +17,7 @@ from lingo_mi.raw.frames import Frames
 
 DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
 DIFFERENCE = (1, -4, 6, -4, 1)
+MOST_VIEWS = 64  # of which noise is measured
 HOT = 0.05  # and one whose dark count is that part of the flat's counts off its neighbours'
 
 
@@ -36,11 +37,12 @@ class Fields:
     photons: float | None
 
 
-def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None) -> Fields:
+def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, saturation: float = np.inf) -> Fields:
     """The mean dark and flat field, the pixels that are good, and the photons of a pixel.
 
     Photons are those of a Poisson signal of the same scatter: mean^2 / variance of a pixel over the flats, each divided by its
-    brightness first. Raises InputError where a panel has another size than `shape`, or the flats are no brighter than dark.
+    brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good. Raises InputError where a panel has
+    another size than `shape`, or the flats are no brighter than dark.
     """
     for name, frames in (('flats', flats), ('darks', darks)):
         if frames is not None and frames.shape != shape:
@@ -58,8 +60,9 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None) -
     total, square = np.zeros(shape), np.zeros(shape)
     bright = np.zeros(len(flats))
     for i in range(len(flats)):
-        frame = flats[i] - dark
-        good &= np.isfinite(frame)
+        counts = flats[i]
+        frame = counts - dark
+        good &= np.isfinite(frame) & (counts < saturation)
         bright[i] = np.median(frame[np.isfinite(frame)]) if np.isfinite(frame).any() else 0.0
         if not bright[i] > 0:
             raise InputError(
@@ -116,9 +119,11 @@ def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) 
     """Photons a pixel before the object, from how line integrals [view, v, u] scatter from column to column.
 
     The variance of a line integral p is exp(p) / photons. Fourth differences along rows remove what is smooth, their median
-    what has edges. Pixels that a detector's blur correlates look less noisy, so this is then too many. inf without noise.
+    what has edges. Of many views, MOST_VIEWS are measured. Pixels that a detector's blur correlates look less noisy, so this is
+    then too many. inf without noise.
     """
-    p = np.asarray(projections, np.float64)
+    some = np.unique(np.linspace(0, len(projections) - 1, MOST_VIEWS).astype(int))
+    p = np.asarray(projections[some], np.float64)
     n = p.shape[-1] - len(DIFFERENCE) + 1
     if n < 1:
         return np.inf
@@ -127,7 +132,7 @@ def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) 
     power = sum(w**2 * np.exp(p[..., part]) for w, part in parts)
     scaled = np.abs(difference) / np.sqrt(power)
     if valid is not None:
-        scaled = scaled[np.logical_and.reduce([valid[..., part] for _, part in parts])]
+        scaled = scaled[np.logical_and.reduce([valid[some][..., part] for _, part in parts])]
     scaled = scaled[scaled > 0]  # where all are exactly alike there was nothing to count
     sigma = 1.4826 * np.median(scaled) if scaled.size else 0.0
     return float(1 / sigma**2) if sigma > 0 else np.inf

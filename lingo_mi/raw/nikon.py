@@ -47,7 +47,11 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
     if n < 1 or not DSD >= DSO > 0:
         raise InputError(f'{path}: needs Projections >= 1 and SrcToDetector >= SrcToObject > 0')
     top, bottom = number('CentreOfRotationTop', 0), number('CentreOfRotationBottom', 0)
-    unread = [name for name in ('DetectorOffsetX', 'DetectorOffsetY', 'ObjectTilt', 'ObjectRoll') if number(name, 0)]
+    unread = [
+        name
+        for name in ('DetectorOffsetX', 'DetectorOffsetY', 'ObjectOffsetX', 'ObjectTilt', 'ObjectRoll')
+        if number(name, 0)
+    ]
     if top != bottom:
         unread.append('the slope between CentreOfRotationTop and CentreOfRotationBottom')
     if unread:

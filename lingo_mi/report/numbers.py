@@ -71,8 +71,8 @@ QUALITY = {
     ),
 }  # fmt: skip
 SETTINGS = {
-    'method': Number('Method', '', '', 'The recipe of settings that the fit began from.'),
-    'views': Number('Views used', '', '', 'Projections that the fit has seen.'),
+    'method': Number('Method', '', '', 'The recipe of a fit, or the algorithm of a reconstruction.'),
+    'views': Number('Views used', '', '', 'Measured projections that the result was made of.'),
     'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
     'stopping': Number(
         'Early stop', '', '', 'Views that were held out told after which step more of them no longer helped.'

@@ -45,6 +45,11 @@ def compare_page(results: list[Stored], truth: Volume | None = None, title: str 
                     f'{name}: has {_grid(volume)}, but {next(iter(volumes))} has {_grid(first)}: results that are compared '
                     'need one grid; fit or reconstruct again with the same scanner'
                 )
+            if name != 'Truth' and not np.allclose(volume.affine, first.affine, atol=0.01 * max(first.spacing)):
+                raise InputError(
+                    f'{name}: its voxels lie elsewhere than those of {next(iter(volumes))}: results that are compared need '
+                    'one grid; fit or reconstruct again with the same scanner'
+                )
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]
         data = {name: volume.data for name, volume in volumes.items()}
         known['slices'] = slices(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)

@@ -18,6 +18,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
+from lingo_mi.studies.benchmarks.rtk_bridge import require_every_pixel
 
 
 def model(geometry: Geometry, mbirjax: Any) -> Any:
@@ -48,6 +49,7 @@ def reconstruct(scan: Scan, mbirjax: Any, **settings: Any) -> np.ndarray:
 
     settings   of its model, such as sharpness=1.0
     """
+    require_every_pixel(scan, 'MBIRJAX')
     made = model(scan.geometry, mbirjax)
     made.set_params(**settings)
     found, _ = made.recon(np.ascontiguousarray(scan.projections, np.float32), print_logs=False, logfile_path=None)

@@ -18,13 +18,19 @@ from lingo_mi.scan import Scan
 
 
 def gantry(geometry: Geometry, itk: Any) -> Any:
-    """RTK's geometry object. Raises InputError for a scan that is not on a circle."""
-    if not isinstance(geometry, CircularGeometry):
-        raise InputError('RTK is compared with on circles only; this scan has other poses')
+    """RTK's geometry object. Raises InputError for a scan that is not one of a cone beam on a circle."""
+    if not isinstance(geometry, CircularGeometry) or geometry.mode != 'cone':
+        raise InputError('RTK is compared with on circles of a cone beam only')
     out = itk.RTK.ThreeDCircularProjectionGeometry.New()
     for angle in np.degrees(geometry.angles):
         out.AddProjection(geometry.DSO, geometry.DSD, float(angle), geometry.offDetector[1], geometry.offDetector[0])
     return out
+
+
+def require_every_pixel(scan: Scan, program: str) -> None:
+    """Raises InputError for a scan with pixels that are not valid: the program would take them for air."""
+    if scan.valid is not None:
+        raise InputError(f'{program} is compared with on scans of which every pixel is valid only')
 
 
 def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any) -> Any:
@@ -57,6 +63,7 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     kind       'FDK', 'SART' or 'ConjugateGradient'
     settings   arguments of the filter's Set... methods, such as NumberOfIterations=1
     """
+    require_every_pixel(scan, 'RTK')
     image = itk.Image[itk.F, 3]
     geometry = scan.geometry
     cls = getattr(itk.RTK, kind + 'ConeBeamReconstructionFilter')
@@ -79,6 +86,7 @@ def total_variation(scan: Scan, itk: Any, beta: float, alpha: float = 0.1, niter
     beta    weight of the split gradient: the smaller, the faster it converges, until it diverges, from few views sooner
     niter   outer iterations, with ten conjugate gradients each
     """
+    require_every_pixel(scan, 'RTK')
     geometry = scan.geometry
     solver = itk.RTK.ADMMTotalVariationConeBeamReconstructionFilter[itk.Image[itk.F, 3]].New()
     solver.SetInput(0, volume_image(np.zeros(geometry.nVoxel), geometry, itk))

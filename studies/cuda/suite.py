@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import subprocess
 import sys
@@ -113,9 +114,12 @@ def run_tests(
 
 
 def _code(tests):
-    """What the tests run, as git names it in the last commit of their checkout; empty where there is none."""
-    command = ['git', 'ls-tree', 'HEAD', *CODE]
-    return subprocess.run(command, cwd=tests.resolve().parent, capture_output=True, text=True).stdout
+    """A digest of what the tests run: of all files of the checkout but documents."""
+    root, digest = tests.resolve().parent, hashlib.sha256()
+    for file in sorted(f for name in CODE for f in [root / name, *(root / name).rglob('*')] if f.is_file()):
+        if '__pycache__' not in file.parts:
+            digest.update(f'{file.relative_to(root)}'.encode() + b'\0' + file.read_bytes())
+    return digest.hexdigest()
 
 
 def _run_file(stand_in, tests, name, sm, noise, known):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.file_access import replacing, write_text
+from lingo_mi.file_access import read_object, replacing, write_text
 from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
 from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS
 from lingo_mi.studies.markdown import insert_into, table
@@ -37,7 +37,7 @@ def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | 
         for name, result in found.items()
     }
     path = folder / 'effects.json'
-    known = (json.loads(path.read_text(encoding='utf-8')) if path.exists() else {}) | numbers
+    known = (read_object(path) if path.exists() else {}) | numbers
     numbers = {name: known[name] for name in EXPERIMENTS if name in known}
     write_text(path, json.dumps(numbers, indent=1) + '\n')
     text = make_table(numbers)

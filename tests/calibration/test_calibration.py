@@ -221,3 +221,14 @@ def test_bad_input():
         lm.calibrate(scan, air='smooth')
     with pytest.raises(lm.InputError, match='zero everywhere'):
         lm.calibrate(lm.Scan(geometry, np.zeros_like(scan.projections)))
+
+
+def test_a_drift_that_no_view_shows_is_not_found():
+    """A rod along the axis looks the same however high the panel is."""
+    geometry = lm.Geometry.parallel(
+        nDetector=(16, 32), dDetector=1.0, nVoxel=(24, 24, 24), dVoxel=1.0, angles=circular(24)
+    )
+    x, y = np.meshgrid(*2 * [np.arange(24) - 11.5], indexing='ij')
+    rod = ((np.hypot(x - 2, y + 1) < 6) * 0.02)[:, :, None] * np.ones(24)
+    calibration = lm.calibrate(lm.Scan(geometry, grid.project(rod, geometry)), drift=3, progress=False)
+    assert not any(np.abs(calibration.found.drift.panel(geometry).v).ravel() > 0)

@@ -7,7 +7,7 @@ import pytest
 
 import lingo_mi as lm
 from lingo_mi.cli import calibrate
-from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.files.scans import history_of, read_scan, write_scan
 from lingo_mi.geometry import circular
 
 
@@ -37,6 +37,17 @@ def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
     assert mended.geometry.offDetector[1] == pytest.approx(-4.0, abs=0.2)
     np.testing.assert_array_equal(mended.projections, given.projections)
     assert 'calibrated_from: scan.npy' in out.with_suffix('.yml').read_text()
+
+
+def test_history_is_kept_and_what_is_left_out_is_said(fan, monkeypatch, tmp_path):
+    write_scan(fan, read_scan(fan).train, 'npy', dict(frames='raw.tif'))
+    run(monkeypatch, fan, '--out', tmp_path / 'a.npy')
+    assert history_of(tmp_path / 'a.npy')['before'] == dict(frames='raw.tif')
+    scan = read_scan(fan).train
+    write_scan(tmp_path / 'b.pickle', lm.Dataset(scan.subset(slice(0, 20)), scan.subset(slice(20, 24))), 'naf')
+    with pytest.warns(UserWarning, match='the views to fit alone'):
+        run(monkeypatch, tmp_path / 'b.pickle', '--out', tmp_path / 'c.npy')
+    assert len(read_scan(tmp_path / 'c.npy').train) == 20
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -79,15 +80,17 @@ def test_parquet(home):
 
 
 def test_columns_of_text_and_numbers(tmp_path):
-    """A setting that one row gives, and the others' results: the Parquet file has one kind of value in a column."""
+    """A setting of a row that failed, and the others' results: the Parquet file has one kind of value in a column."""
     parquet = pytest.importorskip('pyarrow.parquet')
-    rows = [Row('a', 2, '.', settings=dict(iterations='2000')), Row('b', 3, '.')]
+    rows = [Row('a', 2, '.'), Row('b', 3, '.'), Row('c', 4, '.', settings=dict(iterations='900'))]
     table = Table(tmp_path, rows)
     table.done('a', dict(iterations=2000, views=5, psnr_2d=40.5))
     table.done('b', dict(iterations=1400, views=6, psnr_2d=41))
+    table.state('c', 'failed', 'why')
     table.finish()
     found = parquet.read_table(tmp_path / 'results.parquet').to_pylist()
-    assert [row['iterations'] for row in found] == ['2000', '1400'] and [row['psnr_2d'] for row in found] == [40.5, 41]
+    assert [row['iterations'] for row in found] == ['2000', '1400', '900']
+    assert [row['psnr_2d'] for row in found] == [40.5, 41, None]
 
 
 @pytest.mark.parametrize('name', ['results.parquet', 'batch.log'])
@@ -127,6 +130,31 @@ def test_projections_and_volumes(home):
     rows = results(home)
     assert rows['one']['psnr_3d'] == '' and float(rows['one']['psnr_2d']) > 10  # 2 of 7 views are held out
     assert float(rows['ct']['psnr_3d']) > 10 and lm.load_result(home / 'out' / 'ct').volume().shape == (16,) * 3
+
+
+def test_another_scan_of_the_same_name_is_another_request(home):
+    """Also where the file has the same size, and where only what lies beside it has changed."""
+    geometry = lm.Geometry.cone(
+        DSO=100, DSD=150, nDetector=(20, 24), dDetector=1.8, nVoxel=16, dVoxel=1.5, angles=np.linspace(0, 3, 7)
+    )
+    scan = lm.simulate(lm.phantom('foot', size=16), geometry, progress=False).train
+    (home / 'list.csv').write_text('file\none.npy\n')
+    write_scan(home / 'one.npy', scan, 'npy')
+    assert batch(home)[0] == 0 and '1 of 1 scans are done already' in batch(home)[1]
+    text = (home / 'one.yml').read_text()
+    write_scan(home / 'one.npy', replace(scan, projections=2 * scan.projections), 'npy')
+    code, _, err = batch(home)
+    assert code == 2 and 'holds a result of other values of content of the scan' in err
+    write_scan(home / 'one.npy', scan, 'npy')
+    assert batch(home)[0] == 0
+    (home / 'one.yml').write_text(text.replace('DSO: 100', 'DSO: 99'))
+    assert 'content of the scan' in batch(home)[2]
+
+
+def test_the_table_has_the_steps_that_were_made(home):
+    table = Table(home / 'out', [Row('a', 2, str(home), geometry='tiny.xml', settings=dict(iterations='1400'))])
+    table.done('a', dict(iterations=350, views=5, psnr_3d=30.0))
+    assert table._rows['a']['iterations'] == 350 and table._rows['a']['status'] == 'done'
 
 
 def test_failures_are_tried_once_more(home):

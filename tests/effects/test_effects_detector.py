@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import lingo_mi as lm
 from lingo_mi.effects.detector import Detector, taps
 from lingo_mi.effects.focal_spot import FocalSpot, square
+from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.view import View
@@ -191,3 +193,15 @@ def test_spot_larger_than_the_distance_of_the_source():
     with pytest.raises(InputError, match='a parallel beam has no focal spot'):
         FocalSpot.of('6', 3).check(None)
     FocalSpot().check(None)
+
+
+def test_a_binned_panel_has_the_noise_of_its_pixels_and_none_of_its_dead_ones():
+    geometry = lm.Geometry.parallel(nDetector=(64, 64), dDetector=1, nVoxel=4, dVoxel=1, angles=[0.0, 1.0])
+    panel = Detector(photons=1000.0, dead=0.02)
+    seen = np.array([panel.measure(np.full((64, 64), 0.5), view) for view in range(2)])
+    binned = lm.Scan(geometry, seen, effects=Effects(detector=panel)).binned(2)
+    dead = panel.maps((64, 64))[1].reshape(32, 2, 32, 2).any((1, 3))
+    np.testing.assert_array_equal(binned.valid, np.broadcast_to(~dead, (2, 32, 32)))
+    expected = binned.effects.detector.deviation(0.5)
+    assert binned.projections[binned.valid].std() == pytest.approx(expected, rel=0.1)
+    assert binned.effects.masked(binned).valid.sum() == binned.valid.sum()

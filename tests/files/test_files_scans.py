@@ -14,6 +14,7 @@ from helpers.scans import small_dataset
 from lingo_mi.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.geometry import Geometry
 from lingo_mi.reconstruction import CGLS
 from lingo_mi.scan import Dataset, Scan
 
@@ -436,3 +437,30 @@ def test_htc_reconstruction_agrees_with_the_challenges():
     assert correlation(image.T, reference) < 0.9 and correlation(image, reference) < 0.9
     # the reference is per pixel of 0.1483 mm
     assert np.polyfit(reference.ravel() / 0.1483, image.T[::-1].ravel(), 1)[0] == pytest.approx(1, abs=0.05)
+
+
+def test_exr_views_are_read_in_the_order_of_their_numbers(tmp_path):
+    scan = small_dataset().train
+    scan = scan.subset(np.arange(12) % len(scan))
+    scan = replace(scan, projections=np.arange(12, dtype=np.float32)[:, None, None] + np.zeros(scan.projections.shape))
+    write_scan(tmp_path / 'a', scan, 'exr')
+    for i in range(12):
+        (tmp_path / f'a/train/{i:04d}.exr').rename(tmp_path / f'a/train/{i}.exr')
+    assert read_scan(tmp_path / 'a').train.projections[:, 0, 0].tolist() == list(range(12))
+
+
+def test_many_poses_have_a_file_of_their_own(tmp_path):
+    angles = np.linspace(0, 40, 1200)
+    sizes = dict(DSO=100, DSD=150, nDetector=2, dDetector=1.0, nVoxel=4, dVoxel=1.0)
+    scan = Scan(Geometry.helix(angles=angles, pitch=5.0, **sizes), np.ones((1200, 2, 2)))
+    write_scan(tmp_path / 'a.npy', scan, 'npy')
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['a.npy', 'a.poses.npy', 'a.yml']
+    back = read_scan(tmp_path / 'a.npy').train.geometry.rays()
+    np.testing.assert_allclose(back.corner, scan.geometry.rays().corner, atol=1e-9)
+
+
+def test_held_out_views_of_an_npy_are_refused(tmp_path):
+    write_scan(tmp_path / 'a.npy', small_dataset().train, 'npy')
+    with open(tmp_path / 'a.yml', 'a') as file:
+        file.write('test_angles: [1, 2]\n')
+    refused(tmp_path / 'a.npy', 'test_angles goes with a folder of EXR views')

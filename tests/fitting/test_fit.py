@@ -240,6 +240,18 @@ def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
     np.testing.assert_array_equal(fitted.initial, whole.initial)
 
 
+def test_other_projections_of_the_same_mean_are_refused(scan, tmp_path):
+    path = tmp_path / 'fit.npz'
+    settings = SHORT.changed(iterations=3)
+    run(scan, settings, some_points(scan.geometry), path=path)
+    nearly = replace(scan, projections=scan.projections * np.float32(1 + 1e-6))  # as simulated by another machine
+    run(nearly, settings, None, path=path)
+    for axis in range(3):
+        mirrored = replace(scan, projections=np.flip(scan.projections, axis))
+        with pytest.raises(InputError, match='other values of the projections'):
+            run(mirrored, settings, None, path=path)
+
+
 def test_resuming_a_finished_fit_changes_nothing(scan, tmp_path):
     path = tmp_path / 'fit.npz'
     settings = SHORT.changed(iterations=3)

@@ -12,6 +12,7 @@ import lingo_mi as lm
 from lingo_mi.geometry import circular
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import look
+from lingo_mi.inspection.sheet import draw
 
 PIXELS, SIZE = 96, 40
 
@@ -107,6 +108,26 @@ def test_scans_of_nothing_and_of_few_pixels(foot):
         assert not any('nan' in line for line in look(replace(foot, projections=0 * foot.projections)).facts)
     row = foot.subset(slice(10))
     assert not any('clipped' in line for line in look(lm.Scan(row.geometry.binned(1), row.projections)).advice)
+
+
+def test_the_wrong_sign_is_said_and_drawn(foot, tmp_path):
+    scan = replace(foot, projections=-foot.projections)
+    found = look(scan)
+    assert any('give -ln(I / I0)' in line for line in found.advice)
+    draw(tmp_path / 'sheet.png', scan, found)
+    assert (tmp_path / 'sheet.png').stat().st_size > 10_000
+    assert not any('-ln' in line for line in look(foot).advice)
+
+
+@pytest.mark.parametrize('start', [90.0, 300.0])
+def test_the_arc_of_views_that_are_given_as_poses(start):
+    angles = np.radians(start + np.linspace(0, 180, 20, endpoint=False))
+    sizes = dict(DSO=500, DSD=750, nDetector=(16, 24), dDetector=4.0, nVoxel=16, dVoxel=2.0)
+    circle = lm.Geometry.cone(angles=angles, **sizes)
+    posed = lm.Geometry.from_poses(circle.rays(), circle.nDetector, 16, 2.0)
+    p = np.ones((20, 16, 24), np.float32)
+    for geometry in (circle, posed):
+        assert any('angles: 180 degrees in all' in line for line in look(lm.Scan(geometry, p)).facts)
 
 
 def test_air_of_single_views(foot):

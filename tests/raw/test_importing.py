@@ -360,3 +360,82 @@ def test_rows_of_rtk_run_up(tmp_path, named):
     rays = geometry.rays()
     np.testing.assert_allclose(part.geometry.rays().corner, rays.corner + 3 * rays.v + 2 * rays.u, atol=1e-9)
     np.testing.assert_allclose(part.geometry.rays().v, 3 * rays.v, atol=1e-9)
+
+
+# ---- what a grid of its own, files and options must not get wrong ---------------------------------------------------
+
+
+@pytest.mark.parametrize('crop', [(0, 24, 0, 40), (0, 9, 0, 40), (3, 24, 0, 14)])
+def test_the_own_grid_lies_where_the_panel_sees(tmp_path, raw, crop):
+    """As high as the rows that are kept, and around the axis as wide as the farthest column."""
+    values = dict(DSO=100, DSD=150, dDetector=[1, 1], angles=list(range(0, 360, 60)))
+    (tmp_path / 'scan.yml').write_text(yaml.safe_dump(values))
+    given = save(tmp_path, raw)
+    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', crop=crop, **given).geometry
+    v0, v1, u0, u1 = crop
+    assert scan.dVoxel == pytest.approx([2 / 3] * 3) and scan.nVoxel[2] == v1 - v0
+    assert scan.offOrigin == pytest.approx([0, 0, (12 - (v0 + v1) / 2) * 2 / 3])
+    assert scan.nVoxel[0] == scan.nVoxel[1] == 2 * max(20 - u0, u1 - 20)
+
+
+def test_pixels_that_saturate_in_the_flats_are_left_out(tmp_path, raw):
+    flats = np.minimum(raw.flats, 65535).astype(np.uint16)
+    flats[:, 5:8, 6:9] = 65535
+    given = save(tmp_path, raw) | dict(flats=tmp_path / 'clipped.npy')
+    np.save(tmp_path / 'clipped.npy', flats)
+    np.save(tmp_path / 'views.npy', np.clip(raw.views, 0, 40000).astype(np.uint16))
+    values = dict(DSO=100, DSD=150, dDetector=[1, 1], angles=list(range(0, 360, 60)))
+    (tmp_path / 'scan.yml').write_text(yaml.safe_dump(values))
+    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', **given)
+    assert not scan.valid[:, 5:8, 6:9].any() and scan.valid.mean() > 0.9
+
+
+def test_a_stack_of_one_page(tmp_path):
+    """ImageJ writes stacks of more than 4 GB so."""
+    stack = np.random.default_rng(0).integers(100, 9000, (6, 8, 10)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / 'stack.tif', stack, truncate=True)
+    views = open_recording(tmp_path / 'stack.tif').views
+    assert len(views) == 6
+    np.testing.assert_array_equal([views[i] for i in range(6)], stack)
+
+
+@pytest.mark.parametrize('name, value', [('valid', 'mask.npy'), ('I0', 5e4), ('input', 'intensity')])
+def test_a_geometry_of_finished_projections_is_refused(tmp_path, raw, scan_yml, name, value):
+    scan_yml.write_text(scan_yml.read_text() + yaml.safe_dump({name: value}))
+    given = save(tmp_path, raw)
+    with pytest.raises(lm.InputError, match=f'{name} describes projections, not raw frames'):
+        load(tmp_path / 'views.npy', scan_yml, **given)
+
+
+@pytest.mark.parametrize(
+    'option',
+    [
+        dict(views=5),
+        dict(views=(0, None)),
+        dict(binning='2'),
+        dict(binning=1.5),
+        dict(percentile='50'),
+        dict(i0='5'),
+        dict(saturation='x'),
+        dict(angles=[0, 1, 'a', 3]),
+    ],
+    ids=str,
+)
+def test_options_of_another_kind(tmp_path, raw, scan_yml, option):
+    given = save(tmp_path, raw)
+    with pytest.raises(lm.InputError, match=next(iter(option))):
+        load(tmp_path / 'views.npy', scan_yml, **given | option)
+
+
+def test_units_in_an_array_and_alignment_frames(tmp_path):
+    h5py = pytest.importorskip('h5py')
+    frames = np.arange(6 * 4 * 5, dtype=np.uint16).reshape(6, 4, 5)
+    with h5py.File(tmp_path / 'scan.h5', 'w') as file:
+        file['entry/instrument/detector/data'] = frames
+        file['entry/instrument/detector/image_key'] = [0, 0, 0, 0, 0, 0]
+        file['entry/instrument/detector/image_key_control'] = [0, 0, 0, 0, -1, -1]
+        file['entry/sample/rotation_angle'] = np.radians([0, 90, 180, 270, 180, 0])
+        file['entry/sample/rotation_angle'].attrs['units'] = np.array([b'rad'])
+    recording = open_recording(tmp_path / 'scan.h5')
+    assert len(recording.views) == 4
+    np.testing.assert_allclose(recording.angles, [0, 90, 180, 270])

@@ -129,6 +129,12 @@ def test_other_grids(pair, tmp_path):
         compare_page([read_stored(pair[0]), read_stored(tmp_path / 'x.nii.gz')])
 
 
+def test_other_places(pair, tmp_path):
+    write_volume(tmp_path / 'x.nii.gz', np.ones(SHAPE, np.float32), 2.0, (50.0, 0.0, 0.0), 'density per mm')
+    with pytest.raises(InputError, match='x: its voxels lie elsewhere than those of a'):
+        compare_page([read_stored(pair[0]), read_stored(tmp_path / 'x.nii.gz')])
+
+
 @pytest.mark.parametrize('text', ['', '[]', '{"test_angles": 5}', '{"test_angles": ["x"]}'])
 def test_damaged_numbers(pair, text):
     (pair[0] / 'metrics.json').write_text(text)

@@ -9,12 +9,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from helpers.script import FIT
+from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors import grid
+from lingo_mi.scan import Dataset, Scan
+from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
+from lingo_mi.studies.peers import Study
 
 SIZES = dict(DSO=200.0, DSD=300.0, dDetector=3.0)
 
@@ -94,3 +98,23 @@ def test_peers(peers, tmp_path, method, module):
 def test_bad_input(peers, tmp_path, args):
     code, _, err = peers(*args)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not (tmp_path / 'out').exists()
+
+
+def test_pixels_that_are_not_valid(tmp_path):
+    """Peers that take none are left out, and without a true volume there is nothing to compare with."""
+    volume = np.zeros((16, 16, 16), np.float32)
+    volume[4:12, 5:10, 3:12] = 0.03
+    geometry = Geometry.cone(nDetector=24, nVoxel=16, dVoxel=2.4, angles=circular(12), **SIZES)
+    p = grid.project(volume, geometry)
+    valid = np.random.default_rng(0).random(p.shape) > 0.05
+    masked = Scan(geometry, p, valid)
+    with pytest.raises(InputError, match='needs every pixel'):
+        Study(Dataset(masked), tmp_path / 'a').compute_missing(['sart'], [6])
+    assert not list((tmp_path / 'a').glob('*/sart*'))
+    for take in lambda: rtk_bridge.reconstruct('FDK', masked, None), lambda: mbirjax_bridge.reconstruct(masked, None):
+        with pytest.raises(InputError, match='every pixel is valid only'):
+            take()
+    said = []
+    study = Study(Dataset(masked, volume=volume), tmp_path / 'b')
+    study.compute_missing(['fdk', 'sart'], [6], said.append)
+    assert 'fdk: left out: filtered backprojection needs every pixel' in said[0] and 'sart: rms' in said[1]

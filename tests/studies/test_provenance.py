@@ -39,3 +39,5 @@ def test_commit_of_the_package_and_of_no_other_project(tmp_path, monkeypatch):
     assert provenance.commit() is None
     (tmp_path / 'pyproject.toml').touch()
     assert provenance.commit() == git('rev-parse', 'HEAD')
+    git('add', '.')
+    assert provenance.commit() == git('rev-parse', 'HEAD') + '+'

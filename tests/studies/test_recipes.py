@@ -104,6 +104,25 @@ def test_a_scene_of_the_same_name_is_another(tmp_path):
         comparison._require_same_scene(folder, scene)
 
 
+def test_a_value_that_is_a_path_makes_no_folders(tmp_path):
+    comparison = study.Comparison(tmp_path, changes=('projections=/data/x.npy',))
+    folder, command = comparison.plan('a.xml', 'fast')
+    assert folder.parent == tmp_path and folder.name.endswith('projections=%2Fdata%2Fx.npy')
+    assert command[-1] == 'projections=/data/x.npy'
+
+
+@pytest.mark.parametrize('name', ['metrics.json', 'scenes.json'])
+def test_damaged_results(tmp_path, name):
+    scene, comparison = tmp_path / 'a.xml', study.Comparison(tmp_path)
+    scene.write_text('<scene/>')
+    folder, _ = comparison.plan(scene, 'r2')
+    folder.mkdir()
+    (folder / 'metrics.json').write_text('{}')
+    (tmp_path / name if name == 'scenes.json' else folder / name).write_text('[1]')
+    with pytest.raises(InputError, match=f'{name}: is damaged'):
+        comparison.result(scene, 'r2')
+
+
 def test_results_stored_with_earlier_names_of_the_measures(tmp_path):
     r2 = dict(ssim_2d=0.9, psnr_3d=25.0, ssim_3d=0.8)
     old = {name: value for name, value in METRICS.items() if not name.endswith('d_r2') or name == 'psnr_2d_r2'} | r2
