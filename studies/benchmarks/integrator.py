@@ -179,9 +179,10 @@ class Bench:
 
         tree = Tree(mi.TensorXf(self.data), mi.TensorXf(self.density), self.work.extent, EPSILON)
         start = rays(view, 2 * 128.0)
-        one = [type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start]
+        one: Any = [type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start]
+        dr.eval(one)
         tree.image(*one)  # builds the tree, and compiles
-        dr.eval(tree.gradients(*one, mi.Float(1)))
+        tree.gradients(*one, dr.opaque(mi.Float, 1))
         image_of_tree, forward = _timed(tree.image, *start)
         gradients_of_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
         of_tree = errors(image_of_tree.numpy(), *(x.numpy() for x in gradients_of_tree))
