@@ -3,7 +3,7 @@ A Mitsuba scene with a mesh and a cloud
 =======================================
 
 The integrator `lingo_xray` is a Mitsuba plugin like any other. It adds up line integrals through Gaussians, grids and closed
-meshes, and its derivatives reach all of them through `mi.render`.
+meshes. Derivatives by the Gaussians, the grid's values and the mesh's attenuation come through `mi.render`.
 """
 
 # %%

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-MOST_FRAMES, SIDE = 48, 200  # frames of a slider; pixels of their longer side
+MOST_FRAMES, SIDE, LEAST = 48, 200, 12  # frames of a slider; pixels of their longer side, and of the other at least
 PLANES = ((2, 'Axial', 'z'), (1, 'Coronal', 'y'), (0, 'Sagittal', 'x'))
 
 
@@ -48,7 +48,7 @@ def frames(
     Image.fromarray(grey.reshape(-1, columns)).save(file, 'png', optimize=True)
     sprite = base64.b64encode(file.getvalue()).decode('ascii')
     scale = SIDE / max(rows, columns)
-    width, height = max(1, round(columns * scale)), max(1, round(rows * scale))
+    width, height = max(LEAST, round(columns * scale)), max(LEAST, round(rows * scale))
     first = int(np.abs(chosen - (count // 2 if start is None else start)).argmin())
     said = [html.escape(str(labels[i])).replace('|', '/') for i in chosen]
     act = (
@@ -63,7 +63,8 @@ def frames(
     return (
         f'<figure style="display:inline-block;vertical-align:top;margin:0 1em .5em 0;width:{max(width, SIDE)}px">'
         f'<figcaption style="margin:0">{name}</figcaption>'
-        f'<div role="img" aria-label="{name}" style="width:{width}px;height:{height}px;background-size:100% auto;'
+        f'<div role="img" aria-label="{name}" style="width:{width}px;height:{height}px;'
+        f'background-size:{width}px {height * len(chosen)}px;'
         f'background-position-y:{-height * first}px;background-image:url(data:image/png;base64,{sprite})"></div>'
         f'{slider if len(chosen) > 1 else ""}<output style="display:block;font-size:.9em">{said[first]}</output></figure>'
     )

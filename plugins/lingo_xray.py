@@ -74,11 +74,11 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
     centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
-    `perspective` and `orthographic`. Integrals through Gaussians begin at a cone beam's source and end at a scanner's panel;
-    in a parallel beam, and behind a camera's image, they are never cut.
+    `perspective` and `orthographic`. Integrals begin at a cone beam's source, and do not end at the panel.
+    Those of a parallel beam are never cut.
 
     Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`. Gradients reach the Gaussians' centres, scales, rotations and
-    densities, the grid's values and its scale, in forward and in reverse mode.
+    densities, the grid's values and its scale, and a mesh's `sigma_t` (not its vertices), in forward and in reverse mode.
     """
 
     def __init__(self, props):

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lingo_mi import notebook
+from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, replacing, writing
 from lingo_mi.files.slabs import THICKNESS, write_slabs
-from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.fitted import Fitted, NeedsEffects
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import locked
 from lingo_mi.geometry import Geometry
@@ -42,6 +43,7 @@ from lingo_mi.results.measure import Measured, measure
 from lingo_mi.results.save import report_data, result_names, save
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset
+from lingo_mi.scene.load import load_scene
 
 
 class Gaussians(NamedTuple):
@@ -263,7 +265,14 @@ def load_result(path: str | PathLike) -> Result:
         )
     if path.is_dir():
         require_together(path, [SCENE, CLOUD, CHECKPOINT])
-    fitted, numbers = Fitted.from_checkpoint(file), file.with_name(METRICS)
+    try:
+        fitted = Fitted.from_checkpoint(file)
+    except NeedsEffects:
+        if not (path / SCENE).exists():
+            raise
+        loaded = load_scene(path / SCENE)
+        fitted = Fitted.from_checkpoint(file, find_effects(loaded.scene, loaded.scanner))
+    numbers = file.with_name(METRICS)
     stored = None
     if path.is_dir() and numbers.exists():
         try:

@@ -119,8 +119,8 @@ def check_input(args: argparse.Namespace) -> None:
                 f'{args.scene}: is no scene, which --projections and --volume go with; leave one of them out'
             )
         args.projections, args.scene = args.scene, SCANNER
-    for name in ('projections', 'volume'):
-        if getattr(args, name) == '':  # an unset variable of the shell's
+    for name in ('projections', 'volume', 'complete', 'start'):
+        if getattr(args, name, None) == '':  # an unset variable of the shell's
             raise InputError(f'--{name} names no file')
     if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')

@@ -298,8 +298,8 @@ def reconstruct_into(
     if isinstance(found, Chosen):
         print(found.report())
         plan, error = beside(out)
-        write_text(plan, json.dumps(found.record(), indent=1) + '\n')
         replace(found, volume=found.error).save(error, force=True)
+        write_text(plan, json.dumps(found.record(), indent=1) + '\n')  # last: it says whose the map is
 
 
 def write_page(

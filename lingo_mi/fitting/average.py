@@ -39,11 +39,9 @@ class Average:
         self.values = None
 
     def of(self, state: DeviceState) -> DeviceState:
-        """The state with its parameters replaced by their mean."""
-        if self.values is None:
-            return state
+        """The state of now, which later steps do not change, with its parameters replaced by their mean."""
         out = copy.copy(state)
-        out.values = self.values
+        out.values = dict(state.values if self.values is None else self.values)  # steps replace its arrays
         return out
 
     def arrays(self) -> dict:

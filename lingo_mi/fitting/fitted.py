@@ -22,6 +22,10 @@ from lingo_mi.metrics import current_names
 from lingo_mi.projectors.objects import Ellipsoids
 
 
+class NeedsEffects(InputError):
+    """A checkpoint cannot be read without the effects that its fit has modelled."""
+
+
 @dataclass
 class Fitted:
     """A fitted cloud, or a fitted neural field.
@@ -137,9 +141,9 @@ class Fitted:
         except InputError as error:
             raise InputError(f'{path}: {error}') from None
         if effects is None and extra.get('effects', bool(arrays.keys() & {'share', 'scattered'})):
-            raise InputError(
-                f'{path}: the fit has modelled effects of its scan, which a checkpoint does not keep: give them too, '
-                'or use its result.xml, which has them'
+            raise NeedsEffects(
+                f'{path}: the fit has modelled effects of its scan, which a checkpoint does not keep: load the folder of its '
+                'result, whose result.xml has them'
             )
         poses = None
         if max(settings.adam.rate_pose) > 0:

@@ -5,6 +5,7 @@ Neither PyTorch nor JAX is a dependency: arrays of theirs cannot come from a cal
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ from lingo_mi.runtime import ensure_variant
 
 NAMES = 'means', 'scales', 'quaternions', 'density'
 COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian
+ONE_AT_A_TIME = threading.RLock()  # recorded kernels serve one thread at a time
 
 
 def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...], name: str) -> Any:
@@ -39,16 +41,19 @@ def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...],
         return mi.TensorXf(function(*_gaussians(tensors)), shape)
 
     if kind == 'NumPy':
-        ensure_variant()
-        return of_tensors(*map(uploaded_tensor, arrays)).numpy()
+        with ONE_AT_A_TIME:
+            ensure_variant()
+            return of_tensors(*map(uploaded_tensor, arrays)).numpy()
     if kind == 'Dr.Jit':
-        ensure_variant('cuda' if dr.backend_v(arrays[0]) == dr.JitBackend.CUDA else 'cpu')
-        return of_tensors(*arrays)
+        with ONE_AT_A_TIME:
+            ensure_variant('cuda' if dr.backend_v(arrays[0]) == dr.JitBackend.CUDA else 'cpu')
+            return of_tensors(*arrays)
     # Imported here, because PyTorch and JAX are heavy and may be missing.
     if kind == 'PyTorch':
         from lingo_mi.functional.through_torch import call_torch
 
-        return call_torch(of_tensors, arrays, name)
+        with ONE_AT_A_TIME:
+            return call_torch(of_tensors, arrays, name)
     from lingo_mi.functional.through_jax import call_jax
 
     ensure_variant()

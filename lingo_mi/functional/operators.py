@@ -145,6 +145,8 @@ def _indices(views, count: int) -> np.ndarray:
     if views is None:
         return np.arange(count)
     try:
+        if any(isinstance(i, bool) for i in views):  # a mask is no list of indices
+            raise TypeError
         found = np.array([operator.index(i) for i in views], int)
     except TypeError:
         raise InputError(f'views must be whole numbers, one a view, not {views!r}') from None

@@ -1,4 +1,4 @@
-"""PyTorch's tensors through Dr.Jit: shared memory, one graph of derivatives."""
+"""PyTorch's tensors through Dr.Jit: one operation of PyTorch's graph, whose derivatives are Dr.Jit's."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import torch
 
 from lingo_mi.errors import InputError
+from lingo_mi.functional.frameworks import ONE_AT_A_TIME
 from lingo_mi.runtime import ensure_variant
 
 
@@ -22,6 +24,34 @@ def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any
     ensure_variant(devices.pop().type)
     # Dr.Jit takes plain tensors alone: not nn.Parameter, which is a class of its own.
     plain = [a.as_subclass(torch.Tensor).to(torch.float32).contiguous() for a in arrays]
-    if not torch.is_grad_enabled():  # what derivatives need would be kept
-        plain = [a.detach() for a in plain]
-    return dr.wrap(source='torch', target='drjit')(function)(*plain)
+    return _OfDrJit.apply(function, *plain)
+
+
+class _OfDrJit(torch.autograd.Function):
+    """`drjit.wrap` would give the first derivatives again where PyTorch goes back through one graph twice."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[..., Any], *arrays: torch.Tensor) -> torch.Tensor:
+        tensors = [mi.TensorXf(a.detach()) for a in arrays]
+        wanted = ctx.needs_input_grad[1:]
+        for tensor, is_wanted in zip(tensors, wanted):
+            if is_wanted:
+                dr.enable_grad(tensor)
+        found = function(*tensors)
+        if any(wanted):
+            ctx.graph = tensors, found
+            ctx.save_for_backward(*arrays)  # asked for, it raises where PyTorch has freed the graph
+        return dr.detach(found).torch().clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
+        tensors, found = ctx.graph
+        assert ctx.saved_tensors
+        with ONE_AT_A_TIME:
+            dr.clear_grad(tensors)
+            dr.set_grad(found, mi.TensorXf(upstream.contiguous()))
+            dr.enqueue(dr.ADMode.Backward, found)
+            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearInterior)
+            wanted = zip(tensors, ctx.needs_input_grad[1:])
+            return None, *(dr.grad(tensor).torch().clone() if is_wanted else None for tensor, is_wanted in wanted)

@@ -1,7 +1,7 @@
 """Joseph's projector and its exact transpose for circular scans, fast enough to iterate with (Dr.Jit, llvm or cuda).
 
 Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982): a ray's main axis is x or y,
-whichever is nearer to its direction. The ray is sampled where it meets the slices of voxel centres along this axis, by
+whichever has more slices of voxels on its way. The ray is sampled where it meets the slices of voxel centres along this axis, by
 bilinear interpolation in each slice. If the main axis is x, the weight of voxel (i, j, k) in the ray of pixel (u, v) is
 
     a = L(u, v) hat(y(u, i) - j) hat(z(u, v, i) - k),    hat(s) = max(0, 1 - |s|)
@@ -49,7 +49,7 @@ def column_table(geometry: Geometry) -> np.ndarray:
     direction = np.broadcast_to(source, pixel.shape) if rays.parallel else pixel - source
     start = pixel if rays.parallel else source
     index, step = (start - first) / voxel, direction / voxel
-    along_y = np.abs(direction[..., 1]) > np.abs(direction[..., 0])
+    along_y = np.abs(step[..., 1]) > np.abs(step[..., 0])  # in voxels: no slice is stepped over
 
     def main(x):
         return np.where(along_y, x[..., 1], x[..., 0])

@@ -111,7 +111,8 @@ class Score:
         return self._norm(evaluated(self.b - self.A.forward(x, self.views)[0])) / self.all
 
     def _norm(self, images: mi.Float) -> float:
-        return float(np.sqrt(power(images.numpy().reshape(self.shape).swapaxes(1, 2)).mean()))
+        views = images.numpy().reshape(self.shape)
+        return float(np.sqrt(np.mean([power(view.T).mean() for view in views])))  # one by one, for memory
 
 
 class Watch:

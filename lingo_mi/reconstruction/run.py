@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from lingo_mi import progress as bars
+from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.memory_needs import needed
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
+
+MOST_ENTRIES = 2**32  # of one of Dr.Jit's arrays
 
 
 def reconstruct(
@@ -51,8 +55,14 @@ def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: in
 
 
 def check_room(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
-    """Raises InputError if memory is too small; arguments as of `check_scan`."""
+    """Raises InputError if memory or an array is too small; arguments as of `check_scan`."""
     views = views or len(geometry)
+    pixels = views * math.prod(geometry.nDetector) if algorithm is not None and algorithm.name != 'fdk' else 0
+    for number, what in (math.prod(geometry.nVoxel), 'voxels'), (pixels, 'pixels in all views'):
+        if number >= MOST_ENTRIES:
+            raise InputError(
+                f'{number:.4g} {what} are more than an array can hold, 2^32; take larger ones, or slabs (--slab)'
+            )
     if algorithm is None:
         check_memory(geometry, views=views)
     else:

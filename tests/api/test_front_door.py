@@ -296,3 +296,16 @@ def test_examples_of_the_docstrings_name_what_exists():
     text = Path(lm.__file__).read_text(encoding='utf-8').split('"""')[1]
     used = {word.split('(')[0] for line in text.splitlines() for word in line.split() if word.startswith('lm.')}
     assert {word.removeprefix('lm.').split('.')[0].strip('(),') for word in used} <= set(lm.__all__)
+
+
+def test_a_result_with_modelled_effects_is_loaded(tmp_path):
+    """A checkpoint does not keep them; the result.xml beside it does."""
+    sizes = dict(pixels=24, pixel_size=12, voxels=16, voxel_size=2.4)
+    data = lm.simulate('effects/focal_spot', views=6, parameters=sizes, progress=False)
+    result = lm.fit(data, 'fast', iterations=5, n_points=100, progress=False)
+    result.save(tmp_path / 'out')
+    again = lm.load_result(tmp_path / 'out')
+    np.testing.assert_array_equal(again.volume(), result.volume())
+    np.testing.assert_allclose(again.render(data.train.geometry), result.render(data.train.geometry), atol=1e-5)
+    with pytest.raises(lm.InputError, match='load the folder of its result'):
+        lm.load_result(tmp_path / 'out' / 'checkpoint.npz')

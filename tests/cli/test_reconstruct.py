@@ -103,6 +103,12 @@ def test_best(scene, dataset, tmp_path):
     assert code == 2 and 'v-plan.json: exists already' in err and not out.exists()
 
 
+@pytest.mark.parametrize('option', ['--complete', '--start'])
+def test_an_unset_variable_of_the_shell(scene, tmp_path, option):
+    code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', option, '', '--out', tmp_path / 'v.nii')
+    assert code == 2 and f'{option} names no file' in err and not (tmp_path / 'v.nii').exists()
+
+
 def test_fdk_of_a_turned_panel(dataset, tmp_path):
     """As good as of the scene whose panel is upright."""
     panel = '<string name="dDetector" value="1.8, 1.8"/>'

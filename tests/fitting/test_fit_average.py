@@ -1,5 +1,8 @@
 """The running mean of the parameters: what it is, where it begins anew, and that resuming keeps it."""
 
+from types import SimpleNamespace
+
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -70,3 +73,15 @@ def test_a_resumed_fit_has_the_same_mean(tmp_path, stop):
 def test_bad_decay(average):
     with pytest.raises(InputError, match='average'):
         AdamSettings(average=average)
+
+
+@pytest.mark.parametrize('decay', [0.0, 0.5])
+def test_a_measured_state_stays_as_it_was(decay):
+    """A page that is opened later shows the fit of its moment."""
+    state, average = SimpleNamespace(values=dict(density=mi.Float([1.0, 2.0]))), loop.Average(decay)
+    average.add(state)
+    seen = average.of(state)
+    before = seen.values['density'].numpy().copy()
+    state.values['density'] = state.values['density'] + 1
+    average.add(state)
+    np.testing.assert_array_equal(seen.values['density'].numpy(), before)

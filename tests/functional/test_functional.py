@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import drjit as dr
@@ -453,9 +454,41 @@ def test_twice_through_one_graph_of_torch():
     arrays = arrays_of('torch', columns(gaussians()))
     arrays[3].requires_grad_()
     images = project(*arrays, scan(), views=[0, 1])
-    (first,) = torch.autograd.grad(images.sum(), arrays[3], retain_graph=True)
-    (again,) = torch.autograd.grad(images.sum(), arrays[3])
+    loss, other = images.sum(), (images[0] ** 2).sum()
+    (first,) = torch.autograd.grad(loss, arrays[3], retain_graph=True)
+    (of_other,) = torch.autograd.grad(other, arrays[3], retain_graph=True)
+    (again,) = torch.autograd.grad(loss, arrays[3])
     np.testing.assert_array_equal(host(first), host(again))
+    (alone,) = torch.autograd.grad((project(*arrays, scan(), views=[0, 1])[0] ** 2).sum(), arrays[3])
+    np.testing.assert_array_equal(host(of_other), host(alone))
+    assert np.abs(host(of_other) - host(first)).max() > 0.1 * np.abs(host(first)).max()
+    with pytest.raises(RuntimeError, match='second time'):
+        torch.autograd.grad(images.mean(), arrays[3])
+
+
+def test_jacobian_of_torch():
+    torch = framework('torch')
+    arrays = arrays_of('torch', columns(gaussians()))
+
+    def pixels(density):
+        return project(*arrays[:3], density, scan(), views=[0])[0, :2, :2].ravel()
+
+    found = torch.autograd.functional.jacobian(pixels, arrays[3])
+    for i, row in enumerate(found):
+        density = arrays[3].clone().requires_grad_()
+        pixels(density)[i].backward()
+        np.testing.assert_array_equal(host(row), host(density.grad))
+
+
+@pytest.mark.parametrize('kind', ['numpy', 'torch'])
+def test_calls_from_several_threads(kind):
+    if kind == 'torch':
+        framework('torch')
+    arrays = arrays_of(kind, columns(gaussians()))
+    expected = host(project(*arrays, scan(), views=[0]))
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: project(*arrays, scan(), views=[0]), range(12)):
+            np.testing.assert_array_equal(host(found), expected)
 
 
 def test_variant(variant):

@@ -13,7 +13,7 @@ def matrix(geometry) -> np.ndarray:
             for u in range(geometry.nDetector[1]):
                 o, d = frames.through(view, u + 0.5, v + 0.5)
                 weights = np.zeros(size)
-                main = int(abs(d[1]) > abs(d[0]))
+                main = int(abs(d[1] / voxel[1]) > abs(d[0] / voxel[0]))
                 for m in range(size[main]):
                     t = (first[main] + m * voxel[main] - o[main]) / d[main]
                     p = (o + t * d - first) / voxel

@@ -90,14 +90,23 @@ def test_voxels_beside_a_ray_add_nothing_whatever_they_hold():
         assert (image == 3).sum() == 1 and np.isnan(image).sum() == 8
 
 
-def test_smooth_ball_against_the_exact_projector():
-    """Joseph samples once a slice, which is nearly exact where the volume is smooth."""
-    geometry = scan(n=6, nVoxel=(40, 44, 36), dVoxel=(2.0, 1.8, 2.2), nDetector=(30, 34), dDetector=(4.0, 4.0))
+@pytest.mark.parametrize(
+    'voxels',
+    [
+        dict(nVoxel=(40, 44, 36), dVoxel=(2.0, 1.8, 2.2)),
+        dict(nVoxel=(80, 20, 36), dVoxel=(1.0, 4.0, 2.2)),
+        dict(nVoxel=(20, 160, 36), dVoxel=(4.0, 0.5, 2.2)),
+    ],
+    ids=str,
+)
+def test_smooth_ball_against_the_exact_projector(voxels):
+    """Joseph samples once a slice, which is nearly exact where the volume is smooth, however long the voxels are."""
+    geometry = scan(n=6, nDetector=(30, 34), dDetector=(4.0, 4.0), **voxels)
     grid = [
         (np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
     ]
     x = np.stack(np.meshgrid(*grid, indexing='ij'), -1)
-    volume = 0.02 / (1 + np.exp((np.linalg.norm(x - [6.0, -5.0, 4.0], axis=-1) - 25) / 0.8))
+    volume = 0.02 / (1 + np.exp((np.linalg.norm(x - [6.0, -5.0, 4.0], axis=-1) - 25) / 2.0))
     result = Joseph(geometry).forward(mi.Float(np.float32(volume).ravel()), range(6))[0].numpy()
     result = result.reshape(6, 34, 30).transpose(0, 2, 1)
     exact = project(volume, geometry)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+import lingo_mi as lm
 from helpers.grids import scan as small
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
@@ -13,9 +14,10 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
-from lingo_mi.reconstruction import ASDPOCS, Best
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
 from lingo_mi.reconstruction.best import error_map
 from lingo_mi.reconstruction.held_out import Score, split
+from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
@@ -121,3 +123,15 @@ def test_the_map_of_errors():
     found = error_map(volume, other)
     assert found.dtype == np.float32 and found.argmax() == np.ravel_multi_index((4, 4, 4), found.shape)
     assert abs((found**2).sum() - 1) < 1e-3 and not error_map(volume, volume).any()
+
+
+@pytest.mark.parametrize('sizes, what', [(dict(nVoxel=1700), 'voxels'), (dict(nDetector=2048), 'pixels in all views')])
+def test_more_than_an_array_can_hold(monkeypatch, sizes, what):
+    geometry = lm.Geometry.cone(
+        **dict(DSO=500, DSD=750, nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=np.linspace(0, 6, 1100)) | sizes
+    )
+    with pytest.raises(InputError, match=f'{what} are more than an array can hold'):
+        check_room(geometry, SART(1))
+    if what != 'voxels':
+        monkeypatch.setattr(run, 'check_memory', lambda *_, **__: None)
+        check_room(geometry, FDK())

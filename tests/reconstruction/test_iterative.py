@@ -240,7 +240,7 @@ def test_asd_pocs_meets_exact_line_integrals():
     truth = rng.random(geo.nVoxel)
     scan = Scan(geo, project(truth, geo))
     missed = [
-        np.linalg.norm(project(ASDPOCS(40, alpha=1e-6, exact_every=n).run(scan).volume, geo) - scan.projections)
+        np.linalg.norm(project(ASDPOCS(80, alpha=1e-6, exact_every=n).run(scan).volume, geo) - scan.projections)
         for n in (0, 2)
     ]
     assert missed[1] < 0.2 * missed[0]
