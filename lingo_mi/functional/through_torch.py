@@ -32,7 +32,7 @@ class _OfDrJit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, function: Callable[..., Any], *arrays: torch.Tensor) -> torch.Tensor:
-        tensors = [mi.TensorXf(a.detach()) for a in arrays]
+        tensors: Any = [_tensor(a.detach()) for a in arrays]
         wanted = ctx.needs_input_grad[1:]
         for tensor, is_wanted in zip(tensors, wanted):
             if is_wanted:
@@ -50,8 +50,12 @@ class _OfDrJit(torch.autograd.Function):
         assert ctx.saved_tensors
         with ONE_AT_A_TIME:
             dr.clear_grad(tensors)
-            dr.set_grad(found, mi.TensorXf(upstream.contiguous()))
+            dr.set_grad(found, _tensor(upstream.contiguous()))
             dr.enqueue(dr.ADMode.Backward, found)
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearInterior)
             wanted = zip(tensors, ctx.needs_input_grad[1:])
             return None, *(dr.grad(tensor).torch().clone() if is_wanted else None for tensor, is_wanted in wanted)
+
+
+def _tensor(array: Any) -> mi.TensorXf:
+    return mi.TensorXf(array)

@@ -182,7 +182,7 @@ class Bench:
         one: Any = [type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start]
         dr.eval(one)
         tree.image(*one)  # builds the tree, and compiles
-        tree.gradients(*one, dr.opaque(mi.Float, 1))
+        tree.gradients(one[0], one[1], dr.opaque(mi.Float, 1))
         image_of_tree, forward = _timed(tree.image, *start)
         gradients_of_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
         of_tree = errors(image_of_tree.numpy(), *(x.numpy() for x in gradients_of_tree))
