@@ -42,7 +42,8 @@ def read(path: Path) -> list[dict]:
         rows = [{key: row[key] for key in KEYS} for row in json.loads(text)]
     except (ValueError, TypeError, KeyError):
         raise InputError(f'{path}: holds no measurements of this command; remove it, or choose another --out') from None
-    return [row for row in rows if (row['commit'], row['machine']) == (commit(), machine())]
+    here = commit(), machine()
+    return [row for row in rows if (row['commit'], row['machine']) == here]
 
 
 def main() -> None:
@@ -60,11 +61,10 @@ def main() -> None:
     if document:
         check_places(document, ['growth'])
     args.out.mkdir(parents=True, exist_ok=True)
-    stored = args.out / 'growth.json'
+    stored, made = args.out / 'growth.json', dict(commit=commit(), machine=machine())
     with locked(args.out), Progress('Stages', len(DEPENDS)) as bar:
 
         def after(found, others):
-            made = dict(commit=commit(), machine=machine())
             write_text(stored, json.dumps([row | made for row in found + others], indent=1) + '\n')
             bar.update(len({row['stage'] for row in found}), last=found[-1]['stage'])
 

@@ -59,8 +59,8 @@ class Row:
         return settings_of(self.recipe, **self.settings)
 
     def request(self) -> dict:
-        """What a stored result must be the answer to: the file, by its name in the list and its size, and all that the numbers
-        depend on."""
+        """What a stored result must be the answer to: the file, by its name in the list, its size and the contents of its scan,
+        and all else that the numbers depend on."""
         path = self.path
         size = path.stat().st_size if path is not None and path.is_file() else None
         settings = {name: value for name, value in self.fit_settings().flat().items() if name != 'checkpoint_seconds'}
@@ -91,7 +91,7 @@ def _digest_of(files):
     """Of the contents of (file, size, time of change): a file that has not changed is read once."""
     found = hashlib.sha256()
     for file, *_ in files:
-        found.update(f'{file.name}'.encode(errors='surrogateescape'))
+        found.update(file.name.encode(errors='surrogateescape'))
         with open(file, 'rb') as stream:
             while part := stream.read(2**24):
                 found.update(part)

@@ -58,4 +58,5 @@ class _OfDrJit(torch.autograd.Function):
 
 
 def _tensor(array: Any) -> mi.TensorXf:
+    """In the memory of PyTorch's."""
     return mi.TensorXf(array)

@@ -13,7 +13,8 @@ INTRODUCTION = """# CUDA without a GPU
 
 Written by `lingo-mi cuda-check --stand-in PROGRAM --markdown FILE`. The tests ran on `cuda_ad_mono` under a stand-in for the CUDA
 driver, which runs Dr.Jit's PTX on the CPU; it traces no rays and finds no races. Every kernel that they compiled went through
-`ptxas`, NVIDIA's assembler. *Noise*: approximate instructions err by as much as NVIDIA allows. *Checked*: every address is."""
+`ptxas`, NVIDIA's assembler. Files of tests that load no kernel ran once for all devices. *Noise*: approximate instructions err
+by as much as NVIDIA allows. *Checked*: every address is."""
 LARGEST = 8  # kernels listed
 
 
