@@ -338,8 +338,6 @@ def _own_grid(geometry: Geometry) -> Geometry:
     # Where they meet the plane through the origin that is parallel to the panel.
     seen = start - along * ((start * across).sum(-1) / (along * across).sum(-1))[..., None]
     low, high = seen[..., 2].min(), seen[..., 2].max()
-    if any(geometry.offOrigin):
-        low, high = -(high - low) / 2, (high - low) / 2
     side, height = (max(1, int(np.ceil(x / step - 1e-6))) for x in (2 * np.hypot(*seen[..., :2].T).max(), high - low))
     middle = geometry.offOrigin if any(geometry.offOrigin) else (0.0, 0.0, (low + high) / 2)
     return replace(geometry, nVoxel=(side, side, height), dVoxel=(step,) * 3, offOrigin=middle)
