@@ -11,6 +11,8 @@ import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+os.environ.setdefault('XLA_PYTHON_CLIENT_PREALLOCATE', 'false')  # JAX would take three quarters of a GPU's memory
+
 VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
 STAND_IN = 'LINGO_MI_CUDA_STAND_IN' in os.environ  # for the CUDA driver: one thread, without OptiX
 

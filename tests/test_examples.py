@@ -40,6 +40,7 @@ def test_example(path, variant, monkeypatch, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter('error', RuntimeWarning)
         names = runpy.run_path(str(path), run_name='__main__')
+    lm.use_variant(variant)  # which an example may change
     shown = [names[node.value.id] for node in ast.parse(path.read_text(encoding='utf-8')).body if is_name(node)]
     assert all('<figure' in display or '<svg' in display for display in (found._repr_html_() for found in shown))
     assert shown or pyplot.get_fignums(), 'an example shows something'

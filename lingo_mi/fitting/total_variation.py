@@ -13,6 +13,7 @@ from lingo_mi.fitting import losses
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.view_loss import evaluate
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
@@ -35,7 +36,14 @@ def random_cube_variation(
     room = between - (np.array(shape) - 1) * s.tv_stride
     corner = -half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
     voxel = voxel * s.tv_stride
-    low, high = vector64(corner), vector64(corner + shape * voxel)
+    low, high, step = vector64(corner), vector64(corner + shape * voxel), vector64(voxel)
+    settled = dict(shape=shape, extent=extent, weight=s.lambda_tv)
+    if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
+        # All Gaussians: the number of those in the cube would have to be waited for, and would differ from step to step.
+        loss, gradients = _REPLAY(*gaussians, low, step, factor, **settled)
+        for x, gradient in zip(gaussians, gradients):
+            dr.accum_grad(x, gradient)
+        return loss
     with dr.suspend_grad():
         centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
         reach = dr.max(scale) * extent
@@ -44,8 +52,24 @@ def random_cube_variation(
     if dr.width(index) == 0:
         return mi.Float(0)
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
-    cube = voxelize(*chosen, grid=Grid(low, vector64(voxel), shape), extent=extent)
-    loss = s.lambda_tv * losses.tv(cube, (nz, ny, nx))
-    dr.backward(loss if factor is None else factor * loss)
+    loss = _differentiated(chosen, low, step, factor, **settled)
     evaluate(gaussians)
+    return loss
+
+
+def _differentiated(gaussians, corner, step, factor, shape, extent, weight):
+    """The value for a cube of samples, whose gradient it adds to the Gaussians'."""
+    cube = voxelize(*gaussians, grid=Grid(corner, step, shape), extent=extent)
+    loss = weight * losses.tv(cube, shape[::-1])
+    dr.backward(loss if factor is None else factor * loss)
     return dr.detach(loss)
+
+
+def _replayed(*arrays, **settled):
+    *gaussians, corner, step, factor = arrays
+    dr.enable_grad(gaussians)
+    loss = _differentiated(gaussians, corner, step, factor, **settled)
+    return loss, [dr.grad(x) for x in gaussians]
+
+
+_REPLAY = Replay(_replayed)

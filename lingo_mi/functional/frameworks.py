@@ -6,7 +6,8 @@ Neither PyTorch nor JAX is a dependency: arrays of theirs cannot come from a cal
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,20 @@ from lingo_mi.runtime import ensure_variant
 
 NAMES = 'means', 'scales', 'quaternions', 'density'
 COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian
-ONE_AT_A_TIME = threading.RLock()  # recorded kernels serve one thread at a time
+_LOCK = threading.RLock()
+
+
+@contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Holds up other threads: recorded kernels serve one at a time. Tells Dr.Jit of a thread that goes on with another's arrays.
+
+    PyTorch goes back through a graph on a GPU in a thread of its own.
+    """
+    with _LOCK:
+        for backend in dr.JitBackend.CUDA, dr.JitBackend.LLVM:
+            if dr.has_backend(backend):
+                dr.detail.new_scope(backend)
+        yield
 
 
 def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...], name: str) -> Any:
@@ -41,18 +55,18 @@ def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...],
         return mi.TensorXf(function(*_gaussians(tensors)), shape)
 
     if kind == 'NumPy':
-        with ONE_AT_A_TIME:
+        with one_at_a_time():
             ensure_variant()
             return of_tensors(*map(uploaded_tensor, arrays)).numpy()
     if kind == 'Dr.Jit':
-        with ONE_AT_A_TIME:
+        with one_at_a_time():
             ensure_variant('cuda' if dr.backend_v(arrays[0]) == dr.JitBackend.CUDA else 'cpu')
             return of_tensors(*arrays)
     # Imported here, because PyTorch and JAX are heavy and may be missing.
     if kind == 'PyTorch':
         from lingo_mi.functional.through_torch import call_torch
 
-        with ONE_AT_A_TIME:
+        with one_at_a_time():
             return call_torch(of_tensors, arrays, name)
     from lingo_mi.functional.through_jax import call_jax
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import torch
 
 from lingo_mi.errors import InputError
-from lingo_mi.functional.frameworks import ONE_AT_A_TIME
+from lingo_mi.functional.frameworks import one_at_a_time
 from lingo_mi.runtime import ensure_variant
 
 
@@ -48,7 +48,7 @@ class _OfDrJit(torch.autograd.Function):
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
         tensors, found = ctx.graph
         assert ctx.saved_tensors
-        with ONE_AT_A_TIME:
+        with one_at_a_time():
             dr.clear_grad(tensors)
             dr.set_grad(found, _tensor(upstream.contiguous()))
             dr.enqueue(dr.ADMode.Backward, found)

@@ -257,7 +257,7 @@ def test_save_and_load(result, data, tmp_path):
             lm.load_result(folder)
 
 
-def test_checkpoint_and_resume(data, tmp_path):
+def test_checkpoint_and_resume(data, tmp_path, sums_in_order):
     path = tmp_path / 'fit.npz'
     short = TINY | dict(iterations=6)
     # Recipes whose rates fall over fixed steps can go on to more iterations: the same as in one go.

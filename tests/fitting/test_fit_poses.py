@@ -111,7 +111,7 @@ def test_errors_of_a_millimetre_and_half_a_degree_are_found():
     )
 
 
-def test_checkpoints_keep_the_poses(tmp_path):
+def test_checkpoints_keep_the_poses(tmp_path, sums_in_order):
     scan = tiny_scan(geometry(3))
     settings = MOVING.changed(iterations=12)
     whole = run(scan, settings, some_points(scan.geometry), seed=3)

@@ -47,7 +47,7 @@ def test_it_stops_at_the_step_of_the_least_error(whole):
     assert whole.history[-1]['iteration'] == whole.steps
 
 
-def test_its_steps_are_those_of_a_fit_without_a_search(scan, whole, tmp_path):
+def test_its_steps_are_those_of_a_fit_without_a_search(scan, whole, tmp_path, sums_in_order):
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, SETTINGS.changed(stop='off'), some_points(scan.geometry), 3, path=path, progress=stop_at(whole.steps))
@@ -75,7 +75,7 @@ def searched_enough(done, **fields):
 
 
 @pytest.mark.parametrize('where', ['search', 'between', 'fit'])
-def test_resumed_it_is_the_same(scan, whole, tmp_path, where):
+def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
     path = tmp_path / 'fit.npz'
     searched_enough.looks, searched_enough.errors = -1, None  # the first that is shown is no look
     searched_enough.wanted = len(whole.search['errors'])

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from helpers.same import assert_same
 from lingo_mi.errors import InputError
 from lingo_mi.functional import project, voxelize
 from lingo_mi.geometry.base import CircularGeometry
@@ -127,7 +128,7 @@ def test_images(kind, views):
     assert str(found.dtype).endswith('float32') if kind != 'drjit' else True
     assert relative(host(found), expected) < 2e-6
     some = project(*arrays, g, extent=EXTENT, views=[2, -3])
-    np.testing.assert_array_equal(host(some), host(found)[[2, 0]])
+    assert_same(host(some), host(found)[[2, 0]])
 
 
 @pytest.mark.parametrize('kind', DIFFERENTIABLE)
@@ -215,9 +216,9 @@ def test_anything_that_numpy_reads():
     g, values = scan(), columns(gaussians())
     expected = project(*values, g)
     for convert in (np.ndarray.tolist, np.float64, np.asfortranarray, Foreign):
-        np.testing.assert_array_equal(project(*map(convert, values), g), expected)
+        assert_same(project(*map(convert, values), g), expected)
     whole = [[0, 1, 2]], [[9, 8, 7]], [[0, 0, 0, 2]], [1]
-    np.testing.assert_array_equal(project(*whole, g), project(*map(np.float32, whole), g))
+    assert_same(project(*whole, g), project(*map(np.float32, whole), g))
 
 
 @pytest.mark.parametrize('kind', ['torch', 'jax'])
@@ -250,9 +251,9 @@ def test_torch_parameters_and_no_grad():
     with torch.no_grad():
         without = project(*parameters, g)
     assert out.requires_grad and not without.requires_grad
-    np.testing.assert_array_equal(host(out), host(without))
+    assert_same(host(out), host(without))
     strided = [torch.stack([p.detach(), p.detach()], -1)[..., 0] for p in parameters]
-    np.testing.assert_array_equal(host(project(*strided, g)), host(without))
+    assert_same(host(project(*strided, g)), host(without))
 
 
 def test_a_constant_in_torch():
@@ -458,12 +459,26 @@ def test_twice_through_one_graph_of_torch():
     (first,) = torch.autograd.grad(loss, arrays[3], retain_graph=True)
     (of_other,) = torch.autograd.grad(other, arrays[3], retain_graph=True)
     (again,) = torch.autograd.grad(loss, arrays[3])
-    np.testing.assert_array_equal(host(first), host(again))
+    assert_same(host(first), host(again))
     (alone,) = torch.autograd.grad((project(*arrays, scan(), views=[0, 1])[0] ** 2).sum(), arrays[3])
-    np.testing.assert_array_equal(host(of_other), host(alone))
+    assert_same(host(of_other), host(alone))
     assert np.abs(host(of_other) - host(first)).max() > 0.1 * np.abs(host(first)).max()
     with pytest.raises(RuntimeError, match='second time'):
         torch.autograd.grad(images.mean(), arrays[3])
+
+
+def test_back_through_graphs_in_another_thread():
+    """As PyTorch does on a GPU, in one thread for all."""
+    framework('torch')
+    with ThreadPoolExecutor(1) as pool:
+        for function in (project, voxelize) * 2:
+            arrays, others = (arrays_of('torch', columns(gaussians())) for _ in range(2))
+            for x in (*arrays, *others):
+                x.requires_grad_()
+            pool.submit(function(*arrays, scan()).square().sum().backward).result()
+            function(*others, scan()).square().sum().backward()
+            for x, other in zip(arrays, others):
+                assert relative(host(x.grad), host(other.grad)) < 1e-5
 
 
 def test_jacobian_of_torch():
@@ -477,7 +492,7 @@ def test_jacobian_of_torch():
     for i, row in enumerate(found):
         density = arrays[3].clone().requires_grad_()
         pixels(density)[i].backward()
-        np.testing.assert_array_equal(host(row), host(density.grad))
+        assert_same(host(row), host(density.grad))
 
 
 @pytest.mark.parametrize('kind', ['numpy', 'torch'])
@@ -488,7 +503,7 @@ def test_calls_from_several_threads(kind):
     expected = host(project(*arrays, scan(), views=[0]))
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(lambda _: project(*arrays, scan(), views=[0]), range(12)):
-            np.testing.assert_array_equal(host(found), expected)
+            assert_same(host(found), expected)
 
 
 def test_variant(variant):

@@ -12,6 +12,7 @@ from scipy.sparse.linalg import lsqr
 from helpers.algorithms import ITERATIVE
 from helpers.grids import scan as small
 from helpers.matrices import matrix
+from helpers.same import assert_same
 from lingo_mi import phantoms
 from lingo_mi.completion.views import complete
 from lingo_mi.errors import InputError
@@ -246,7 +247,7 @@ def test_asd_pocs_meets_exact_line_integrals():
     assert missed[1] < 0.2 * missed[0]
     valid = rng.random(scan.projections.shape) > 0.01
     masked = Scan(geo, scan.projections, valid)  # of which the projector is the exact one
-    np.testing.assert_array_equal(ASDPOCS(2, exact_every=1).run(masked), ASDPOCS(2).run(masked))
+    assert_same(ASDPOCS(2, exact_every=1).run(masked).volume, ASDPOCS(2).run(masked).volume)
 
 
 def test_asd_pocs_stops(system):

@@ -94,7 +94,7 @@ def fit(data, **options):
     return lm.fit(data, 'fast', progress=False, **SMALL, **options)
 
 
-def test_a_fit_is_the_same_with_and_without(data, capsys):
+def test_a_fit_is_the_same_with_and_without(data, capsys, sums_in_order):
     plain, seen = fit(data), fit(data, live=True)
     assert re.search(r'^live: http://127.0.0.1:\d+/\?token=\S+$', capsys.readouterr().err, re.M)
     for a, b in zip(plain.gaussians, seen.gaussians):
