@@ -17,6 +17,8 @@ from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Grid, voxelize
 
+FAR = 1e6  # in the normalised frame, where a scan's volume has about the size 1
+
 
 def random_cube_variation(
     gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator, factor: Any = None
@@ -39,22 +41,24 @@ def random_cube_variation(
     low, high, step = vector64(corner), vector64(corner + shape * voxel), vector64(voxel)
     settled = dict(shape=shape, extent=extent, weight=s.lambda_tv)
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
-        # All Gaussians: the number of those in the cube would have to be waited for, and would differ from step to step.
-        loss, gradients = _REPLAY(*gaussians, low, step, factor, **settled)
+        loss, gradients = _REPLAY(*gaussians, low, high, step, factor, **settled)
         for x, gradient in zip(gaussians, gradients):
             dr.accum_grad(x, gradient)
         return loss
-    with dr.suspend_grad():
-        centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
-        reach = dr.max(scale) * extent
-        near = dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))
-        index: Any = dr.compress(near)
+    index: Any = dr.compress(_near(gaussians, low, high, extent))
     if dr.width(index) == 0:
         return mi.Float(0)
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
     loss = _differentiated(chosen, low, step, factor, **settled)
     evaluate(gaussians)
     return loss
+
+
+def _near(gaussians, low, high, extent):
+    """Which Gaussians may reach into a box."""
+    centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
+    reach = dr.max(scale) * extent
+    return dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))
 
 
 def _differentiated(gaussians, corner, step, factor, shape, extent, weight):
@@ -66,10 +70,22 @@ def _differentiated(gaussians, corner, step, factor, shape, extent, weight):
 
 
 def _replayed(*arrays, **settled):
-    *gaussians, corner, step, factor = arrays
-    dr.enable_grad(gaussians)
-    loss = _differentiated(gaussians, corner, step, factor, **settled)
-    return loss, [dr.grad(x) for x in gaussians]
+    """The value for a cube, and its gradient, without waiting for the number of Gaussians in the cube.
+
+    Those come first, in as many places as there are Gaussians. The rest of the places holds Gaussians far away.
+    """
+    *gaussians, low, high, step, factor = arrays
+    near = _near(gaussians, low, high, settled['extent'])
+    one_each, i = dr.select(near, mi.UInt32(1), 0), dr.arange(mi.UInt32, dr.width(near))
+    place = dr.prefix_reduce(dr.ReduceOp.Add, one_each, exclusive=True)
+    index, taken = dr.zeros(mi.UInt32, dr.width(near)), i < dr.sum(one_each)
+    dr.scatter(index, i, place, near, mode=dr.ReduceMode.Permute)
+    far = mi.Point3f(FAR), mi.Vector3f(1), mi.Vector4f(0, 0, 0, 1), mi.Float(0)
+    chosen = [dr.select(taken, dr.gather(type(x), x, index, taken), away) for x, away in zip(gaussians, far)]
+    dr.eval(chosen, place)
+    dr.enable_grad(chosen)
+    loss = _differentiated(chosen, low, step, factor, **settled)
+    return loss, [dr.gather(type(x), dr.grad(x), place, near) for x in chosen]
 
 
 _REPLAY = Replay(_replayed)

@@ -324,7 +324,7 @@ class Work:
         share = total // self.teams + 1
         begin = mi.UInt64(lane // lanes) * share
         begin, end = (
-            _cut(dr.minimum(x, total), self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
+            _cut(dr.minimum(x, total), total, self.ends, self.block_cost, dr.opaque(mi.UInt32, self.count))
             for x in (begin, begin + share)
         )
         return Share(lane, begin, end, self.blocks, layout, self.sharing.block)
@@ -377,12 +377,16 @@ def _sum_of_copies(values, size, copies):
     return mi.Float(repeat(mi.UInt32(0), dr.opaque(mi.UInt32, copies), add, dr.zeros(Float64, size))[0])
 
 
-def _cut(position, ends, block_cost, count):
-    """The first block that begins at or after a position in the total cost, as (item, block)."""
+def _cut(position, total, ends, block_cost, count):
+    """The first block that begins at or after a position in the total cost, as (item, block).
+
+    The end of all work is behind the last block: the last team need not walk through the empty items that may follow.
+    """
 
     def halve(g, size):
         half = size // 2
-        behind = dr.gather(mi.UInt64, ends, g + half) <= position
+        end = dr.gather(mi.UInt64, ends, g + half)
+        behind = (end <= position) & (end < total)
         return dr.select(behind, g + half + 1, g), dr.select(behind, size - half - 1, half)
 
     g, _ = while_loop((mi.UInt32(0), mi.UInt32(count)), lambda g, size: size > 0, halve)
