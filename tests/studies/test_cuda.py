@@ -6,13 +6,16 @@ from importlib import resources
 
 import pytest
 
+from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from helpers.script import FIT, run
 from lingo_mi.errors import InputError
+from lingo_mi.fitting.loop import run as run_fit
 from lingo_mi.gpu import GPU
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.cuda import assemble, model, report, waits
 from lingo_mi.studies.cuda.assemble import Kernel, find_ptxas
 from lingo_mi.studies.cuda.count import KINDS, _counts, difference
+from lingo_mi.studies.cuda.measure import measured
 from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
 from lingo_mi.studies.cuda.page import page
 from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files, run_tests
@@ -126,6 +129,14 @@ def test_times_of_a_kernel():
     assert found['issue'] == pytest.approx(65e6 / (4 * 64e9)) and found['fp64'] == pytest.approx(32e6 / (32 * 64e9))
     assert found['atomics'] == pytest.approx(1e-3) and found['memory'] == pytest.approx(1e-3)
     assert seconds(kernel(launches=7), card) == pytest.approx(7 * model.LAUNCH)
+
+
+def test_times_of_a_fit():
+    scan = tiny_scan(geometry())
+    found = measured(run_fit(scan, SHORT, some_points(scan.geometry)), repeats=2)
+    for work in found.values():
+        assert work['launches'] > 10 and 0 < work['longest'] <= work['all']
+    assert found['a step']['seconds'] > 0
 
 
 def test_consumer_cards_take_longer_for_float64():

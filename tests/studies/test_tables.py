@@ -221,7 +221,7 @@ def test_a_fit_without_its_checkpoint_is_fitted_again(tmp_path, content):
     assert tables._iterations(saved) == 10 and numbers(cells.get(fit)) == pytest.approx(numbers(before))
 
 
-def test_a_longer_fit_goes_on_from_a_shorter_one(tmp_path):
+def test_a_longer_fit_goes_on_from_a_shorter_one(tmp_path, sums_in_order):
     short, fit = Fit('foot', 4, SHORT, 10), Fit('foot', 4, SHORT, 20)
     steps, whole = Cells(tmp_path / 'a', TINY), Cells(tmp_path / 'b', TINY)
     before = steps.compute(short, 'fit')

@@ -1,0 +1,94 @@
+"""Times of a fit's image, derivatives and steps, as the device measures its kernels and as a clock measures the steps.
+
+    lingo-mi fit x3d_foot --out out/foot
+    python -m lingo_mi.studies.cuda.measure out/foot/checkpoint.npz
+
+On a GPU the model's prediction stands beside the time of a step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.step import Stepper
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.view import View
+from lingo_mi.runtime import use_variant
+from lingo_mi.scan import Scan
+from lingo_mi.studies.cuda.model import beside
+from lingo_mi.studies.cuda.work import VIEW, image
+from lingo_mi.studies.markdown import table
+
+WARM = 5
+
+
+def kernels(work: Callable[[], object]) -> dict:
+    """Launches of some work that has run before, the milliseconds of all, and of the longest."""
+    work()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        work()
+        dr.sync_thread()
+        taken = [kernel['execution_time'] for kernel in dr.kernel_history()]
+    return dict(launches=len(taken), all=sum(taken), longest=max(taken))
+
+
+def measured(fitted: Fitted, repeats: int) -> dict[str, dict]:
+    """Of an image with its derivatives, and of a step: `kernels`; of a step also `seconds`, of one of many in a row."""
+    view = VIEW % len(fitted.geometry)
+    geometry, rng = fitted.geometry.subset([view]), np.random.default_rng(0)
+    scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)).astype(np.float32))
+    stepper, state = Stepper(scan, fitted.settings), DeviceState(fitted.state)
+    *vectors, density = (np.asarray(x, np.float32) for x in fitted.world_gaussians())
+    types = mi.Point3f, mi.Vector3f, mi.Vector4f
+    gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
+    rays = View.of(geometry.rays(), 0, *geometry.nDetector)
+
+    def step():
+        stepper.step(state, [0], fitted.settings.iterations - 1, rng)
+
+    for _ in range(WARM):
+        step()
+    dr.sync_thread()
+    begun = time.perf_counter()
+    for _ in range(repeats):
+        step()
+    dr.sync_thread()
+    seconds = (time.perf_counter() - begun) / repeats
+    return {
+        'image and derivatives': kernels(lambda: image([dr.detach(x) for x in gaussians], rays, derivatives=True)),
+        'a step': kernels(step) | dict(seconds=seconds),
+    }
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
+    p.add_argument('checkpoint', help='of a fit')
+    p.add_argument('--repeats', type=int, default=100, help='steps in a row')
+    p.add_argument('--variant', metavar='V')
+    args = p.parse_args()
+    variant = use_variant(args.variant)
+    fitted = Fitted.from_checkpoint(args.checkpoint)
+    found = measured(fitted, args.repeats)
+    columns = [
+        ('work', lambda row: row[0]),
+        ('launches', lambda row: f'{row[1]["launches"]}'),
+        ('kernels, ms', lambda row: f'{row[1]["all"]:.2f}'),
+        ('longest, ms', lambda row: f'{row[1]["longest"]:.2f}'),
+        ('in a row, ms', lambda row: f'{1e3 * row[1]["seconds"]:.2f}' if 'seconds' in row[1] else ''),
+    ]
+    print(table(columns, found.items()))  # type: ignore[arg-type] - rows of any kind do
+    if variant.startswith('cuda'):
+        print(beside('a step', 'step', found['a step']['seconds'], len(fitted.state)))
+
+
+if __name__ == '__main__':
+    main()
