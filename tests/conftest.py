@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
+from helpers.same import STAND_IN, adds_in_any_order
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -14,7 +15,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what 
 os.environ.setdefault('XLA_PYTHON_CLIENT_PREALLOCATE', 'false')  # JAX would take three quarters of a GPU's memory
 
 VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
-STAND_IN = 'LINGO_MI_CUDA_STAND_IN' in os.environ  # for the CUDA driver: one thread, without OptiX
 
 
 def pytest_addoption(parser):
@@ -44,7 +44,7 @@ def variant() -> str:
 @pytest.fixture
 def sums_in_order(variant) -> None:
     """Skips where the order of additions is not that of the program."""
-    if variant.startswith('cuda') and not STAND_IN:
+    if adds_in_any_order():
         pytest.skip('a GPU adds atomically, in any order')
 
 

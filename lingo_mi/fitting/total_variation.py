@@ -33,8 +33,7 @@ def random_cube_variation(
     """
     s, half, extent = settings.loss, geometry.half, settings.model.extent
     voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1
-    nx, ny, nz = (int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
-    shape = nx, ny, nz
+    shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
     room = between - (np.array(shape) - 1) * s.tv_stride
     corner = -half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
     voxel = voxel * s.tv_stride

@@ -3,7 +3,7 @@
     lingo-mi fit x3d_foot --out out/foot
     python -m lingo_mi.studies.cuda.measure out/foot/checkpoint.npz
 
-On a GPU the model's prediction stands beside the time of a step.
+On a GPU the times that the model predicts stand beside.
 """
 
 from __future__ import annotations
@@ -19,26 +19,29 @@ import numpy as np
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.step import Stepper
+from lingo_mi.gpu import gpu
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
-from lingo_mi.studies.cuda.model import beside
+from lingo_mi.studies.cuda.model import Card, counts, predicted
 from lingo_mi.studies.cuda.work import VIEW, image
 from lingo_mi.studies.markdown import table
 
 WARM = 5
+SHORT = 0.05  # ms
 
 
 def kernels(work: Callable[[], object]) -> dict:
-    """Launches of some work that has run before, the milliseconds of all, and of the longest."""
+    """Launches of some work, their milliseconds, and the same of those shorter than SHORT."""
     work()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         work()
         dr.sync_thread()
         taken = [kernel['execution_time'] for kernel in dr.kernel_history()]
-    return dict(launches=len(taken), all=sum(taken), longest=max(taken))
+    short = [ms for ms in taken if ms < SHORT]
+    return dict(launches=len(taken), all=sum(taken), short=len(short), of_short=sum(short))
 
 
 def measured(fitted: Fitted, repeats: int) -> dict[str, dict]:
@@ -69,6 +72,16 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, dict]:
     }
 
 
+def expected(gaussians: int) -> dict[str, float]:
+    """Milliseconds of the same work by the model, with as many pairs a Gaussian as in the foot; empty for an unknown card."""
+    card, foot = Card.of(gpu()), counts()['foot']
+    if not card.clock:
+        return {}
+    parts = {'image and derivatives': ('image', 'derivatives'), 'a step': ('step',)}
+    boxes = foot['boxes'] / foot['gaussians'] * gaussians
+    return {name: 1e3 * sum(predicted(part, card, gaussians, boxes) for part in of) for name, of in parts.items()}
+
+
 def main() -> None:
     p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     p.add_argument('checkpoint', help='of a fit')
@@ -78,16 +91,17 @@ def main() -> None:
     variant = use_variant(args.variant)
     fitted = Fitted.from_checkpoint(args.checkpoint)
     found = measured(fitted, args.repeats)
+    model = expected(len(fitted.state)) if variant.startswith('cuda') else {}
     columns = [
         ('work', lambda row: row[0]),
         ('launches', lambda row: f'{row[1]["launches"]}'),
         ('kernels, ms', lambda row: f'{row[1]["all"]:.2f}'),
-        ('longest, ms', lambda row: f'{row[1]["longest"]:.2f}'),
+        ('the model, ms', lambda row: f'{model[row[0]]:.2f}' if model else ''),
+        ('short kernels', lambda row: f'{row[1]["short"]}'),
+        ('those, ms', lambda row: f'{row[1]["of_short"]:.2f}'),
         ('in a row, ms', lambda row: f'{1e3 * row[1]["seconds"]:.2f}' if 'seconds' in row[1] else ''),
     ]
     print(table(columns, found.items()))  # type: ignore[arg-type] - rows of any kind do
-    if variant.startswith('cuda'):
-        print(beside('a step', 'step', found['a step']['seconds'], len(fitted.state)))
 
 
 if __name__ == '__main__':

@@ -12,10 +12,9 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting.loop import run as run_fit
 from lingo_mi.gpu import GPU
 from lingo_mi.studies.cell_files import CellFiles
-from lingo_mi.studies.cuda import assemble, model, report, waits
+from lingo_mi.studies.cuda import assemble, measure, model, report, waits
 from lingo_mi.studies.cuda.assemble import Kernel, find_ptxas
 from lingo_mi.studies.cuda.count import KINDS, _counts, difference
-from lingo_mi.studies.cuda.measure import measured
 from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
 from lingo_mi.studies.cuda.page import page
 from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files, run_tests
@@ -133,10 +132,23 @@ def test_times_of_a_kernel():
 
 def test_times_of_a_fit():
     scan = tiny_scan(geometry())
-    found = measured(run_fit(scan, SHORT, some_points(scan.geometry)), repeats=2)
+    found = measure.measured(run_fit(scan, SHORT, some_points(scan.geometry)), repeats=2)
     for work in found.values():
-        assert work['launches'] > 10 and 0 < work['longest'] <= work['all']
+        assert work['launches'] > 10 and 0 < work['short'] <= work['launches'] and 0 < work['of_short'] <= work['all']
     assert found['a step']['seconds'] > 0
+
+
+def test_times_by_the_model(monkeypatch):
+    card = CARDS[2]
+    monkeypatch.setattr(
+        measure, 'gpu', lambda: GPU(card.name, 0, card.multiprocessors, 64, 90, card.clock, card.bandwidth)
+    )
+    foot = counts()['foot']
+    found = measure.expected(foot['gaussians'])
+    assert found['a step'] == pytest.approx(1e3 * sum(seconds(kernel, card) for kernel in foot['step']))
+    assert found['image and derivatives'] < found['a step']
+    monkeypatch.setattr(measure, 'gpu', lambda: GPU('unknown', 0, 1, 64, 90, 0, 0))
+    assert measure.expected(1000) == {}
 
 
 def test_consumer_cards_take_longer_for_float64():
