@@ -128,7 +128,6 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
         )
     views = 0 if views is None else whole('views', views, 1)
     dataset = choose_views(read_scan(as_path('path', path), geometry), views)
-    check_memory(dataset.train.geometry)
     warn_if_truncated(dataset.train.geometry)
     return dataset
 

@@ -25,6 +25,7 @@ from lingo_mi.results.watch import watched
 from lingo_mi.results.watchers import watchers_of
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scene.checks import check_memory
 
 
 def fit(
@@ -56,8 +57,8 @@ def fit(
     settings     any setting of the fit by name, such as iterations=800, n_points=20_000 or lambda_tv=0.1 (see `Settings`)
 
     Returns a `Result`. Ctrl-C stops between two steps and leaves a checkpoint, where one is named. Raises InputError for an
-    unknown recipe or setting, a scan without signal, a checkpoint of another fit or that cannot be written, and a fit that
-    diverges.
+    unknown recipe or setting, a scan without signal or larger than memory, a checkpoint of another fit or that cannot be
+    written, and a fit that diverges.
 
         result = lm.fit(data, 'fast', iterations=800, checkpoint='out/foot.npz')
     """
@@ -66,6 +67,7 @@ def fit(
     require_type('recipe', recipe, (str, Settings))
     seed = parsing.seed(seed)
     dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
+    check_memory(dataset.train.geometry)
     if isinstance(recipe, Settings):
         name, chosen = 'settings', recipe.changed(**settings)
     else:

@@ -150,21 +150,20 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
     scene   the `LoadedScene` of args.scene
     views   how many evenly spaced views to use (None: all)
     seed    of the noise, where the scene's detector has any
-    slab    slices of the volume that are in memory at once (0: all)
+    slab    slices of the volume that are in memory at once (0: all; else there is no true volume)
     """
     from lingo_mi.files.scans import read_scan
     from lingo_mi.files.volumes import read_volume
-    from lingo_mi.scene.checks import check_memory, warn_if_truncated
+    from lingo_mi.scene.checks import check_memory, thinned, warn_if_truncated
     from lingo_mi.scene.simulate import choose_views, take_scan, with_effects
 
     if args.projections:
         dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
-        geometry = dataset.train.geometry
-        check_memory(geometry.slab(0, min(slab, geometry.nVoxel[2])) if slab else geometry)
+        check_memory(thinned(dataset.train.geometry, slab))
         warn_if_truncated(dataset.train.geometry)
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
-    return take_scan(scene, views or 0, volume, seed)
+    return take_scan(scene, views or 0, volume, seed, truth=not slab)
 
 
 def cluster_arguments(parser: argparse.ArgumentParser) -> None:

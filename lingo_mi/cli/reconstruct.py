@@ -56,7 +56,7 @@ from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
 from lingo_mi.progress import Progress
-from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, progress_bar, reconstruct
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
@@ -237,7 +237,8 @@ def reconstruct_into(
     effects      'model' or 'ignore'
     parameters   of the scene file
     """
-    scene = load_scene(args.scene, parameters)
+    slab = args.slab or 0
+    scene = load_scene(args.scene, parameters, slab)
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
     opacities = isinstance(cloud, Fitted) and not cloud.settings.volumetric
     if (args.algorithm in FROM_CLOUD or args.start) and opacities:
@@ -248,8 +249,10 @@ def reconstruct_into(
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
     views = args.views or (len(cloud.geometry) if cloud else None)
     if not (args.projections or args.volume):  # their geometry is not known before they are read
-        check_scan(scene.scanner.geometry, algorithm, views)
-    dataset = read_input(args, scene, None if cloud else args.views, seed or 0, args.slab or 0)
+        require_rays(scene.scanner.geometry)
+        if not slab:
+            check_room(scene.scanner.geometry, algorithm, views)
+    dataset = read_input(args, scene, None if cloud else args.views, seed or 0, slab)
     scan, inputs = dataset.train, {}
     parts = scan.geometry.slabs(args.slab or scan.geometry.nVoxel[2])
     require_rays(scan.geometry)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from lingo_mi.functional.frameworks import one_at_a_time
 from lingo_mi.projectors.upload import uploaded_tensor
 
 
@@ -44,7 +45,8 @@ def _on_host(function, result, *arrays):
     """function(*arrays) of NumPy's arrays; a callback where JAX traces, whose errors would hide ours elsewhere."""
 
     def of_numpy(*arrays):
-        return function(*map(np.asarray, arrays))
+        with one_at_a_time():
+            return function(*map(np.asarray, arrays))
 
     if any(isinstance(a, Tracer) for a in arrays):
         return jax.pure_callback(of_numpy, result, *arrays, vmap_method='sequential')

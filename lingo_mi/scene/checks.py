@@ -31,6 +31,11 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
         )
 
 
+def thinned(geometry: Geometry, slab: int) -> Geometry:
+    """A scan with the slices of its volume that are in memory at once, of which `slab` are asked for (0: all)."""
+    return geometry.slab(0, min(slab, geometry.nVoxel[2])) if slab else geometry
+
+
 def require_densities(volume: np.ndarray) -> None:
     """Raises InputError for a volume [x, y, z] that is hardly one of densities per mm: with a value of -500 or less, as
     Hounsfield units of air have, or below minus half the maximum.

@@ -13,7 +13,7 @@ import mitsuba as mi
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError
 from lingo_mi.interrupts import noticed
-from lingo_mi.scene.checks import check_memory
+from lingo_mi.scene.checks import check_memory, thinned
 from lingo_mi.scene.outline import outline
 
 
@@ -30,12 +30,13 @@ class LoadedScene:
         return self.path.stem
 
 
-def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedScene:
+def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int = 0) -> LoadedScene:
     """Load a Mitsuba scene with a `ct_scanner`.
 
     parameters   values for the scene's own `<default>` names
+    slab         slices of the volume that will be in memory at once (0: all)
 
-    Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong.
+    Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong, and where memory does not suffice.
     """
     path = Path(path)
     known = outline(path, parameters)
@@ -51,7 +52,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None) -> LoadedSc
     scanner = next((s for s in scene.sensors() if hasattr(s, 'geometry')), None)
     if scanner is None:
         raise InputError(f'{path}: the scene has no scanner; add <sensor type="ct_scanner">')
-    check_memory(scanner.geometry, scanner.test_geometry)
+    check_memory(thinned(scanner.geometry, slab), scanner.test_geometry)
     try:
         find_effects(scene, scanner)
     except InputError as error:

@@ -24,15 +24,17 @@ from lingo_mi.scene.load import LoadedScene
 from lingo_mi.scene.truth import ScannedVolume, fills_grid, true_volume
 
 
-def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None, seed: int = 0) -> Dataset:
+def take_scan(
+    loaded: LoadedScene, views: int = 0, volume: Volume | None = None, seed: int = 0, truth: bool = True
+) -> Dataset:
     """The scan of a scene: its measured projections if the scanner has any; otherwise all views are rendered.
 
     views    number of views to fit, evenly spaced among the scanner's (0: all)
     volume   `files.volumes.Volume` to scan instead of the scene's objects
     seed     of the detector's noise, if it has any
+    truth    whether the data set gets the true volume, where that is known on the scanner's grid
 
-    Held-out views are the scanner's test views, or the remaining views if it has none. The data set has the true volume if
-    that is known on the scanner's grid.
+    Held-out views are the scanner's test views, or the remaining views if it has none.
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:
@@ -71,7 +73,8 @@ def take_scan(loaded: LoadedScene, views: int = 0, volume: Volume | None = None,
         everything.subset(slice(0, len(geometry))), geometry=geometry
     )  # as given: joining may make poses of it
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
-    return choose_views(Dataset(train, held_out, true_volume(objects, geometry)), 0 if test is not None else views)
+    true = true_volume(objects, geometry) if truth else None
+    return choose_views(Dataset(train, held_out, true), 0 if test is not None else views)
 
 
 def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:

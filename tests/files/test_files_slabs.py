@@ -134,6 +134,32 @@ def test_completed_views_need_no_volume(tmp_path, monkeypatch):
     assert code == 0 and read_volume(tmp_path / 'v.nii').data.shape == (120, 120, 24), err
 
 
+def test_a_scene_whose_volume_is_larger_than_memory(tmp_path, monkeypatch):
+    scene = tmp_path / 'tiny.xml'
+    scene.write_text(SCENE.replace('24, 24, 24', '120, 120, 24').replace('"1, 1, 1"', '"0.2, 0.2, 1"'))
+    command = RECONSTRUCT, scene, '--algorithm', 'fdk', '--out', tmp_path / 'v.nii'
+    code, out, err = run(*command)
+    assert code == 0, err
+    whole = read_volume(tmp_path / 'v.nii').data
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 4e6)  # bytes; the volume has 1.4e6
+    code, _, err = run(*command, '--force')
+    assert code == 2 and 'of memory' in err
+    code, _, err = run(*command, '--force', '--slab', 4)
+    assert code == 0, err
+    np.testing.assert_allclose(read_volume(tmp_path / 'v.nii').data, whole, atol=1e-5 * whole.max())
+
+
+def test_a_scan_whose_volume_is_larger_than_memory(tmp_path, monkeypatch):
+    g = geometry((120, 120, 24))
+    write_scan(tmp_path / 'scan.npy', lm.Scan(g, noise((9, 40, 48))), 'npy')
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 4e6)
+    scan = lm.load(tmp_path / 'scan.npy').train
+    assert next(lm.FDK().slabs(scan, 4)).shape == (120, 120, 4)
+    for work in lambda: lm.fit(scan), lambda: lm.reconstruct(scan, lm.FDK()):
+        with pytest.raises(InputError, match='of memory'):
+            work()
+
+
 def test_the_command(tmp_path):
     zarr = pytest.importorskip('zarr')
     scene = tmp_path / 'tiny.xml'

@@ -495,10 +495,8 @@ def test_jacobian_of_torch():
         assert_same(host(row), host(density.grad))
 
 
-@pytest.mark.parametrize('kind', ['numpy', 'torch'])
+@pytest.mark.parametrize('kind', ['numpy', 'torch', 'jax'])
 def test_calls_from_several_threads(kind):
-    if kind == 'torch':
-        framework('torch')
     arrays = arrays_of(kind, columns(gaussians()))
     expected = host(project(*arrays, scan(), views=[0]))
     with ThreadPoolExecutor(4) as pool:
