@@ -58,12 +58,20 @@ _TEMPORARY = '.lingo_mi-{}-{}'
 _LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
 
 
+def parsed_json(text: str | bytes) -> Any:
+    """What a text in JSON says. Raises ValueError for any other text, also for one that is nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError('nested too deeply') from None
+
+
 def read_object(path: PathLike | str) -> dict[str, Any]:
     """What a JSON file holds by name. Raises InputError where it cannot be read or holds something else."""
     with reading(path):
         text = Path(path).read_text(encoding='utf-8', errors='replace')
     try:
-        found = json.loads(text)
+        found = parsed_json(text)
     except ValueError:
         found = None
     if not isinstance(found, dict):
@@ -188,19 +196,21 @@ def require_writable(folder: Path, path: Path, mend: str = 'choose another place
 
     mend   what to do, for the message
     """
-    made = []
     try:
-        for part in (*reversed(folder.parents), folder):
-            if not part.exists():
-                part.mkdir()
-                made.append(part)
-        with tempfile.TemporaryFile(dir=folder):  # of a name that no file has
+        with tempfile.TemporaryFile(dir=_deepest(folder)):  # of a name that no file has
             pass
     except OSError as error:
         raise InputError(f'{path}: cannot write there ({error.strerror}); {mend}') from None
-    finally:
-        for part in reversed(made):
-            part.rmdir()
+
+
+def _deepest(folder: Path) -> Path:
+    """The folder itself, or of those above it the first that exists. Nothing is made: another process may be about to."""
+    while True:
+        try:
+            os.lstat(folder)
+            return folder
+        except FileNotFoundError:
+            folder = folder.parent
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import flush_folder, leftovers, reading, replacing, writing
+from lingo_mi.file_access import flush_folder, leftovers, parsed_json, reading, replacing, writing
 from lingo_mi.folder_lock import LOCK
 
 METRICS, CHECKPOINT, MANIFEST, VIEWS = 'metrics.json', 'checkpoint.npz', '.lingo_mi.json', 'views'
@@ -48,7 +48,7 @@ def manifest_of(folder: Path) -> Manifest:
     _require_file(path)
     try:
         with reading(path):
-            found = json.loads(path.read_text(encoding='utf-8'))
+            found = parsed_json(path.read_text(encoding='utf-8'))
         names, begun = found['files'], found['writing']
         if not (isinstance(names, list) and isinstance(begun, bool) and all(isinstance(n, str) for n in names)):
             raise ValueError
@@ -190,7 +190,7 @@ def _write(folder: Path, manifest: Manifest) -> None:
 def _json(path: Path):
     try:
         with reading(path):
-            return json.loads(path.read_text(encoding='utf-8'))
+            return parsed_json(path.read_text(encoding='utf-8'))
     except ValueError as error:
         if isinstance(error, InputError):
             raise

@@ -7,7 +7,10 @@ import glob
 import os
 import re
 import sys
+import threading
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from lingo_mi.errors import InputError
@@ -16,6 +19,25 @@ LLVM_HELP = (
     'Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '
     'elsewhere install LLVM and set DRJIT_LIBLLVM_PATH to its libLLVM shared library.'
 )
+
+
+_LOCK = threading.RLock()
+
+
+@contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Holds up other threads: recorded kernels serve one at a time, and two threads in Dr.Jit may wait for each other for ever.
+
+    Tells Dr.Jit of a thread that goes on with another's arrays: PyTorch goes back through a graph on a GPU in a thread of its
+    own. Also a decorator: `@one_at_a_time()`.
+    """
+    import drjit as dr
+
+    with _LOCK:
+        for backend in dr.JitBackend.CUDA, dr.JitBackend.LLVM:
+            if dr.has_backend(backend):
+                dr.detail.new_scope(backend)
+        yield
 
 
 def cores() -> int:

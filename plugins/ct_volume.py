@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mitsuba as mi
@@ -61,9 +62,13 @@ def create(props: mi.Properties) -> mi.Object:
     ):
         if not isinstance(value, kinds):
             raise InputError(f'ct_volume: {key} = {value!r} is of the wrong type')
+    if not math.isfinite(scale):
+        raise InputError(f'ct_volume: scale must be finite, not {scale}')
     to_world = props.get('to_world', mi.ScalarTransform4f())
     if bool(filename) == bool(phantom):
         raise InputError('ct_volume needs either a filename or a phantom')
+    if phantom and mu_water:
+        raise InputError('ct_volume: mu_water is for a file in Hounsfield units; a phantom is scaled by scale')
     if phantom:
         data = make(phantom, size, seed).data
     else:

@@ -139,7 +139,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
             total = self._ideal(find_objects(scene), view, primal)
         else:
             total = effects.line_integrals(find_objects(scene), view, self.options)
-            total = effects.saturated(total, view) if seed is None else effects.measured(total, view, seed)
+            total = effects.expected(total, view) if seed is None else effects.measured(total, view, seed)
             if self.output == 'transmission':
                 total = dr.exp(-total)
         film = sensor.film()

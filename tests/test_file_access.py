@@ -3,14 +3,17 @@
 import os
 import threading
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import beside, reading, replacing, require_writable, write_text
+from lingo_mi.file_access import beside, read_object, reading, replacing, require_writable, write_text
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.output_folder import manifest_of
+from lingo_mi.results.stored import read_stored
 
 
 @pytest.mark.parametrize('name', ['v.raw', 'v', 'below/v.raw', './v.raw', 'a..b'])
@@ -96,3 +99,22 @@ def test_the_probe_has_a_name_of_its_own(tmp_path):
     (tmp_path / '.writable').write_text('mine')
     require_writable(tmp_path, tmp_path)
     assert (tmp_path / '.writable').read_text() == 'mine' and os.listdir(tmp_path) == ['.writable']
+
+
+def test_the_probe_makes_nothing(tmp_path):
+    """Not even folders that it would remove again: two commands may begin at once."""
+    made = []
+    with mock.patch.object(Path, 'mkdir', lambda *a, **k: made.append(a)):
+        require_writable(tmp_path / 'a' / 'b', tmp_path)
+    assert not made and os.listdir(tmp_path) == []
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(InputError, match='cannot write there'):
+        require_writable(tmp_path / 'file' / 'b', tmp_path)
+
+
+@pytest.mark.parametrize('call', [lambda f: read_object(f / 'metrics.json'), manifest_of, read_stored])
+def test_json_that_is_nested_too_deeply(tmp_path, call):
+    for name in ('.lingo_mi.json', 'metrics.json'):
+        (tmp_path / name).write_text('[' * 200_000)
+    with pytest.raises(InputError):
+        call(tmp_path)

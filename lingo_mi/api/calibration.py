@@ -13,7 +13,7 @@ from lingo_mi.geometry import Geometry
 from lingo_mi.parsing import whole
 from lingo_mi.progress import Progress
 from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.runtime import ensure_variant
+from lingo_mi.runtime import ensure_variant, one_at_a_time
 from lingo_mi.scan import Dataset, Scan
 
 MOST_DEGREE, MOST_CURVE = 8, 3
@@ -39,9 +39,13 @@ class Calibration:
     @property
     def needed(self) -> bool:
         """Whether anything is more than three standard errors from zero."""
-        drift, response = self.found.drift, self.found.response
-        responds = response is not None and any(part.values.any() for part in response.parts)
-        return any(drift.u) or any(drift.v) or bool(drift.yaw) or responds
+        drift = self.found.drift
+        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._responds
+
+    @property
+    def _responds(self) -> bool:
+        response = self.found.response
+        return response is not None and any(part.values.any() for part in response.parts)
 
     def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
         """The same views with the panel where it was found. Views that were held out get what was found for their time, which
@@ -61,7 +65,7 @@ class Calibration:
         if not self.needed:
             return scan
         response = self.found.response
-        if response is not None:
+        if response is not None and self._responds:
             if scan.effects is not None:  # it was found on line integrals
                 scan = linearised(scan, scan.effects)
             scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
@@ -69,7 +73,7 @@ class Calibration:
 
     def lines(self) -> list[str]:
         """What was found, in sentences."""
-        f, (_, du) = self.found, self.geometry.dDetector
+        f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
         told = []
         for name, value in f.measured.items():
             error, kept = f.errors[name], self._kept(name)
@@ -79,7 +83,8 @@ class Calibration:
                 text = f'{_TERMS[name.rstrip("0123456789_")]} ({name}): {value:+.3g} +- {error:.2g}'
             else:
                 what = 'shift' if len(name) == 1 else f'drift of order {name[1:]}'
-                text = f'{what} of the panel along {name[0]}: {value:+.4g} mm +- {error:.2g} ({value / du:+.3f} pixels)'
+                pixels = value / pixel[name[0]]
+                text = f'{what} of the panel along {name[0]}: {value:+.4g} mm +- {error:.2g} ({pixels:+.3f} pixels)'
             told.append(text + ('' if kept else ', not taken, as it is less than three standard errors'))
         told.append(
             f'views predict each other to {f.after:.4g} rms instead of {f.before:.4g} (line integrals, smoothed)'
@@ -97,6 +102,7 @@ class Calibration:
         return k < len(values) and bool(values[k])
 
 
+@one_at_a_time()
 def calibrate(
     scan: Scan | Dataset,
     *,

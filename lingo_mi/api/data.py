@@ -21,7 +21,7 @@ from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
 from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
 from lingo_mi.raw.importing import Options, import_raw
-from lingo_mi.runtime import ensure_variant
+from lingo_mi.runtime import ensure_variant, one_at_a_time
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory, require_densities, warn_if_truncated
 from lingo_mi.scene.load import load_scene
@@ -29,6 +29,7 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import choose_views, take_scan
 
 
+@one_at_a_time()
 def simulate(
     source: str | PathLike | Phantom | np.ndarray,
     geometry: Geometry | None = None,
@@ -44,7 +45,8 @@ def simulate(
     source      a Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a
                 `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
     geometry    for a phantom or a volume: the scanner. A volume must have `geometry.nVoxel` voxels. Without it, a phantom
-                is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out
+                is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out. On a grid
+                other than its own, a phantom is its voxels
     views       how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
                 has views of its own for that. Of a phantom without a geometry: how many to scan
     held_out    with `geometry`: further views, to measure new views on

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 from dataclasses import replace
 from functools import cached_property
 from os import PathLike
@@ -16,7 +15,7 @@ import numpy as np
 from lingo_mi import notebook
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError, require_type
-from lingo_mi.file_access import as_path, replacing, writing
+from lingo_mi.file_access import as_path, parsed_json, replacing, writing
 from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting.fitted import Fitted, NeedsEffects
 from lingo_mi.fitting.settings import Settings
@@ -276,7 +275,7 @@ def load_result(path: str | PathLike) -> Result:
     stored = None
     if path.is_dir() and numbers.exists():
         try:
-            stored = current_names(json.loads(numbers.read_text(encoding='utf-8')))
+            stored = current_names(parsed_json(numbers.read_text(encoding='utf-8')))
         except (ValueError, AttributeError):  # no JSON, or no dictionary
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
     return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)

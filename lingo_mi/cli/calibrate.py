@@ -5,9 +5,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
+from lingo_mi.cli.common import Parser, check_scan_output
 from lingo_mi.runtime import use_variant
 
 EPILOG = """\
@@ -47,19 +45,8 @@ def main() -> None:
     parser.add_argument('--force', action='store_true', help='overwrite existing files')
     parser.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     args = parser.parse_args()
-    written = []
     if args.out is not None:
-        if args.out.suffix != '.npy':
-            raise InputError(
-                f'{args.out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy'
-            )
-        written = [args.out, args.out.with_suffix('.yml'), args.out.with_name(args.out.stem + '.valid.npy')]
-        if Path(args.scan).resolve() in [file.resolve() for file in written]:
-            raise InputError(f'{args.scan}: would be overwritten; give --out another name')
-        for file in written:
-            if file.exists() and not args.force:
-                raise InputError(f'{file}: exists already; give --force to overwrite it')
-        require_writable(args.out.parent, args.out, 'choose another --out')
+        check_scan_output(args.out, _inputs(Path(args.scan)), args.force)
     use_variant(args.variant)
     from lingo_mi.api.calibration import calibrate
     from lingo_mi.files.scans import history_of, read_scan, write_scan
@@ -84,3 +71,13 @@ def main() -> None:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_scan(args.out, calibration.corrected(scan), 'npy', history)
         print(args.out)
+
+
+def _inputs(scan: Path) -> list[Path]:
+    """The files that a scan is read from, but for those of a folder."""
+    from lingo_mi.files.scans import geometry_of, named_files
+
+    if scan.suffix != '.npy':
+        return [scan]
+    geometry = Path(geometry_of(scan))
+    return [scan, geometry, *named_files(geometry)]

@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -164,6 +165,25 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
         return dataset
     volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
     return take_scan(scene, views or 0, volume, seed, truth=not slab)
+
+
+def check_scan_output(out: Path, inputs: Iterable[PathLike | str | None], force: bool) -> None:
+    """Raises InputError unless a scan can be written to `out`, an .npy, and beside it, over none of the files that are read.
+
+    force   whether other files may be overwritten
+    """
+    from lingo_mi.files.scans import written_files
+
+    if out.suffix != '.npy':
+        raise InputError(f'{out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy')
+    written = written_files(out)
+    for given in filter(None, inputs):
+        if Path(given).resolve() in [file.resolve() for file in written]:
+            raise InputError(f'{given}: would be overwritten by {out} or a file beside it; give --out another name')
+    for file in written:
+        if file.exists() and not force:
+            raise InputError(f'{file}: exists already; give --force to overwrite it')
+    require_writable(out.parent, out, 'choose another --out')
 
 
 def cluster_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,9 +3,8 @@
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, check_scan_output
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
 
 EPILOG = """\
 examples:
@@ -27,7 +26,11 @@ def arguments() -> argparse.Namespace:
     )
     add('--geometry', required=True, metavar='F', help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml")
     add(
-        '--out', required=True, type=Path, metavar='F.npy', help='the scan; F.yml and F.valid.npy are written beside it'
+        '--out',
+        required=True,
+        type=Path,
+        metavar='F.npy',
+        help='the scan; F.yml, F.valid.npy and, for many poses, F.poses.npy are written beside it',
     )
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')
@@ -70,24 +73,15 @@ def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
 
 def main() -> None:
     args = arguments()
-    from lingo_mi.files.scans import write_scan
+    from lingo_mi.files.scans import named_files, write_scan
     from lingo_mi.raw.importing import Options, import_raw
     from lingo_mi.raw.nikon import read_numbers
 
-    if args.out.suffix != '.npy':
-        raise InputError(f'{args.out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy')
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
-    written = [args.out, args.out.with_suffix('.yml'), args.out.with_name(args.out.stem + '.valid.npy')]
-    for given in filter(None, (args.frames, args.geometry, args.flats, args.darks, args.angles, args.exposure)):
-        if Path(given).resolve() in [file.resolve() for file in written]:
-            raise InputError(
-                f'{given}: would be overwritten by {args.out} or a file beside it; give --out another name'
-            )
-    for file in written:
-        if file.exists() and not args.force:
-            raise InputError(f'{file}: exists already; give --force to overwrite it')
-    require_writable(args.out.parent, args.out, 'choose another --out')
+    named = named_files(args.geometry) if Path(args.geometry).suffix.lower() in ('.yml', '.yaml') else []
+    inputs = [args.frames, args.geometry, args.flats, args.darks, args.angles, args.exposure, *named]
+    check_scan_output(args.out, inputs, args.force)
     exposure = 1.0
     if args.exposure is not None:
         try:

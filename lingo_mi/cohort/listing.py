@@ -11,14 +11,13 @@ from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 
-from lingo_mi.cohort.row import COLUMNS, Row
+from lingo_mi.cohort.row import COLUMNS, Row, scene_of
 from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import reading
 from lingo_mi.files.scans import load_yaml, reader_of
 from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.parsing import MOST_SEED, nearest
 from lingo_mi.scene.load import defaults
-from lingo_mi.scene.shipped import scene_path, scenes
 
 RESERVED = 'results.csv', 'results.parquet', 'batch.log'  # names in the output folder
 MOST_NAME = 100  # bytes of a name
@@ -119,7 +118,7 @@ def _row(cells: dict[str, str], line: int, folder: Path, recipe: str) -> Row:
     file, geometry = own.get('file', ''), own.get('geometry', '')
     if not (file or geometry):
         raise InputError('names neither a file nor a scene')
-    scene = _scene(folder, geometry) if geometry else None
+    scene = scene_of(folder, geometry)
     of_scene = _parameters(scene) if scene else frozenset()
     recipe = own.get('recipe', recipe)
     known = METHODS['fast'].flat()
@@ -161,7 +160,7 @@ def _check(row: Row) -> None:
         with reading(path, folder=path.is_dir()):
             if not os.access(path, os.R_OK):
                 raise InputError(f'{path}: may not be read; check its permissions')
-    if scene_of(row) is not None:
+    if row.scene is not None:
         return
     if path is None:
         raise InputError('has no file')
@@ -171,23 +170,6 @@ def _check(row: Row) -> None:
     reader_of(path, geometry)
     if geometry:
         load_yaml(geometry)
-
-
-def scene_of(row: Row) -> Path | None:
-    """The file of a row's scene; None where its geometry is none. Raises InputError where there is no such scene."""
-    return _scene(Path(row.folder), row.geometry) if row.geometry else None
-
-
-def _scene(folder: Path, geometry: str) -> Path | None:
-    if geometry.endswith('.xml'):
-        return scene_path(folder / geometry)
-    if Path(geometry).suffix.lower() in ('.yml', '.yaml'):
-        return None
-    if geometry not in scenes():
-        raise InputError(
-            f'geometry {shown(geometry)}: must be a geometry file (.yml) or a scene (.xml, or {", ".join(scenes())})'
-        )
-    return scene_path(geometry)
 
 
 @lru_cache(1000)

@@ -8,16 +8,21 @@ from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading
+from lingo_mi.errors import InputError, shown
+from lingo_mi.file_access import parsed_json, reading
+from lingo_mi.files import scans
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
+from lingo_mi.scene import outline
+from lingo_mi.scene.shipped import scene_path, scenes
 
 # How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
 COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'
 CONTENT = 'content of the geometry'  # in a request
 SCAN = 'content of the scan'
+NAMED = 'content of files that the geometry names'
+SYSTEM = '.DS_Store', 'Thumbs.db', 'desktop.ini'  # what desktops leave in folders
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,11 @@ class Row:
         """Of the file."""
         return Path(self.folder) / self.file if self.file else None
 
+    @property
+    def scene(self) -> Path | None:
+        """The file of the scene; None where the geometry is none. Raises InputError where there is no such scene."""
+        return scene_of(Path(self.folder), self.geometry)
+
     def fit_settings(self) -> Settings:
         """All settings of the fit. Raises InputError for an unknown one, or a value out of its range."""
         return settings_of(self.recipe, **self.settings)
@@ -69,17 +79,42 @@ class Row:
         if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
             kept[CONTENT] = hashlib.sha256(geometry.read_bytes()).hexdigest()
         if path is not None and path.exists():
-            kept[SCAN] = _digest(_files(path))
+            kept[SCAN] = _digest(_files(path, geometry if self.geometry else None))
+        if others := self._named():
+            kept[NAMED] = _digest(others)
         return json.loads(json.dumps(kept | dict(bytes=size, settings=settings)))  # as a file has it
 
+    def _named(self):
+        """The files that the geometry names and the numbers depend on."""
+        if self.scene is not None:
+            return [f for f in outline.named_files(self.scene, self.parameters) if f.resolve() != self.scene.resolve()]
+        return scans.named_files(Path(self.folder) / self.geometry) if self.geometry else []
 
-def _files(path):
-    """All files of a scan: those of a folder, or of an .npy also those beside it with its name, as its geometry and mask."""
+
+def scene_of(folder: Path, geometry: str) -> Path | None:
+    """The file of the scene that a column `geometry` names; None for a geometry file, and for ''.
+
+    Raises InputError where it names neither.
+    """
+    if geometry.endswith('.xml'):
+        return scene_path(folder / geometry)
+    if not geometry or Path(geometry).suffix.lower() in ('.yml', '.yaml'):
+        return None
+    if geometry not in scenes():
+        raise InputError(
+            f'geometry {shown(geometry)}: must be a geometry file (.yml) or a scene (.xml, or {", ".join(scenes())})'
+        )
+    return scene_path(geometry)
+
+
+def _files(path, geometry):
+    """All files of a scan: those of a folder; of an .npy without a geometry elsewhere also that beside it, and what it names."""
     if path.is_dir():
-        return [file for file in path.rglob('*') if file.is_file()]
-    if path.suffix.lower() != '.npy':
+        return [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
+    if path.suffix.lower() != '.npy' or geometry is not None:
         return [path]
-    return [file for file in path.parent.iterdir() if file.is_file() and file.name.startswith(path.stem + '.')]
+    beside = scans.geometry_of(path)
+    return [path, beside, *scans.named_files(beside)]
 
 
 def _digest(files):
@@ -116,13 +151,14 @@ def stored(out: Path, row: Row) -> dict | None:
         return None
     try:
         with reading(folder / METRICS):
-            found = json.loads((folder / METRICS).read_text(encoding='utf-8'))
-        files, asked, wanted = found['files'], found.get('request'), row.request()
+            found = parsed_json((folder / METRICS).read_text(encoding='utf-8'))
+        files, asked = found['files'], found.get('request')
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):
         raise InputError(f'{folder}: holds a result that is none of a list; give another name')
-    known = {k: wanted[k] for k in (CONTENT, SCAN) if k in wanted} | asked  # of older results they are not known
+    wanted = row.request()
+    known = {k: wanted[k] for k in (CONTENT, SCAN, NAMED) if k in wanted} | asked  # of older results they are not known
     if changed := [k for k in wanted if known.get(k) != wanted[k]]:
         if changed == ['settings']:
             changed = [k for k, v in wanted['settings'].items() if asked['settings'].get(k) != v]

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lingo_mi.cohort.listing import scene_of
 from lingo_mi.cohort.row import Row, stored
 from lingo_mi.errors import InputError
 from lingo_mi.files.scans import read_scan
@@ -50,7 +49,7 @@ def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
 
 def read_row(row: Row) -> Dataset:
     """The scan of a row: its projections, or what the scene's scanner sees of its volume. Raises InputError."""
-    scene = scene_of(row)
+    scene = row.scene
     if scene is not None:
         volume = None if row.path is None else read_volume(row.path, row.mu_water)
         return take_scan(load_scene(scene, row.parameters), row.views or 0, volume, row.seed)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from lingo_mi.calibration.response.response import Response
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.errors import InputError
+from lingo_mi.file_access import parsed_json
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.poses import Poses
 from lingo_mi.geometry.base import Geometry
@@ -30,6 +31,7 @@ class FittedCloud:
     corrected   the geometry with corrected poses; `geometry` itself if the fit has not corrected them
     extent      cut-off in standard deviations
     effects     effects that the fit has modelled; None if it treated the projections as line integrals
+    response    air levels and gains of the views that the fit has found; None if it sought none
     seed        of the fit and of the noise in its simulated scan; None if unknown
     """
 
@@ -38,6 +40,7 @@ class FittedCloud:
     corrected: Geometry
     extent: float
     effects: Effects | None
+    response: Response | None
     seed: int | None
 
     @classmethod
@@ -47,7 +50,8 @@ class FittedCloud:
         if gaussians is None:
             return fitted
         extent = fitted.settings.model.extent
-        return cls(gaussians, fitted.geometry, fitted.corrected, extent, fitted.effects, fitted.seed)
+        effects = fitted.effects and fitted.effects.of_cloud()
+        return cls(gaussians, fitted.geometry, fitted.corrected, extent, effects, fitted.model.response, fitted.seed)
 
     def render(self, geometry: Geometry) -> np.ndarray:
         """Line integrals in any views, float32 [view, v, u]."""
@@ -69,12 +73,14 @@ def load_cloud(path: Path | str) -> FittedCloud | Fitted:
     if options is None or len(objects) != 1 or not isinstance(objects[0], Ellipsoids):
         raise InputError(f'{path}: is no cloud of Gaussians; {WANTED}')
     corrected, record = loaded.scanner.geometry, _record(path)
+    given = _as_given(corrected, record, path)
     return FittedCloud(
         objects[0],
-        _as_given(corrected, record, path),
+        given,
         corrected,
         options.extent,
         find_effects(loaded.scene, loaded.scanner),
+        _response(given, record, path),
         record.get('seed'),
     )
 
@@ -85,7 +91,7 @@ def _record(path) -> dict:
     if not file.exists():
         return {}
     try:
-        record = json.loads(file.read_text(encoding='utf-8'))
+        record = parsed_json(file.read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
         raise InputError(f'{file}: cannot be read ({type(error).__name__}); fit again, or remove it') from None
     return record if isinstance(record, dict) else {}
@@ -104,6 +110,24 @@ def _as_given(geometry: Geometry, record: dict, path) -> Geometry:
         raise InputError(f'{path}: the poses in the {METRICS} beside it are of another fit')
     poses.turn, poses.shift = np.radians(turn), shift * geometry.scale
     return poses.undone().corrected(geometry)
+
+
+def _response(geometry: Geometry, record: dict, path) -> Response | None:
+    """The air levels and gains of the views that a fit has found."""
+    if 'response' not in record:
+        return None
+    try:
+        found = {name: np.array(values, float) for name, values in record['response'].items()}
+        values = dict(air=found.get('air_level'), gain=found.get('gain_percent'))
+        if any(x is not None and x.shape != (len(geometry),) for x in values.values()):
+            raise ValueError
+    except (AttributeError, TypeError, ValueError):
+        raise InputError(f'{path}: the response in the {METRICS} beside it is of another fit') from None
+    response = Response.of(geometry, **{name: 'view' for name, x in values.items() if x is not None})
+    if response is not None:
+        factor = dict(air=1.0, gain=0.01)
+        response.restore({f'response.{k}': factor[k] * x[:, None] for k, x in values.items() if x is not None})
+    return response
 
 
 def _from_checkpoint(path) -> Fitted:

@@ -80,8 +80,11 @@ def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.nda
 
 
 def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
-    """Line integrals of measured views: `corrected`, with the cloud, for the effects that its fit has modelled. Without such
-    effects, the scan itself."""
+    """Line integrals of measured views: without the response that the cloud's fit has found, and `corrected`, with the cloud, for
+    the effects that it has modelled. Without either, the scan itself."""
+    response = cloud.model.response if isinstance(cloud, Fitted) else cloud.response
+    if response is not None:
+        scan = replace(scan, projections=response.undone(scan.projections, cloud.geometry))
     if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing and fields model none
         return scan
     return corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)

@@ -6,7 +6,8 @@ r_m(E) = mu_m(E) / mu_m(E0). A detector measures (Alvarez and Macovski, Phys. Me
     h(p) = -ln \int s(E) exp(-sum_m r_m(E) p_m) dE   ~   -ln sum_k w_k exp(-sum_m R_mk p_m)
 
 with K terms of positive weights that sum to 1. The terms start as K intervals of energy. Weights and ratios are then
-optimised together for the least mean square error of h over a range of p.
+optimised together for the least mean square error of h up to a largest h of every material alone, so the result does not
+depend on the reference energy.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 from scipy.special import logsumexp, softmax
 from scipy.stats import qmc
 
@@ -74,7 +75,7 @@ def band(signal: ArrayLike, ratios: ArrayLike, count: int, largest: float) -> Ba
     signal    [E] shares of the detected signal; they sum to 1
     ratios    [M, E] attenuation of every material, relative to that at the reference energy
     count     bands, 1 to 6
-    largest   largest sum of the line integrals that they are fitted for
+    largest   h up to which they are fitted: of each material alone, and of mixtures of such amounts
 
     Raises InputError for a count out of range.
     """
@@ -91,7 +92,8 @@ def _band(signal, ratios, materials, count, largest):
     ratios = np.frombuffer(ratios).reshape(materials, -1)
     if len(signal) <= count:
         return Bands(signal, ratios)
-    points = _points(materials, largest, 7)
+    reach = np.array([_reach(signal, r, largest) for r in ratios])
+    points = _points(materials, 7) * reach
     exact = _hardened(points, signal, ratios)
     # Narrow bands at low energies: few photons, but they cause the hardening.
     edges = np.searchsorted(np.cumsum(signal), (np.arange(1, count) / count) ** 2.5)
@@ -121,7 +123,7 @@ def _band(signal, ratios, materials, count, largest):
         max_nfev=MOST_STEPS,
     ).x
     weights, found = unpacked(x)
-    fine = _points(materials, largest, 11)
+    fine = _points(materials, 11) * reach
     worst = np.abs(_hardened(fine, weights, found) - _hardened(fine, signal, ratios)).max()
     return Bands(weights, found, float(worst))
 
@@ -132,14 +134,20 @@ def _hardened(points, weights, ratios):
     return -total
 
 
-def _points(materials, largest, power):
-    """Line integrals [n, M] with sums up to `largest`: each material alone, and 2^power mixtures."""
+def _reach(signal, ratios, largest):
+    """The line integral of one material that is measured as `largest`."""
+    most = largest / ratios.min()  # h rises at least as fast as in the hardest light
+    return brentq(lambda p: _hardened(np.array([p]), signal, ratios[None]) - largest, 0, most * (1 + 1e-6))
+
+
+def _points(materials, power):
+    """Amounts [n, M] with sums up to 1: each material alone, and 2^power mixtures."""
     n = 2**power
-    alone = np.concatenate([np.linspace(0, largest, n)[:, None] * axis for axis in np.eye(materials)])
+    alone = np.concatenate([np.linspace(0, 1, n)[:, None] * axis for axis in np.eye(materials)])
     if materials == 1:
         return alone
     u = qmc.Sobol(materials, scramble=False).random(n)
-    total, rest = largest * u[:, 0], np.ones(n)
+    total, rest = u[:, 0], np.ones(n)
     mixed = np.empty((n, materials))
     for m in range(materials - 1):  # breaks a stick of length 1
         mixed[:, m] = rest * u[:, m + 1]

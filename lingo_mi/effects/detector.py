@@ -16,6 +16,7 @@ a view does not depend on which other views are rendered, or in which order.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -109,9 +110,10 @@ class Detector:
         return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 
     def binned(self, pixels: int) -> Detector:
-        """The detector of which that many pixels became one: their photons and read-out noise, without dead pixels and gains."""
+        """The detector of which that many pixels became one: their photons and noise, without dead pixels and gains."""
         noise = self.electronic_noise * pixels**0.5
-        return replace(self, photons=self.photons * pixels, electronic_noise=noise, dead=0.0, gain=0.0)
+        bits = self.bits and self.bits + round(math.log2(pixels**0.5))  # a mean of n is rounded sqrt(n) times as finely
+        return replace(self, photons=self.photons * pixels, electronic_noise=noise, bits=bits, dead=0.0, gain=0.0)
 
     @property
     def floor(self) -> float:
@@ -212,7 +214,8 @@ def taps(sigma: float) -> list[float]:
 
 @lru_cache(maxsize=4)
 def _maps(seed, gain, dead, shape):
-    rng = np.random.Generator(np.random.Philox(key=[_MAPS + seed, 0]))
+    key = np.array([_MAPS + seed, 0], np.uint64)  # a list would become float64, which rounds the seed off
+    rng = np.random.Generator(np.random.Philox(key=key))
     gains = np.maximum(1 + gain * rng.standard_normal(shape), 0.01)  # no pixel is quite blind by its gain
     return gains, rng.random(shape) < dead
 

@@ -57,6 +57,15 @@ class Effects:
         )
 
     @property
+    def needs_materials(self) -> bool:
+        """Whether it matters what the objects are made of."""
+        return self.tube is not None and (self.tube.hardens or self.scatter is not None)
+
+    def of_cloud(self) -> Effects:
+        """The same for a fitted cloud, or a volume, that stands for all shapes. Raises InputError as `Tube.fitted`."""
+        return replace(self, tube=self.tube.of_cloud()) if self.tube and self.needs_materials else self
+
+    @property
     def response(self) -> str:
         return self.detector.response if self.detector else 'energy'
 
@@ -74,8 +83,10 @@ class Effects:
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
         objects   of `projectors.objects.find_objects`
-        options   its n x n rays per pixel are averaged as intensities
+        options   its n x n rays per pixel are averaged as intensities; a detector with an `aperture` has points of its own in
+                  every pixel
         """
+        options = self._rays(options)
         groups, bands = {'': objects}, None
         if self.tube and self.tube.hardens:
             groups = by_material(objects, self.tube)
@@ -95,6 +106,9 @@ class Effects:
         if self.scatter and self.tube:
             scattered = self.scatter.light(objects, self.tube, self.response, view, self.index)
         return self.averaged(along, view, options, scattered)
+
+    def _rays(self, options):
+        return replace(options, pixel=1, area=False) if self.detector and self.detector.aperture else options
 
     def averaged(self, along: Callable[[View], Any], view: View, options: RenderOptions, scattered: Any = None) -> Any:
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
@@ -122,6 +136,13 @@ class Effects:
         if not (self.detector and self.detector.saturation):
             return integrals
         return dr.maximum(integrals, mi.Float(self.detector.saturates((view.height, view.width)).ravel()))
+
+    def expected(self, integrals: Any, view: View) -> Any:
+        """-ln of the signal that `measured` gives without noise: saturated, with the gains that the detector leaves in."""
+        found = self.saturated(integrals, view)
+        if not (self.detector and self.detector.gain) or self.detector.corrected:
+            return found
+        return found - mi.Float(np.log(self.detector.maps((view.height, view.width))[0]).ravel())
 
     def masked(self, scan: Scan) -> Scan:
         """The scan with dead pixels invalid."""
@@ -164,6 +185,11 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
     if len(tubes) > 1:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
     tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
+    shapes = {shape.id() for shape in scene.shapes()} | {'volume'}  # --volume stands in for the shapes
+    if tube is not None and (unknown := sorted(tube.materials.keys() - shapes)):
+        raise InputError(
+            f'xray_tube {tubes[0].id()!r}: material_{unknown[0]} names none of the shapes {", ".join(sorted(shapes))}'
+        )
     geometry = getattr(sensor, 'geometry', None)
     if detector is not None and detector.psf and geometry is None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import drjit as dr
@@ -20,7 +20,7 @@ from lingo_mi.effects.spectrum import Spectrum, attenuation, monochromatic, tube
 from lingo_mi.errors import InputError
 
 REFERENCE = 60.0  # keV; water attenuates .0206 per mm
-LARGEST = 10.0  # sum of line integrals up to which bands are fitted; 5e-5 of the photons remain there
+LARGEST = 10.0  # measured line integral up to which bands are fitted; 5e-5 of the signal remains there
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TubeParameters:
     reference: float | None = None
     material: str = ''
     split: str = ''
-    bands: int = 4
+    bands: int = 5
     materials: dict[str, str] = field(default_factory=dict)
 
     def given(self) -> dict:
@@ -63,7 +63,7 @@ class Tube:
     material: tuple[str, ...] = ()
     materials: dict[str, tuple[str, ...]] = field(default_factory=dict)
     split: tuple[float, float] | None = None
-    bands: int = 4
+    bands: int = 5
     given: dict = field(default_factory=dict, compare=False)
 
     @staticmethod
@@ -121,7 +121,10 @@ class Tube:
         return names
 
     def fitted(self) -> tuple[str, ...]:
-        """The materials of all objects, one or two, for a fitted cloud, which has no shapes. Raises InputError."""
+        """The materials of all objects, one or two, for a fitted cloud, which has no shapes. Raises InputError.
+
+        Two of different shapes come in the order of their attenuation, as `split` tells them apart.
+        """
         names = tuple(dict.fromkeys([*self.material, *(name for shape in self.materials.values() for name in shape)]))
         if not names:
             raise InputError(
@@ -134,7 +137,13 @@ class Tube:
                 + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
                 + ', or leave it out with -D effects=ignore'
             )
+        if len(names) == 2 and names != self.material:
+            names = tuple(sorted(names, key=lambda name: attenuation(name, [self.reference])[0]))
         return names
+
+    def of_cloud(self) -> Tube:
+        """The tube of a fitted cloud, which stands for all shapes. Raises InputError as `fitted`."""
+        return replace(self, material=self.fitted(), materials={})
 
     def signal(self, names: Iterable[str], response: str = 'energy') -> energy_bands.Bands:
         """The bands for materials (names). response: the detector integrates 'energy' or counts photons ('count')."""

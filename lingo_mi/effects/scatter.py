@@ -36,6 +36,7 @@ from lingo_mi.projectors.view import View
 BATCHES = 16
 MOST_LANES = 2**22  # paths per launch: a few hundred megabytes
 LEAST_GRID, MOST_GRID = 4, 256  # a bicubic spline needs four points
+MOST_TOGETHER = 2**29  # rows x columns of the grid x paths: some gigabytes at once
 MOST_PATHS, MOST_VOXELS, MOST_ENERGIES, MOST_ORDERS = 2**20, 512, 16, 1000
 _LATTICE = [int(2**32 / 1.2207440846057596**k) for k in (1, 2, 3)]  # powers of the root of x^4 = x + 1 (Roberts)
 
@@ -74,6 +75,11 @@ class Scatter:
             raise InputError(
                 f'scatter_grid must be one or two whole numbers from {LEAST_GRID} to {MOST_GRID}, rows and '
                 f'columns, not {grid!r}'
+            )
+        if numbers[0] * numbers[-1] * paths > MOST_TOGETHER:
+            raise InputError(
+                f'scatter: {paths} paths to each of {numbers[0]} x {numbers[-1]} points take too much memory: '
+                f'give at most {MOST_TOGETHER // (numbers[0] * numbers[-1])} paths, or a smaller scatter_grid'
             )
         return (
             Scatter(paths, (numbers[0], numbers[-1]), orders, voxels, energies, seed, _corners(box)) if paths else None

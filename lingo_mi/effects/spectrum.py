@@ -82,8 +82,10 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     path = _cache_folder() / f'spekpy-{_version("spekpy")}_{re.sub(r"[^A-Za-z0-9.]", "_", name)}.npz'
     try:
         with np.load(path) as table:
-            return Spectrum(table['energies'], table['photons'])
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # no cached file yet, or a damaged one
+            found = Spectrum(table['energies'], table['photons'])
+        if abs(found.photons.sum() - 1) < 1e-6:
+            return found
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # no cached file yet, or a damaged one
         pass
     tube = library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)
     try:
@@ -92,6 +94,8 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
         energies, photons = tube.get_spectrum(edges=False)
     except Exception as error:  # spekpy raises plain Exceptions
         raise InputError(f'filtration {filtration!r}: spekpy cannot compute it ({str(error).strip()})') from None
+    if not (np.isfinite(photons).all() and photons.sum() > 0):
+        raise InputError(f'filtration {filtration!r}: no photon of {kvp:g} kV passes it')
     spectrum = Spectrum(energies, photons / photons.sum())
     _store(path, spectrum)
     return spectrum

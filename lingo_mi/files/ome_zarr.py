@@ -59,7 +59,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             fail(f'has values of the type {dtype} in the shape {list(shape)}, not one number a voxel')
         if any(n != 1 for n, name in zip(shape, names) if name not in SPACE) or min(shape) < 1:
             fail(f'has the shape {list(shape)} along {" ".join(names)}; a single volume is needed')
-        require_room(math.prod(shape) * (dtype.itemsize + 8), path)
+        together = math.prod(
+            map(max, shape, _piece(array))
+        )  # a piece is unpacked whole, also where it is larger than the array
+        require_room(together * (dtype.itemsize + 8), path)
         try:
             values = np.asarray(array[...])
         except Exception as error:  # of codecs: many kinds
@@ -72,6 +75,11 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     affine[:3, 3] = (shift[kept] * units)[order]
     ours = attributes.get('lingo_mi')
     return values.transpose(order), affine, f'lingo_mi: {ours}' if isinstance(ours, str) else ''
+
+
+def _piece(array):
+    """The shape of what lies in one file: a shard, or a chunk."""
+    return [int(n) for n in getattr(array, 'shards', None) or array.chunks]
 
 
 def _attributes(path):

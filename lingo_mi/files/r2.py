@@ -20,6 +20,8 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import beside, new_folder, one_line, reading
 from lingo_mi.files import arrays
 from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
+from lingo_mi.geometry.limits import MOST_VIEWS
+from lingo_mi.memory import require_room
 from lingo_mi.scan import Dataset
 
 META = 'meta_data.json'
@@ -31,6 +33,8 @@ def _views(meta, split, where):
         return None
     if not isinstance(listed, list):
         raise InputError(f'{where}: proj_{split} must be a list of views')
+    if len(listed) > MOST_VIEWS:
+        raise InputError(f'{where}: proj_{split} lists {len(listed)} views, but a scan has at most {MOST_VIEWS}')
     projections, angles = [], []
     for i, view in enumerate(listed):
         try:
@@ -46,6 +50,8 @@ def _views(meta, split, where):
                 f'{file}: has the shape {image.shape}, but the first view has '
                 f'{projections[0].shape}; all views need one panel'
             )
+        if not projections:
+            require_room(8 * len(listed) * image.size, where)
         projections.append(image)
         angles.append(angle)
     geometry = to_geometry(meta['scanner'], angles, where, offset_order='uv')

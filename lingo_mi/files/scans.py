@@ -70,6 +70,7 @@ from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.memory import require_room
 from lingo_mi.parsing import nearest
 from lingo_mi.scan import Dataset, Scan
 
@@ -124,9 +125,9 @@ def load_yaml(path: PathLike | str) -> dict:
 def _number(values, key, default, where):
     value = values.get(key, default)
     try:
-        number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
-    except OverflowError:
-        number = math.inf
+        number = float(value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else math.nan
+    except (OverflowError, ValueError):  # YAML takes 1e3 for text
+        number = math.nan
     if not math.isfinite(number):
         raise InputError(f'{where}: {key} must be one number, not {shown(value)}')
     return number
@@ -219,8 +220,8 @@ def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
 
-def _geometry_of(path, geometry):
-    """The geometry file of an .npy: the one that is named, else one beside it."""
+def geometry_of(path: Path, geometry: PathLike | str | None = None) -> Any:
+    """The geometry file of an .npy: the one that is named, else one beside it. Raises InputError where there is none."""
     if geometry is not None:
         return geometry
     beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
@@ -250,6 +251,18 @@ def _read_npy(path, geometry):
     if rows_run_up(values):
         projections, valid = projections[:, ::-1], None if valid is None else valid[:, ::-1]
     return Dataset(make_scan(g, _line_integrals(projections, values, geometry, path), path, valid))
+
+
+def written_files(path: Path) -> list[Path]:
+    """All files that a scan `path`, an .npy, may be written to."""
+    return [path, path.with_suffix('.yml'), *(path.with_name(path.stem + end) for end in ('.valid.npy', '.poses.npy'))]
+
+
+def named_files(geometry: PathLike | str) -> list[Path]:
+    """The files that a geometry file, .yml, names. Raises InputError as `load_yaml`."""
+    values = load_yaml(geometry)
+    names = (values.get(key) for key in ('poses', 'test_poses', 'valid'))
+    return [beside(geometry, name) for name in names if isinstance(name, str)]
 
 
 def _write_npy(path, dataset, history=None):
@@ -288,8 +301,12 @@ def _read_stack(folder):
     files = sorted(folder.glob('*.exr'), key=by_number)
     if not files:
         raise InputError(f'{folder}: holds no .exr views; give at least one')
-    images = [read_exr(file) for file in files]
-    for file, image in zip(files, images):
+    images = []
+    for file in files:
+        image = read_exr(file)
+        if not images:
+            require_room(8 * len(files) * image.size, folder)
+        images.append(image)
         if image.shape != images[0].shape:
             raise InputError(
                 f'{file}: has the shape {image.shape}, but the first view has '
@@ -375,7 +392,7 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
     if suffix in ('.pickle', '.pkl'):
         return partial(naf.read, path)
     if suffix == '.npy':
-        return partial(_read_npy, path, _geometry_of(path, geometry))
+        return partial(_read_npy, path, geometry_of(path, geometry))
     if suffix == '.npz':
         return partial(public_scans.read, path, name)
     raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
@@ -387,7 +404,7 @@ _WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _
 def history_of(path: PathLike | str) -> Any:
     """What a scan's geometry file says of how it was made; None where it says nothing. Raises InputError as `read_scan` does."""
     path = Path(path)
-    return load_yaml(_geometry_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
+    return load_yaml(geometry_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
 
 
 def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:

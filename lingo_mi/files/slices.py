@@ -74,6 +74,8 @@ def read_tiff_file(path: Path) -> np.ndarray:
         others = {kind: False for kind in kinds if not isinstance(getattr(tifffile.TiffFile, kind, None), property)}
         with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False, **others) as file:
             series = file.series[0]
+            if 'S' in series.axes:
+                raise InputError(f'{path}: holds colours; convert it to one value a pixel')
             compressions = {int(page.compression) for page in series.pages if page is not None}
             ratio = max((_RATIO.get(kind, math.inf) for kind in compressions), default=math.inf)
             require_claim(path, series.shape, np.dtype(series.dtype), ratio)

@@ -82,6 +82,8 @@ def read_voxels(
             return values.reshape(tuple(shape), order='F')
         size = require_claim(path, shape, dtype, MOST_DEFLATED if packing == 'deflate' else math.inf)
         try:
+            if start >= os.path.getsize(path):
+                raise InputError(f'{path}: is truncated or damaged: its data begin after its end; fetch it again')
             with open(path, 'rb') as file:
                 file.seek(start)
                 gzipped = file.read(2) == b'\x1f\x8b'

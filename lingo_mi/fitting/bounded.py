@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.fitting.measured import knows_noise
+from lingo_mi.fitting.measured import knows_noise, trusted
 from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.memory import room
@@ -44,7 +44,9 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
         return settings
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:
-        most = min(max(int(scan.projections.size / control.values_per_gaussian), 1), control.max_gaussians)
+        valid = trusted(scan, settings).valid
+        measured = scan.projections.size if valid is None else int(valid.sum())
+        most = min(max(int(measured / control.values_per_gaussian), 1), control.max_gaussians)
         settings = settings.changed(max_gaussians=most, n_points=min(settings.start.n_points, most))
     points = settings.start.n_points
     if settings.start.init == 'r2':  # takes no voxel twice
@@ -68,8 +70,10 @@ def _stops(settings: Settings, scan: Scan) -> bool:
     """Whether a fit of the scan is to stop early, by views that are held out."""
     free = max(settings.adam.rate_pose) > 0 and settings.calibration.pose_motion == 'view'
     why = None
-    if len(scan) < LEAST_VIEWS:
-        why = f'needs at least {LEAST_VIEWS}, but the scan has {len(scan)}'
+    valid = trusted(scan, settings).valid
+    views = len(scan) if valid is None else int(valid.any((1, 2)).sum())
+    if views < LEAST_VIEWS:
+        why = f'needs at least {LEAST_VIEWS} with valid pixels, but the scan has {views}'
     elif free:
         why = 'cannot know their poses: take pose_motion=smooth'
     if settings.stopping.stop == 'on' and why:

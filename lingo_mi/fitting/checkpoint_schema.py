@@ -10,8 +10,8 @@ array.average.*               like values.*, where the fit averages
 array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], where the fit corrects poses
 array.response.*              float64 [rows, numbers], where the fit finds a response: air, gain
 array.search.*                where the fit searches for the step to stop at: float64 rows [any] and errors [looks], whole numbers
-                              iterations [looks] and kept [1]; start.*, like values.*, until the search has ended. Views then
-                              are those that the search sees
+                              iterations [looks], kept [1] and views [1]; start.*, like values.*, until the search has ended.
+                              Views then are those that the search sees
 array.share                   float32 [N], where the fit models two materials
 array.scattered               float64 [2, views, rows, columns], where it models scatter
 extra                         text: plain values as JSON, named in `_PLAIN`
@@ -34,11 +34,12 @@ from lingo_mi.scene.description import NAMES, read_scanner
 
 VERSION = 1  # of the checkpoints written now; those of earlier programs have neither a version nor a checksum
 _SEARCH = 'array.search.'
+_SEEN = _SEARCH + 'views'  # of the search; checkpoints of earlier programs lack it
 _NEVER_NEGATIVE = (
     'gradient',
     'seen',
     'array.poses.steps',
-    *(_SEARCH + name for name in ('rows', 'errors', 'iterations', 'kept')),
+    *(_SEARCH + name for name in ('rows', 'errors', 'iterations', 'kept', 'views')),
 )
 _OF_EFFECTS = 'array.share', 'array.scattered'  # not every effect has both
 
@@ -58,15 +59,18 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
     fit that can go on."""
     settings = _require_plain(extra)
     searching = any(name.startswith(_SEARCH + 'start.') for name in arrays)
-    if searching and settings.stopping.stop == 'on' and extra['views'] >= LEAST_VIEWS:
-        views = extra['views'] - len(held_out_views(extra['views'], HELD_OUT))
-    else:
-        views = extra['views']
+    views = extra['views']
+    if searching and settings.stopping.stop == 'on' and views >= LEAST_VIEWS:
+        views -= len(held_out_views(views, HELD_OUT))
+        if (seen := arrays.get(_SEEN)) is not None:  # fewer than these, where views are without a valid pixel
+            _require_array(_SEEN, seen, 'int', (1,))
+            _require(0 < seen[0] <= views, f'{_SEEN} must be from 1 to {views}')
+            views = int(seen[0])
     expected = _expected(settings, views, arrays['born'].size if 'born' in arrays else 0, searching)
     allowed = dict(expected)
     if not extra.get('effects', True):
         allowed = {name: v for name, v in expected.items() if name not in _OF_EFFECTS}
-    for name in expected.keys() - set(_OF_EFFECTS) - arrays.keys():
+    for name in expected.keys() - {*_OF_EFFECTS, _SEEN} - arrays.keys():
         raise InputError(f'{name} is missing')
     for name in arrays.keys() - allowed.keys():
         raise InputError(f'{shown(name)} does not belong there')
@@ -109,7 +113,7 @@ def _expected(settings: Settings, views: int, count: int, searching: bool) -> di
     found |= {f'array.response.{k}': ('float64', (rows[x], 1)) for k, x in varies.items() if x != 'off'}
     if settings.stopping.stop == 'on':
         found |= {f'{_SEARCH}{k}': ('float64', (None,)) for k in ('rows', 'errors')}
-        found |= {f'{_SEARCH}iterations': ('int', (None,)), f'{_SEARCH}kept': ('int', (1,))}
+        found |= {f'{_SEARCH}iterations': ('int', (None,)), f'{_SEARCH}kept': ('int', (1,)), _SEEN: ('int', (1,))}
         if searching:
             found |= {f'{_SEARCH}start.{k}': ('float32', (None, *shape[1:])) for k, shape in shapes.items()}
     return found
@@ -149,7 +153,7 @@ def _require_plain(extra: Any) -> Settings:
         raise InputError(f'its version is {shown(version)}, but this program reads {VERSION}')
     for name, (wanted, good) in _PLAIN.items():
         if name not in extra:
-            if name == 'moments' or 'version' not in extra and name in ('unit', 'effects'):
+            if name in ('moments', 'traits') or 'version' not in extra and name in ('unit', 'effects'):
                 continue
             raise InputError(f'{name} is missing')
         if not good(extra[name]):
@@ -200,6 +204,14 @@ def _is_moments(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(map(_number, value))
 
 
+def _is_traits(value: Any) -> bool:
+    return (
+        isinstance(value, dict)
+        and value.keys() == {'valid', 'effects'}
+        and all(x is None or isinstance(x, str) and len(x) == 64 for x in value.values())
+    )
+
+
 def _is_history(value: Any) -> bool:
     """Whether these are measurements over time. Those of quality may be missing (None), NaN or infinite."""
     return isinstance(value, list) and all(
@@ -248,6 +260,7 @@ _PLAIN = {
     'scanner': ('the numbers of a ct_scanner', _is_scanner),
     'signal': ('a number', _number),
     'moments': ('three numbers', _is_moments),
+    'traits': ('digests of the valid pixels and of the effects', _is_traits),
 }
 
 

@@ -42,7 +42,7 @@ class ExpectedSignal:
         self.scattered = None
         if effects.tube and effects.scatter:
             self.scattered = ScatteredLight(effects.scatter, effects.tube, effects.response, geometry)
-        if effects.tube and (effects.tube.hardens or effects.scatter):
+        if effects.tube and effects.needs_materials:
             names = effects.tube.fitted()
             self.bands = effects.tube.signal(names, effects.response)
             self.split = effects.tube.split if len(names) == 2 else None

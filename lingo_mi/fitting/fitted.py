@@ -20,6 +20,7 @@ from lingo_mi.fitting.state import State, activate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import current_names
 from lingo_mi.projectors.objects import Ellipsoids
+from lingo_mi.runtime import one_at_a_time
 
 
 class NeedsEffects(InputError):
@@ -39,6 +40,7 @@ class Fitted:
     seconds     spent in steps, including those before an interruption
     info        data on the initial cloud (`InitialCloud.info`)
     search      what views that were held out said (`stopping.Search.record`); None without a search for the step to stop at
+    steps       that were done: of an unfinished fit, and of one that has stopped early, fewer than the settings' iterations
 
     Example:
 
@@ -57,16 +59,12 @@ class Fitted:
     seconds: float = 0.0
     info: dict = field(default_factory=dict)
     search: dict | None = None
+    steps: int = 0
 
     @property
     def settings(self) -> Settings:
         """Settings as used, with the bounds that the scan sets."""
         return self.model.settings
-
-    @property
-    def steps(self) -> int:
-        """Steps of the fit: fewer than the settings' iterations where it has stopped early."""
-        return self.search['kept'] if self.search else self.settings.iterations
 
     @property
     def geometry(self) -> Geometry:
@@ -88,10 +86,12 @@ class Fitted:
         """The geometry with corrected poses; `geometry` itself if the fit has not corrected them."""
         return self.geometry if self.poses is None else self.poses.corrected(self.geometry)
 
+    @one_at_a_time()
     def render(self, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
         """Projections in the views of a geometry, float32 [view, v, u]; see `CloudModel.render`."""
         return self.model.render(DeviceState(self.state), geometry, progress)
 
+    @one_at_a_time()
     def expected(self, geometry: Geometry) -> np.ndarray:
         """What the scan's detector is expected to measure in views that were taken among those of the scan, float32 [view, v, u].
 
@@ -102,14 +102,17 @@ class Fitted:
             geometry = self.poses.between(self.geometry, geometry)
         return self.model.expected(DeviceState(self.state), geometry)
 
+    @one_at_a_time()
     def volume(self, geometry: Geometry | None = None) -> np.ndarray | None:
         """Density in 1/mm on a geometry's grid (default: the scan's), float32 [x, y, z]; None for alpha compositing."""
         return self.model.volume(DeviceState(self.state), geometry)
 
+    @one_at_a_time()
     def cloud(self) -> Ellipsoids | None:
         """The Gaussians in mm, densities in 1/mm; None for alpha compositing and for a neural field."""
         return self.model.cloud(DeviceState(self.state))
 
+    @one_at_a_time()
     def shares(self) -> np.ndarray | None:
         """The second material's share in every Gaussian's density, float32 [N]; None for one material."""
         share = self.model.shares(DeviceState(self.state))
@@ -155,4 +158,5 @@ class Fitted:
             model.response.restore(arrays)
         history = [current_names(entry) for entry in extra['history']]
         seed, seconds, info = (extra[name] for name in ('seed', 'seconds', 'info'))
-        return cls(model, state, arrays['initial'], poses, seed, history, seconds, info, search)
+        steps = extra['iteration']
+        return cls(model, state, arrays['initial'], poses, seed, history, seconds, info, search, steps)

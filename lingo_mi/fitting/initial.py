@@ -19,9 +19,11 @@ from lingo_mi.lingo import initialise as lingo
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.rectify import can_rectify
+from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 
 
+@one_at_a_time()
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
     """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume; of a
     neural field a cloud of no points.

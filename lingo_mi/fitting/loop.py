@@ -17,15 +17,17 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model, stepper_of
 from lingo_mi.fitting.measured import modelled_effects
-from lingo_mi.fitting.resume import moments, require_same_fit
+from lingo_mi.fitting.resume import moments, require_same_fit, traits
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.stopping import Search
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.metrics import current_names
+from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 from lingo_mi.scene.description import describe
 
 
+@one_at_a_time()
 def run(
     scan: Scan,
     settings: Settings,
@@ -66,6 +68,7 @@ def run(
         scanner=describe(scan.geometry),
         signal=float(scan.projections.mean(dtype=float)),
         moments=moments(scan.projections),
+        traits=traits(scan),
     )
     if isinstance(begin, Path):
         host, extra, arrays = checkpoint.load(begin)
@@ -165,7 +168,7 @@ def run(
     store()
     seconds += time.perf_counter() - clock
     found = search.record() if search else None
-    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info, found)
+    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info, found, iteration)
 
 
 def measure_at(iterations: int) -> list[int]:

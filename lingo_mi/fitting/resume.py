@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.settings import Settings
+from lingo_mi.scan import Scan
 
 
 def extensible(settings: Settings, scatters: bool = False) -> bool:
@@ -29,6 +31,19 @@ def moments(projections: np.ndarray) -> list[float]:
         projections.mean((0, 1), dtype=float),
     )
     return [float(np.mean(x * np.linspace(0, 1, len(x)))) for x in p]
+
+
+def traits(scan: Scan) -> dict[str, str | None]:
+    """Tells scans of the same projections apart: digests of the valid pixels and of the effects, as plain values."""
+    e = scan.effects
+    named = None
+    if e is not None:
+        named = [e.tube and e.tube.given, e.spot and vars(e.spot), e.scatter and e.scatter.given]
+        named.append(e.detector and vars(e.detector))
+    return dict(
+        valid=None if scan.valid is None else hashlib.sha256(np.packbits(scan.valid).tobytes()).hexdigest(),
+        effects=None if named is None else hashlib.sha256(json.dumps(named, default=str).encode()).hexdigest(),
+    )
 
 
 def require_same_fit(
@@ -55,6 +70,12 @@ def require_same_fit(
         atol=1e-4 * abs(scanned['signal']),
     ):
         changed.append('the projections')
+    known = extra.get('traits', scanned['traits'])  # earlier checkpoints have none
+    changed += [
+        what
+        for name, what in dict(valid='the valid pixels', effects='the effects of the scan').items()
+        if known[name] != scanned['traits'][name]
+    ]
     if changed:
         raise InputError(
             f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '

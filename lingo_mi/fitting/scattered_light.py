@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from lingo_mi.effects.hardening import Tube
@@ -27,7 +25,7 @@ class ScatteredLight:
 
     def __init__(self, scatter: Scatter, tube: Tube, response: str, geometry: Geometry):
         self.scatter = scatter.within(geometry)
-        self.tube = replace(tube, material=tube.fitted(), materials={})  # the cloud stands for all shapes
+        self.tube = tube.of_cloud()
         self.response = response
 
     def estimate(self, cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:

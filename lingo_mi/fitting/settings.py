@@ -158,8 +158,11 @@ class AdamSettings:
 
     def __post_init__(self):
         rates = {f.name: RATES for f in fields(self) if f.name.startswith('rate_')} | dict(rate_pose=(0, 1))
+        for name in rates:
+            if isinstance(given := getattr(self, name), list):
+                object.__setattr__(self, name, tuple(given))
         decay = (0, 1 - 1e-6)  # beyond, float32 counts it as 1
-        require_ranges(self, **rates, beta1=decay, beta2=decay, epsilon=(0, 1), average=decay)
+        require_ranges(self, **rates, beta1=decay, beta2=decay, epsilon=(1e-30, 1), average=decay)
         _require(
             min(self.rate_pose) > 0 or self.rate_pose == (0, 0),
             f'rate_pose must be two positive numbers, first and last, or 0, not {self.rate_pose}',

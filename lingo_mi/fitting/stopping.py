@@ -116,6 +116,7 @@ class Search:
             errors=np.array(self.errors),
             iterations=np.array(self.iterations, int),
             kept=np.array([self.kept]),
+            views=np.array([len(self.seen)]),
             **{f'start.{k}': v for k, v in self.start.items()},
         )
         return {PREFIX + k: v for k, v in own.items()}

@@ -5,9 +5,7 @@ Neither PyTorch nor JAX is a dependency: arrays of theirs cannot come from a cal
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -16,24 +14,10 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.upload import uploaded_tensor
-from lingo_mi.runtime import ensure_variant
+from lingo_mi.runtime import ensure_variant, one_at_a_time
 
 NAMES = 'means', 'scales', 'quaternions', 'density'
 COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian
-_LOCK = threading.RLock()
-
-
-@contextmanager
-def one_at_a_time() -> Iterator[None]:
-    """Holds up other threads: recorded kernels serve one at a time. Tells Dr.Jit of a thread that goes on with another's arrays.
-
-    PyTorch goes back through a graph on a GPU in a thread of its own.
-    """
-    with _LOCK:
-        for backend in dr.JitBackend.CUDA, dr.JitBackend.LLVM:
-            if dr.has_backend(backend):
-                dr.detail.new_scope(backend)
-        yield
 
 
 def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...], name: str) -> Any:
@@ -95,7 +79,7 @@ def _numpy(array, what: str, name: str) -> np.ndarray:
         if hasattr(array, '__dlpack__') and not hasattr(array, '__array__'):
             array = np.from_dlpack(array)
         return np.asarray(array, np.float32)
-    except (TypeError, ValueError, BufferError, RuntimeError) as error:
+    except (TypeError, ValueError, OverflowError, BufferError, RuntimeError) as error:
         raise InputError(
             f'{name}: {what} cannot be read as an array of numbers ({str(error).splitlines()[0]})'
         ) from None

@@ -25,7 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError, require_type
+from lingo_mi.errors import InputError, require_type, shown
 from lingo_mi.functional.frameworks import call
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.memory import room
@@ -145,11 +145,12 @@ def _indices(views, count: int) -> np.ndarray:
     if views is None:
         return np.arange(count)
     try:
+        views = list(views)
         if any(isinstance(i, bool) for i in views):  # a mask is no list of indices
             raise TypeError
-        found = np.array([operator.index(i) for i in views], int)
+        found = [operator.index(i) for i in views]
     except TypeError:
-        raise InputError(f'views must be whole numbers, one a view, not {views!r}') from None
-    if len(found) == 0 or found.min() < -count or found.max() >= count:
-        raise InputError(f'views must be at least one number from {-count} to {count - 1}, not {views!r}')
-    return found
+        raise InputError(f'views must be whole numbers, one a view, not {shown(views)}') from None
+    if not found or min(found) < -count or max(found) >= count:
+        raise InputError(f'views must be at least one number from {-count} to {count - 1}, not {shown(views)}')
+    return np.array(found, int)

@@ -10,8 +10,7 @@ import mitsuba as mi
 import torch
 
 from lingo_mi.errors import InputError
-from lingo_mi.functional.frameworks import one_at_a_time
-from lingo_mi.runtime import ensure_variant
+from lingo_mi.runtime import ensure_variant, one_at_a_time
 
 
 def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any:

@@ -40,7 +40,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
     """
     distributed = optional('distributed', 'cluster')
     local = re.fullmatch(r'local:(\d{1,9})', address)
-    if address.startswith('local') and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
+    if re.match('local(:|$)', address) and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
         raise InputError(f'--cluster {address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
     with ExitStack() as stack:
         import dask.config

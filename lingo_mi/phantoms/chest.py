@@ -300,7 +300,7 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
 
     def is_lung(p):
         at_hilum = (abs(p[0]) - 36) ** 2 + (p[1] + 14) ** 2 + (p[2] - 26) ** 2 < 22**2
-        return at_hilum or lung[tuple(np.clip((p + SIDE / 2) / step, 0, 127).astype(int))] < -3
+        return at_hilum or lung[tuple(np.clip((p + SIDE / 2) / step, 0, _COARSE - 1).astype(int))] < -3
 
     _thorax(grid, image, rng, is_lung)
     _skeleton(grid, image, texture)

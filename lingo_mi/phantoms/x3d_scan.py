@@ -37,10 +37,12 @@ def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = PIXELS) 
 def simulate(phantom: Phantom, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Noise-free line integrals, float32 [view, v, u], density times mm.
 
-    Exact projections of the object if the phantom has them, else exact projections of its trilinear voxels, which
-    need an active Mitsuba variant. progress: called as progress(views done, views) after every view.
+    Exact projections of the object if the phantom has them and the grid is its own, of its size about the origin; else exact
+    projections of its voxels on the geometry's grid, trilinear, which need an active Mitsuba variant.
+    progress: called as progress(views done, views) after every view.
     """
-    if phantom.analytic is None:
+    own = np.allclose(geometry.dVoxel, phantom.spacing, rtol=1e-6) and not any(geometry.offOrigin)
+    if phantom.analytic is None or not own:
         from lingo_mi.projectors import grid
 
         return grid.project(phantom.data, geometry, progress)

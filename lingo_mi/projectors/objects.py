@@ -72,11 +72,17 @@ class Ellipsoids:
                     f'Gaussian, but {dr.width(column)} as {name}: give it one value a Gaussian'
                 )
         self.rows, (self.centre, self.scale, self.rotation) = data, cloud.columns(data)
-        key, gaussians = (data.index, self.density.index), (self.centre, self.scale, self.rotation, self.density)
-        if key not in _USABLE and require_usable(*gaussians, where=f'the ellipsoids {self.name!r}'):
+        shared = self.second is not None
+        key = data.index, self.density.index, self.second.index if shared else 0
+        if key in _USABLE:
+            return
+        if shared and not dr.all((self.second >= 0) & (self.second <= 1)):
+            raise InputError(f'the ellipsoids {self.name!r}: "second" is a share in the density, from 0 to 1')
+        gaussians = self.centre, self.scale, self.rotation, self.density
+        if require_usable(*gaussians, where=f'the ellipsoids {self.name!r}'):
             while len(_USABLE) >= MOST_USABLE:
                 _USABLE.pop(next(iter(_USABLE)))
-            _USABLE[key] = dr.detach(data), dr.detach(self.density)
+            _USABLE[key] = tuple(dr.detach(x) for x in (data, self.density, self.second if shared else self.density))
 
     @classmethod
     def of(cls, centre: Any, scale: Any, rotation: Any, density: Any, second: Any, name: str) -> Ellipsoids:

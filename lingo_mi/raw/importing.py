@@ -90,7 +90,9 @@ def import_raw(
     flats = recording.flats if options.flats is None else open_recording(options.flats).views
     darks = recording.darks if options.darks is None else open_recording(options.darks).views
     given, white, (down, across) = _geometry(geometry, options, recording.angles, views)
-    i0 = options.i0 if options.i0 is not None else white if flats is None and _no_air(options) else None
+    if options.i0 is not None or flats is not None or not _no_air(options):
+        white = None  # not needed
+    i0 = options.i0 if white is None else white
     if sum(x is not None for x in (options.air, options.percentile, i0)) > 1:
         raise InputError('air, percentile and i0 all say the air level; give one of them')
     if flats is None and i0 is None and _no_air(options):
@@ -113,7 +115,8 @@ def import_raw(
         limit = np.iinfo(views.dtype).max if views.dtype.kind in 'ui' else np.inf
     panel = fields(views.shape, flats, darks, limit)
     if flats is None and i0 is not None:
-        panel = replace(panel, flat=np.full(views.shape, float(i0)))
+        # Nikon's white level is a count, with the dark signal in it.
+        panel = replace(panel, flat=i0 - panel.dark if white is not None else np.full(views.shape, float(i0)))
 
     v0, v1, u0, u1 = crop
     (nv, nu), rows, columns = views.shape, (v0, v1), (u0, u1)
@@ -293,9 +296,12 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
     else:
         raise InputError(f'{path}: is no geometry file; give .yml, .xtekct or .xml (RTK)')
     values.setdefault('nDetector', list(shape))
-    if tuple(np.ravel(values['nDetector'])) != shape:
+    if not np.array_equal(np.broadcast_to(values['nDetector'], 2), shape):
         raise InputError(f'{path}: nDetector is {values["nDetector"]}, but the frames have {list(shape)} pixels (v, u)')
     if values.get('nVoxel') is None:
+        for name in 'dVoxel', 'sVoxel':
+            if values.get(name) is not None:
+                raise InputError(f'{path}: {name} needs nVoxel, the number of voxels; add it, or take {name} out')
         values |= grid
     free = all(values.get(name) is None for name in ('angles', 'totalAngle', 'poses'))
     if angles is not None and (options.angles is not None or free):

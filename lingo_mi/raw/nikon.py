@@ -12,6 +12,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import one_line, reading
+from lingo_mi.geometry.limits import MOST_VIEWS
 
 
 def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
@@ -42,10 +43,10 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
             raise InputError(f'{path}: {name} must be a number, not {section[name]!r}')
         return value
 
-    n = int(number('Projections'))
+    n = number('Projections')
     DSO, DSD = number('SrcToObject'), number('SrcToDetector')
-    if n < 1 or not DSD >= DSO > 0:
-        raise InputError(f'{path}: needs Projections >= 1 and SrcToDetector >= SrcToObject > 0')
+    if not 1 <= n <= MOST_VIEWS or not DSD >= DSO > 0:
+        raise InputError(f'{path}: needs Projections from 1 to {MOST_VIEWS} and SrcToDetector >= SrcToObject > 0')
     top, bottom = number('CentreOfRotationTop', 0), number('CentreOfRotationBottom', 0)
     unread = [
         name
@@ -63,7 +64,7 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
         DSD=DSD,
         nDetector=[int(number('DetectorPixelsY')), int(number('DetectorPixelsX'))],
         dDetector=[number('DetectorPixelSizeY'), number('DetectorPixelSizeX')],
-        angles=(number('InitialAngle', 0) + number('AngularStep') * np.arange(n)).tolist(),
+        angles=(number('InitialAngle', 0) + number('AngularStep') * np.arange(int(n))).tolist(),
     )
     if top + bottom:
         values['COR'] = (top + bottom) / 2 * DSO / DSD

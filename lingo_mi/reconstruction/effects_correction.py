@@ -61,9 +61,7 @@ def linearised(scan: Scan, effects: Effects) -> Scan:
         return found
     g = scan.geometry
     scatter = effects.scatter.within(g)
-    effects = replace(
-        effects, scatter=scatter, tube=replace(effects.tube, material=effects.tube.fitted(), materials={})
-    )
+    effects = replace(effects.of_cloud(), scatter=scatter)
     shape = np.ceil(np.array(g.sVoxel) * scatter.voxels / max(g.sVoxel) - 1e-6).astype(int).clip(1).tolist()
     coarse = g.with_volume(shape, [s / n for s, n in zip(g.sVoxel, shape)])
     low = np.array(g.offOrigin) - np.array(g.sVoxel) / 2

@@ -15,12 +15,14 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.memory_needs import needed
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
+from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
 MOST_ENTRIES = 2**32  # of one of Dr.Jit's arrays
 
 
+@one_at_a_time()
 def reconstruct(
     scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs: Any
 ) -> Reconstruction:

@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import leftovers, reading, write_text, writing
+from lingo_mi.file_access import leftovers, parsed_json, reading, write_text, writing
 from lingo_mi.folder_lock import locked
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
@@ -223,7 +223,7 @@ class _Volume:
             with reading(state):
                 text = state.read_bytes()
             try:
-                known = json.loads(text)
+                known = parsed_json(text)
                 found, done = known['of'], int(known['updates'])
             except (KeyError, TypeError, ValueError):
                 raise InputError(f'{state}: is no state of ours; move its folder away') from None

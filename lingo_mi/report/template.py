@@ -23,7 +23,7 @@ def page(title: str, headline: str, numbers: str, command: str, known: dict, arr
     """A page that loads nothing and runs no script but its own, whose digest its policy names.
 
     title, headline     plain text
-    numbers, command    markup of those sections, made by `table` and `paragraph`
+    numbers, command    markup of those sections, made by `table` and `code`
     known               what the scripts know (JSON); arrays: by name
     live                whether it asks the server that sent it for news
     """

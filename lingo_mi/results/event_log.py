@@ -30,7 +30,7 @@ class EventLog:
             if not path.is_dir():
                 raise InputError(f'{path}: is a file; give a folder')
             self._writer: Any = library.SummaryWriter(str(path), flush_secs=5)
-        self._at = 0
+        self._pictures: list[tuple[str, np.ndarray]] = []  # of the step that `step` tells of next
 
     def search(self, iteration: int, held_out: float) -> None:
         """See `watch.Watcher`. Its steps are not those of the fit: nothing is written."""
@@ -40,7 +40,9 @@ class EventLog:
         for name, value in entry.items():
             if name not in ('iteration', 'seconds') and value is not None:
                 self._writer.add_scalar(name, value, entry['iteration'])
-        self._at = entry['iteration']
+        for name, image in self._pictures:
+            self._writer.add_image(name, image, entry['iteration'], dataformats='HW')
+        self._pictures = []
 
     def look(self, snapshot: Snapshot) -> None:
         """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth where there is one."""
@@ -61,4 +63,4 @@ class EventLog:
 
     def _picture(self, name: str, images: list[np.ndarray], window: tuple[float, float]) -> None:
         row = (np.concatenate(images, 1) - window[0]) / (window[1] - window[0])
-        self._writer.add_image(name, (np.clip(row, 0, 1) * 255).astype(np.uint8), self._at + 1, dataformats='HW')
+        self._pictures.append((name, (np.clip(row, 0, 1) * 255).astype(np.uint8)))

@@ -109,7 +109,7 @@ def _of_gaussians(fitted: Fitted) -> dict:
 
 def _steps_made(fitted: Fitted) -> int:
     """Steps of the fit and of the search before it."""
-    return fitted.steps + (fitted.search['iterations'][-1] if fitted.search else 0)
+    return max(fitted.steps + (fitted.search['iterations'][-1] if fitted.search else 0), 1)
 
 
 def summary(result: dict) -> str:

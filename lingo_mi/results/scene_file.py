@@ -41,7 +41,7 @@ def write_scene(path: Path, geometry: Geometry, extent: float | None, effects: E
             for k, v in effects.tube.given.items()
             if not (v is None or k.startswith('material') or v == '' and k != 'filtration')
         }
-        if effects.tube.hardens or effects.scatter:  # the cloud stands for all shapes
+        if effects.needs_materials:  # the cloud stands for all shapes
             given['material'] = ' + '.join(effects.tube.fitted())
         scatter = effects.scatter.within(geometry).given if effects.scatter else {}
         lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot | scatter, 8), '    </emitter>']

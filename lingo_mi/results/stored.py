@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path, reading
+from lingo_mi.file_access import as_path, parsed_json, reading
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import Volume, read_volume
 from lingo_mi.metrics import current_names
@@ -41,7 +40,7 @@ class Stored:
 def _planned(plan: Path) -> str | None:
     """The check sum of the volume that a plan of `best` has made, where there is one that says."""
     try:
-        found = json.loads(plan.read_text(encoding='utf-8'))
+        found = parsed_json(plan.read_text(encoding='utf-8'))
         return found.get('volume')
     except (OSError, ValueError, AttributeError):
         return None
@@ -67,7 +66,7 @@ def read_stored(path: PathLike | str) -> Stored:
             raise InputError(f'{path}: there is no result here; give a folder that lingo-mi fit wrote, or a volume')
     try:
         with reading(numbers):
-            metrics = current_names(json.loads(numbers.read_text(encoding='utf-8')))
+            metrics = current_names(parsed_json(numbers.read_text(encoding='utf-8')))
         angles = [float(angle) for angle in metrics.get('test_angles') or []]
     except (TypeError, ValueError, AttributeError) as error:
         if isinstance(error, InputError):

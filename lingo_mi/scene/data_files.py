@@ -21,12 +21,12 @@ def data_file(name: str, parameter: str) -> str:
     resolver: Any = mi.file_resolver  # declared as an object
     found = Path(str(resolver().resolve(name)))
     folder = os.environ.get('LINGO_MI_DATA')
-    if not found.exists() and folder:
+    if not os.path.exists(found) and folder:  # other than Path's, False for a name that is too long
         found = Path(folder) / name
-    if not found.exists():
+    if not os.path.exists(found):
         where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
         raise InputError(
-            f'{name}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
+            f'{name[:100]}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
             f'that holds it, or name your file: -D {parameter}=FILE'
         )
     if not found.is_file() and not found.is_dir():

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import to_posed
 from lingo_mi.geometry import astra
@@ -172,6 +172,17 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     return geometry(angles), geometry(np.radians(drawn))
 
 
+def _split_numbers(text: str) -> tuple[list[float], list[str]]:
+    """The numbers in a text, and what else it holds between commas and spaces."""
+    numbers, others = [], []
+    for part in text.replace(',', ' ').split():
+        try:
+            numbers.append(float(part))
+        except ValueError:
+            others.append(part)
+    return numbers, others
+
+
 def _read_poses(props, shared):
     """A scan with a pose for every view."""
     given = [name for name in _CIRCLE if name in props]
@@ -182,9 +193,10 @@ def _read_poses(props, shared):
 
     def views(n_detector, step, parallel, origin):
         poses = props['poses']
-        try:
-            numbers = [float(x) for x in poses.replace(',', ' ').split()]
-        except ValueError:
+        numbers, wrong = _split_numbers(poses)
+        if wrong and len(numbers) > len(wrong):
+            raise InputError(f'poses must be 12 numbers for every view, or a file; {shown(wrong[0])} is no number')
+        if wrong:
             return read_poses(data_file(poses, 'poses'), n_detector, step, parallel, origin)
         if len(numbers) % 12:
             raise InputError(f'poses must be 12 numbers for every view, not {len(numbers)}')

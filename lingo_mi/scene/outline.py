@@ -23,6 +23,18 @@ MOST_INCLUDES = 15  # within each other, as in Mitsuba
 _ENCODINGS = 'utf-8', 'us-ascii', 'ascii', 'iso-8859-1', 'latin-1'
 
 
+def named_files(path: PathLike | str, parameters: dict | None = None) -> list[Path]:
+    """A scene file, those that it includes, and all files that its texts name, where they exist, also in LINGO_MI_DATA.
+
+    Raises InputError as `outline`.
+    """
+    look = _Look({name: str(value) for name, value in (parameters or {}).items()})
+    look.at(Path(path), 0)
+    if folder := os.environ.get('LINGO_MI_DATA'):
+        look.folders.append(Path(folder))
+    return sorted(look.scenes | {file for text in look.texts for file in look.places(text) if os.path.isfile(file)})
+
+
 def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
     """Names of a scene file's own `<default>` parameters.
 
@@ -43,12 +55,16 @@ class _Look:
 
     values     of the parameters
     folders    in which names are looked for
+    scenes     the files themselves
+    texts      of all strings
     elements   of all files so far
     """
 
     values: dict[str, str]
     defaults: set[str] = field(default_factory=set)
     folders: list[Path] = field(default_factory=lambda: [Path()])
+    scenes: set[Path] = field(default_factory=set)
+    texts: set[str] = field(default_factory=set)
     elements: int = 0
 
     def at(self, path: Path, included: int):
@@ -56,6 +72,7 @@ class _Look:
         if included > MOST_INCLUDES:
             raise InputError(f'{path}: is included more than {MOST_INCLUDES} files deep')
         _require_scene(path)
+        self.scenes.add(path)
         self.folders.append(path.parent)
         more, depth = [], 0
 
@@ -75,8 +92,10 @@ class _Look:
                 self.folders += [folder / self.filled(given.get('value', '')) for folder in self.folders]
             elif tag == 'include':
                 more.append(self.filled(given.get('filename', '')))
-            elif tag == 'string' and given.get('name') == 'filename':
-                self.require_readable(path, self.filled(given.get('value', '')))
+            elif tag == 'string':
+                self.texts.add(text := self.filled(given.get('value', '')))
+                if given.get('name') == 'filename':
+                    self.require_readable(path, text)
 
         def end(tag):
             nonlocal depth

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import resources
 from os import PathLike
 from pathlib import Path
@@ -23,11 +24,11 @@ def scene_path(scene: PathLike | str) -> Path:
     Raises InputError if there is neither. A folder of another name is returned unchanged; reading it fails later.
     """
     path = Path(scene)
-    if path.is_file():
+    if os.path.isfile(path):  # other than Path's, False for a name that is too long
         return path
     known = scenes()
     if str(scene) in known:
         return known[str(scene)]
-    if path.exists():
+    if os.path.exists(path):
         return path
-    raise InputError(f'{scene}: there is no such scene; name a file, or one of {", ".join(sorted(known))}')
+    raise InputError(f'{str(scene)[:100]}: there is no such scene; name a file, or one of {", ".join(sorted(known))}')

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.api.calibration import Calibration
 from lingo_mi.calibration.cross_prediction import coarse
 from lingo_mi.calibration.drift import Drift, times
 from lingo_mi.calibration.panel import Panel
 from lingo_mi.calibration.response.response import Response
+from lingo_mi.calibration.search import Found
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects
 from lingo_mi.geometry import circular
 from lingo_mi.projectors import grid
 
@@ -232,3 +236,22 @@ def test_a_drift_that_no_view_shows_is_not_found():
     rod = ((np.hypot(x - 2, y + 1) < 6) * 0.02)[:, :, None] * np.ones(24)
     calibration = lm.calibrate(lm.Scan(geometry, grid.project(rod, geometry)), drift=3, progress=False)
     assert not any(np.abs(calibration.found.drift.panel(geometry).v).ravel() > 0)
+
+
+def test_a_response_that_was_not_found_leaves_the_effects():
+    geometry, data = scanner(8)
+    effects = Effects(detector=Detector(photons=1e4))
+    scan = lm.Scan(geometry, grid.project(data, geometry), effects=effects)
+    response = Response.of(geometry, air='smooth')
+    drift = Drift(geometry, u=(0.5,), v=(0.3,))
+    found = Found(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), 1.0, 0.5)
+    calibration = Calibration(geometry, found)
+    moved = calibration.corrected(scan)
+    assert moved.effects is effects and moved.geometry != geometry
+    np.testing.assert_array_equal(moved.projections, scan.projections)
+    dv, du = geometry.dDetector
+    assert (
+        f'({0.3 / dv:+.3f} pixels)' in calibration.lines()[1] and f'({0.5 / du:+.3f} pixels)' in calibration.lines()[0]
+    )
+    response.parts[0].values[0] = 0.1
+    assert calibration.corrected(scan).effects is None

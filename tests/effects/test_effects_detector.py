@@ -205,3 +205,18 @@ def test_a_binned_panel_has_the_noise_of_its_pixels_and_none_of_its_dead_ones():
     expected = binned.effects.detector.deviation(0.5)
     assert binned.projections[binned.valid].std() == pytest.approx(expected, rel=0.1)
     assert binned.effects.masked(binned).valid.sum() == binned.valid.sum()
+
+
+def test_the_seed_says_which_pixels_are_dead_and_what_the_gains_are():
+    maps = [detector(gain=0.1, dead=0.1, seed=seed).maps((40, 50)) for seed in (0, 1, 2**62)]
+    for (gains, dead), (others, alive) in zip(maps, maps[1:]):
+        assert abs(np.corrcoef(gains.ravel(), others.ravel())[0, 1]) < 0.1 and np.any(dead != alive)
+
+
+def test_a_binned_panel_rounds_more_finely():
+    light = np.random.default_rng(0).uniform(0.3, 0.9, (200, 4, 200, 4)).mean((1, 3), keepdims=True)
+    light = light + np.random.default_rng(1).uniform(-0.02, 0.02, (200, 4, 200, 4))
+    coarse = detector(bits=6)
+    seen = coarse.signal(light.reshape(800, 800), 0).reshape(light.shape)
+    wrong = np.log(seen.mean((1, 3)) / light.mean((1, 3)))
+    assert wrong.std() == pytest.approx(coarse.binned(16).deviation(light.mean((1, 3))).mean(), rel=0.1)

@@ -14,7 +14,7 @@ from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, ren
 from lingo_mi.effects.bands import band
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects, find_effects
-from lingo_mi.effects.hardening import hardened
+from lingo_mi.effects.hardening import Tube, TubeParameters, hardened
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.objects import find_objects
@@ -207,6 +207,29 @@ def test_what_saturates_has_no_derivative(output):
         np.testing.assert_allclose(f, e, atol=1e-6 * np.abs(e).max())
 
 
+@pytest.mark.parametrize('film', [dict(gain=0.3), dict(gain=0.2, saturation=0.9)])
+def test_derivative_with_gains_that_are_left_in(film):
+    """That of the image as it is measured, by differences."""
+    scene = scene_of(None, None, detector(corrected=False, **film), output='transmission')
+    params = mi.traverse(scene)
+    density = mi.Float(params['cloud.density'])
+
+    def image(factor):
+        params['cloud.density'] = density * factor
+        params.update()
+        return np.array(mi.render(scene, params), float).ravel()
+
+    differences = (image(1.01) - image(0.99)) / 0.02
+    params['cloud.density'] = density
+    dr.enable_grad(params['cloud.density'])
+    params.update()
+    dr.set_grad(params['cloud.density'], density)
+    found = dr.forward_to(mi.render(scene, params)).numpy().ravel()
+    smooth = np.abs(image(1.01) + image(0.99) - 2 * image(1)) < 1e-4  # not where saturation ends in between
+    assert smooth.mean() > 0.9 and np.abs(differences).max() > 0.01
+    np.testing.assert_allclose(found[smooth], differences[smooth], atol=2e-4)
+
+
 # ---- focal spot and aperture -----------------------------------------------------------------------------------------
 
 
@@ -254,8 +277,10 @@ def test_edge_responses(tube, film, variance):
     assert abs(mean) < 0.003 and abs(found / variance - 1) < 0.01
 
 
-def test_aperture_is_the_mean_over_a_pixel():
-    soft = scene_of(None, None, detector(aperture=1.0, aperture_order=8))
+@pytest.mark.parametrize('pixel', ['centre', 3, 'area'])
+def test_aperture_is_the_mean_over_a_pixel(pixel):
+    """Once, whatever the integrator's own rule for pixels."""
+    soft = scene_of(None, None, detector(aperture=1.0, aperture_order=8), pixel=pixel)
     fine = scene_of(pixel=16, output='transmission')
     np.testing.assert_allclose(render(soft), -np.log(render(fine)), atol=2e-4)
 
@@ -303,6 +328,7 @@ def test_scan_of_a_scene(scene_file):
             "xray_tube 'tube': focal_spot of 100 mm is not smaller than the distance of the source, 100 mm",
         ),
         ('name="photons"', 'name="photon"', 'photon'),
+        ('name="material"', 'name="material_fooot"', "'tube': material_fooot names none of the shapes foot, volume"),
     ],
 )
 def test_one_line_that_names_element_and_place(scene_file, old, new, match):
@@ -325,6 +351,25 @@ def test_second_material_of_a_mesh():
         scene = scene_of(dict(thing=thing), tube)
         with pytest.raises(InputError, match=match):
             through_mitsuba(scene)
+
+
+@pytest.mark.parametrize('share', [1.5, -0.5, np.nan])
+def test_second_material_is_a_share(share):
+    cloud = ellipsoids(cloud_of())
+    cloud['second'] = mi.TensorXf(np.full((len(cloud_of().density), 1), share, np.float32))
+    with pytest.raises(InputError, match='is a share in the density, from 0 to 1'):
+        through_mitsuba(scene_of(dict(thing=cloud)))
+
+
+@physics
+def test_materials_of_shapes_in_a_cloud():
+    """The one that attenuates less comes first, in whatever order shapes name them."""
+    tubes = [
+        Tube.of(TubeParameters(kvp=120.0, split='.04, .09', material=one, materials=dict(a=other)))
+        for one, other in (('Al', 'water'), ('water', 'Al'))
+    ]
+    for tube in tubes:
+        assert tube.fitted() == tube.of_cloud().made_of('cloud') == ('water', 'Al')
 
 
 @physics

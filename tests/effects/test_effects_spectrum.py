@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from lingo_mi.effects import spectrum as module
 from lingo_mi.effects.bands import Bands, band
@@ -68,7 +69,10 @@ def test_second_time_it_is_read(tmp_path, monkeypatch):
     np.testing.assert_array_equal(tube_spectrum(60.0).photons, made.photons)
     monkeypatch.setattr(module, 'library', library)
     (file,) = (tmp_path / 'lingo_mi' / 'spectra').iterdir()
-    file.write_bytes(b'PK damaged')
+    for damaged in b'PK damaged', b'':
+        file.write_bytes(damaged)
+        np.testing.assert_array_equal(tube_spectrum(60.0).photons, made.photons)
+    np.savez(file, energies=made.energies, photons=made.photons * np.nan)
     np.testing.assert_array_equal(tube_spectrum(60.0).photons, made.photons)
 
 
@@ -90,6 +94,7 @@ def test_missing_library(monkeypatch):
         (lambda: tube_spectrum(120, 12, 'Al'), 'filtration'),
         (lambda: tube_spectrum(120, 12, 'Al -1'), 'filtration'),
         (lambda: tube_spectrum(120, 12, 'Unobtainium 1'), 'filtration'),
+        (lambda: tube_spectrum(20, 12, 'Pb 100'), 'no photon of 20 kV passes it'),
         (lambda: monochromatic(0.0), 'energy must be positive'),
         (lambda: attenuation('unobtainium', [60.0]), 'is unknown'),
         (lambda: attenuation('CsI @ -1', [60.0]), 'positive density'),
@@ -129,20 +134,38 @@ def test_attenuation(material, energy, mu):
     'materials, errors',
     [
         (('water',), (3e-1, 2e-2, 2e-3, 2e-4, 2e-5, 2e-6)),
-        (('soft tissue', 'bone'), (7e-1, 1e-1, 2e-2, 2e-3, 5e-4, 1e-4)),
+        (('soft tissue', 'bone'), (9e-1, 2e-1, 2e-2, 3e-3, 6e-4, 2e-4)),
+        (('Fe',), (3e0, 4e-1, 1e-1, 3e-2, 8e-3, 5e-3)),
     ],
 )
 def test_error_against_the_full_spectrum(materials, errors, response):
     """What bands promise holds on other points than those that they were fitted to, and falls with their number."""
     spectrum = tube_spectrum(120.0)
     signal, r = spectrum.detected(response), ratios(spectrum, *materials)
-    u = np.random.default_rng(0).dirichlet(np.ones(len(materials) + 1), 500)[:, :-1] * 10
-    exact = -np.log(np.exp(-u @ np.array(r)) @ signal)
+
+    def measured(u):
+        return -np.log(np.exp(-u @ np.array(r)) @ signal)
+
+    most = [brentq(lambda p: measured(p * axis) - 10, 0, 100) for axis in np.eye(len(materials))]
+    u = np.random.default_rng(0).dirichlet(np.ones(len(materials) + 1), 500)[:, :-1] * most
+    exact = measured(u)
     for count, most in enumerate(errors, 1):
         found = band(signal, r, count, 10.0)
         error = np.abs(found.hardened(*u.T) - exact).max()
         assert error < 1.1 * found.error and found.error < most
         assert abs(found.weights.sum() - 1) < 1e-12 and found.weights.min() > 0
+
+
+@pytest.mark.parametrize('reference', [20.0, 60.0, 110.0])
+def test_bands_are_right_at_any_reference_energy(reference):
+    """Iron, until one photon in two thousand is left."""
+    spectrum = tube_spectrum(120.0)
+    mu = attenuation('Fe', spectrum.energies)
+    found = band(spectrum.detected('energy'), [mu / attenuation('Fe', [reference])], 5, 10.0)
+    thickness = np.linspace(0, 21, 50)  # mm
+    exact = -np.log(np.exp(-np.outer(thickness, mu)) @ spectrum.detected('energy'))
+    assert exact.max() > 7.5
+    np.testing.assert_allclose(found.hardened(thickness * attenuation('Fe', [reference])), exact, atol=5e-3)
 
 
 def test_monochromatic_needs_one_band():

@@ -129,6 +129,7 @@ def test_wrong_numbers_of_dimensions(tmp_path, n):
         (dict(HeaderSize='9' * 300), 'cannot hold'),
         (dict(HeaderSize='inf'), 'HeaderSize'),
         (dict(CompressedData='True'), 'unpacked'),
+        (dict(CompressedData='True', HeaderSize='1e19'), 'begin after its end'),
         (dict(ElementSpacing='1 nan 1'), 'ElementSpacing'),
         (dict(TransformMatrix='1 0 0'), 'TransformMatrix'),
     ],

@@ -159,3 +159,12 @@ def test_no_folder(tmp_path):
         read_volume(tmp_path / 'v.zarr')
     with pytest.raises(InputError, match='there is no such file'):
         read_volume(tmp_path / 'w.zarr')
+
+
+def test_a_chunk_that_no_memory_holds(tmp_path, volume):
+    """It is unpacked whole, however small the array."""
+    folder = image(tmp_path / 'v.zarr', volume)
+    huge = dict(name='regular', configuration=dict(chunk_shape=[1 << 20] * 3))
+    damage(folder, '0/zarr.json', lambda header: header.update(chunk_grid=huge))
+    with pytest.raises(InputError, match='memory'):
+        read_volume(folder)

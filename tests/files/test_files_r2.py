@@ -211,3 +211,15 @@ def test_files_elsewhere(tmp_path, name):
     meta.write_text(json.dumps(content))
     with pytest.raises(InputError, match='beside it'):
         r2.read(folder)
+
+
+def test_one_image_listed_many_times(tmp_path, monkeypatch):
+    folder(tmp_path)
+    meta = json.loads((tmp_path / 'meta_data.json').read_text())
+    meta['proj_train'] = meta['proj_train'][:1] * 50
+    (tmp_path / 'meta_data.json').write_text(json.dumps(meta))
+    monkeypatch.setattr('lingo_mi.memory.host_room', lambda: 49 * 24 * 8)
+    refused(tmp_path, 'memory')
+    meta['proj_train'] *= 3000
+    (tmp_path / 'meta_data.json').write_text(json.dumps(meta))
+    refused(tmp_path, 'lists 150000 views, but a scan has at most 100000')

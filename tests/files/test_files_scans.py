@@ -464,3 +464,18 @@ def test_held_out_views_of_an_npy_are_refused(tmp_path):
     with open(tmp_path / 'a.yml', 'a') as file:
         file.write('test_angles: [1, 2]\n')
     refused(tmp_path / 'a.npy', 'test_angles goes with a folder of EXR views')
+
+
+def test_more_exr_views_than_memory_holds(tmp_path, monkeypatch):
+    write_scan(tmp_path / 'scan', small_dataset(), 'exr')
+    monkeypatch.setattr('lingo_mi.memory.host_room', lambda: 100.0)
+    with pytest.raises(InputError, match='memory'):
+        read_scan(tmp_path / 'scan')
+
+
+def test_numbers_that_yaml_takes_for_text(tmp_path):
+    write_scan(tmp_path / 'a.npy', small_dataset().train, 'npy')
+    text = (tmp_path / 'a.yml').read_text().replace('input: line_integral', 'input: intensity\nI0: 1e3')
+    (tmp_path / 'a.yml').write_text(text)
+    np.save(tmp_path / 'a.npy', np.full(small_dataset().train.projections.shape, 1e3 * np.exp(-1), np.float32))
+    np.testing.assert_allclose(read_scan(tmp_path / 'a.npy').train.projections, 1, rtol=1e-6)

@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import drjit as dr
@@ -12,6 +14,8 @@ import pytest
 
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting import checkpoint, step, view_loss
@@ -89,7 +93,7 @@ ENDS = RATES | dict(
     lambda_tv=(0, 1e6),
     beta1=(0, 1 - 1e-6),
     beta2=(0, 1 - 1e-6),
-    epsilon=(0, 1),
+    epsilon=(1e-30, 1),
     average=(0, 1 - 1e-6),
     densify_threshold=(0, 1e6),
     split_size=(0, 1e6),
@@ -480,3 +484,53 @@ def test_progress_shows_the_absolute_measures(tmp_path):
     assert shown[-1] == dict(psnr_2d=3.0, psnr_3d=4.0)
     assert {k: v for k, v in again.history[0].items() if k.startswith('psnr')} == dict(psnr_3d_r2=1.0, psnr_3d=2.0)
     assert Fitted.from_checkpoint(path).history == again.history
+
+
+def test_steps_of_an_unfinished_fit(scan, tmp_path):
+    path = tmp_path / 'fit.npz'
+    with pytest.raises(KeyboardInterrupt):
+        run(scan, SHORT, some_points(scan.geometry), path=path, progress=stop_at(5))
+    assert Fitted.from_checkpoint(path).steps == 5
+    assert run(scan, SHORT, None, path=path).steps == Fitted.from_checkpoint(path).steps == 30
+
+
+@pytest.mark.parametrize('what', ['valid pixels', 'effects of the scan'])
+def test_another_mask_or_other_effects_are_refused(scan, tmp_path, what):
+    path, settings = tmp_path / 'fit.npz', SHORT.changed(iterations=3)
+    valid = np.ones(scan.projections.shape, bool)
+    valid[0, :4] = False
+    detector = Detector.of(**Detector.DEFAULTS | dict(photons=1e4))
+    change = dict(valid=valid) if what == 'valid pixels' else dict(effects=Effects(detector=detector))
+    run(replace(scan, **change), settings, some_points(scan.geometry), path=path)
+    run(replace(scan, **change), settings, None, path=path)
+    with pytest.raises(InputError, match=f'other values of the {what};'):
+        run(scan, settings, None, path=path)
+
+
+def test_values_of_invalid_pixels_do_not_count(scan):
+    valid = np.zeros(scan.projections.shape, bool)
+    valid[:, :4] = True
+    few = limits.bounded(SHORT.changed(values_per_gaussian=5), replace(scan, valid=valid))
+    assert few.densification.max_gaussians == valid.sum() // 5
+
+
+def test_rates_in_lists(scan):
+    """As JSON has them."""
+    adam = replace(SHORT.adam, rate_centre=[1e-3, 1e-4], rate_pose=[0, 0])
+    assert adam.rate_centre == (1e-3, 1e-4)
+    run(scan, replace(SHORT.changed(iterations=1), adam=adam), some_points(scan.geometry))
+
+
+def test_fits_in_several_threads():
+    """They take turns: in Dr.Jit at once, they would wait for each other for ever."""
+    code = """
+import concurrent.futures, numpy as np, lingo_mi as lm
+g = lm.Geometry.cone(DSO=100, DSD=150, nDetector=12, dDetector=3, nVoxel=10, dVoxel=2, angles=lm.circular(4))
+scan = lm.simulate(lm.phantom('foot', size=10).data, g, progress=False).train
+with concurrent.futures.ThreadPoolExecutor(3) as pool:
+    fits = [pool.submit(lm.fit, scan, iterations=12, n_points=80, progress=False) for _ in range(2)]
+    image = lm.project(np.ones((1, 3)), np.ones((1, 3)), [[0, 0, 0, 1.0]], [1.0], g)
+    print(np.abs(fits[0].result().volume() - fits[1].result().volume()).max() < 1e-3, image.shape)
+"""
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0 and done.stdout.split() == ['True', '(4,', '12,', '12)'], done.stderr[-2000:]

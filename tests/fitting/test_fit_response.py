@@ -10,13 +10,16 @@ from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop
 from helpers.same import assert_same
 from lingo_mi.calibration.drift import Drift
 from lingo_mi.calibration.response.response import Response
+from lingo_mi.completion.clouds import FittedCloud, load_cloud
+from lingo_mi.completion.prepare import prepare_completed, prepare_start
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.reconstruction import SART
 from lingo_mi.results.measure import measure
 from lingo_mi.results.save import save
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Dataset, Scan
 
 LONG = SHORT.changed(iterations=600, densify_from=10**6, lambda_tv=0.0)
 
@@ -141,3 +144,20 @@ def test_smooth_poses_hold_and_are_told_of_views_between():
 def test_bad_settings(changes, message):
     with pytest.raises(InputError, match=message):
         SHORT.changed(**changes)
+
+
+def test_volumes_from_a_result_are_made_without_the_response(tmp_path):
+    """Measured views are as the cloud's own: in Python, from the files of the result, and beside completed views."""
+    scan, true = measured(true_views(8), air=[[0.05], [0.03]], gain=[[0], [0.06]])
+    settings = SHORT.changed(iterations=20, fit_air='smooth', fit_gain='smooth')
+    fitted = run(scan, settings, some_points(scan.geometry), seed=3)
+    for part, known in zip(fitted.model.response.parts, true.parts):
+        part.values = known.values.copy()
+    save(tmp_path, fitted, measure(fitted, scan))
+    ideal = true.undone(scan.projections, scan.geometry)
+    assert np.abs(ideal - scan.projections).max() > 0.05
+    for cloud in FittedCloud.of(fitted), load_cloud(tmp_path / 'result.xml'):
+        found, _ = prepare_start(Dataset(scan), cloud, SART())
+        np.testing.assert_allclose(found.projections, ideal, atol=1e-5)
+        completed, _ = prepare_completed(Dataset(scan), cloud, 16, SART())
+        np.testing.assert_allclose(completed.projections[: len(scan)], ideal, atol=1e-5)

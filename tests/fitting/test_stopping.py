@@ -131,7 +131,7 @@ def test_auto_is_for_scans_whose_noise_is_known(scan):
 @pytest.mark.parametrize(
     'views, changes, message',
     [
-        (3, {}, 'needs at least 4, but the scan has 3'),
+        (3, {}, 'needs at least 4 with valid pixels, but the scan has 3'),
         (12, dict(rate_pose=(1e-3, 1e-3)), 'cannot know their poses: take pose_motion=smooth'),
         (12, dict(stop='soon'), "stop is 'off', 'on' or 'auto', not 'soon'"),
         (12, dict(stop_patience=5), 'stop_patience must be at least stop_every, 10, not 5'),
@@ -165,11 +165,27 @@ def test_altered_checkpoints(scan, tmp_path, where):
         run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path, progress=progress)
     content = contents(path)
     names = [name for name in content if name.startswith('array.search.')]
-    assert len(names) == (4 if where == 'fit' else 8)
+    assert len(names) == (5 if where == 'fit' else 9)
     for name in names:
         old = content[name]
-        for bad in (None, old[:0], old[..., None], old.astype(complex), old - 1000 if old.ndim == 1 else old[:-1]):
+        gone = [] if name == 'array.search.views' else [None]  # which checkpoints of earlier programs lack
+        for bad in (*gone, old[:0], old[..., None], old.astype(complex), old - 1000 if old.ndim == 1 else old[:-1]):
             altered = {k: v for k, v in content.items() if k != name} | ({} if bad is None else {name: bad})
             write_as_before(tmp_path / 'old.npz', altered)
             with pytest.raises(InputError, match='not a checkpoint of a fit, or it is damaged'):
                 checkpoint.load(tmp_path / 'old.npz')
+
+
+def test_views_without_a_valid_pixel_do_not_count(scan, tmp_path):
+    """They are no views to hold out, and a search that sees fewer goes on from its checkpoint."""
+    valid = np.ones(scan.projections.shape, bool)
+    valid[3] = False
+    path, settings = tmp_path / 'fit.npz', SETTINGS.changed(fit_air='view')
+    with pytest.raises(KeyboardInterrupt):
+        run(replace(scan, valid=valid), settings, some_points(scan.geometry), path=path, progress=stop_at(15))
+    assert run(replace(scan, valid=valid), settings, None, path=path).search is not None
+    valid[3:] = False
+    few = replace(scan, valid=valid)
+    assert bounded(SETTINGS.changed(stop='auto'), few).stopping.stop == 'off'
+    with pytest.raises(InputError, match='at least 4 with valid pixels, but the scan has 3'):
+        bounded(SETTINGS, few)

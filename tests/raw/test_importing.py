@@ -12,6 +12,8 @@ import lingo_mi as lm
 from helpers.raw_frames import raw_frames
 from lingo_mi.cli import main
 from lingo_mi.errors import InputError
+from lingo_mi.files.scans import write_scan
+from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import rtk
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.importing import Options, import_raw
@@ -439,3 +441,53 @@ def test_units_in_an_array_and_alignment_frames(tmp_path):
     recording = open_recording(tmp_path / 'scan.h5')
     assert len(recording.views) == 4
     np.testing.assert_allclose(recording.angles, [0, 90, 180, 270])
+
+
+def test_poses_that_the_geometry_names_are_not_overwritten(tmp_path, raw, monkeypatch, capsys):
+    n = 1200
+    np.save(tmp_path / 'frames.npy', np.ones((n, 2, 8), np.float32))
+    g = lm.Geometry.helix(
+        DSO=100, DSD=150, nDetector=(2, 8), dDetector=1, nVoxel=4, dVoxel=1, angles=np.linspace(0, 40, n), pitch=5.0
+    )
+    lm.Scan(g, np.ones((n, 2, 8), np.float32))
+    write_scan(tmp_path / 'scan.npy', lm.Scan(g, np.ones((n, 2, 8), np.float32)), 'npy')
+    values = yaml.safe_load((tmp_path / 'scan.yml').read_text())
+    (tmp_path / 'geo.yml').write_text(yaml.safe_dump({k: v for k, v in values.items() if k != 'input'}))
+    (tmp_path / 'scan.npy').unlink(), (tmp_path / 'scan.yml').unlink()
+    before = (tmp_path / 'scan.poses.npy').read_bytes()
+    command = [
+        'import',
+        tmp_path / 'frames.npy',
+        '--geometry',
+        tmp_path / 'geo.yml',
+        '--out',
+        tmp_path / 'scan.npy',
+        '--i0',
+        1,
+    ]
+    for more, says in ([], 'scan.poses.npy: would be overwritten'), (['--force'], 'would be overwritten'):
+        monkeypatch.setattr(sys, 'argv', ['lingo-mi', *map(str, command), *more])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert stop.value.code == 2 and says in capsys.readouterr().err
+    assert (tmp_path / 'scan.poses.npy').read_bytes() == before
+
+
+@pytest.mark.parametrize('name', ['dVoxel', 'sVoxel'])
+def test_the_size_of_voxels_needs_their_number(tmp_path, raw, scan_yml, name):
+    values = yaml.safe_load(scan_yml.read_text())
+    scan_yml.write_text(yaml.safe_dump({k: v for k, v in values.items() if 'Voxel' not in k} | {name: 0.1}))
+    with pytest.raises(InputError, match=f'{name} needs nVoxel'):
+        load(tmp_path / 'views.npy', scan_yml, **save(tmp_path, raw))
+
+
+def test_a_square_panel_in_one_number(tmp_path, scan_yml):
+    np.save(tmp_path / 'v.npy', np.full((6, 5, 5), 100.0, np.float32))
+    scan_yml.write_text(scan_yml.read_text() + 'nDetector: 5\n')
+    assert load(tmp_path / 'v.npy', scan_yml, i0=100.0).geometry.nDetector == (5, 5)
+
+
+def test_colours_are_refused(tmp_path, scan_yml):
+    tifffile.imwrite(tmp_path / 'rgb.tif', np.zeros((20, 30, 3), np.uint8), photometric='rgb')
+    with pytest.raises(InputError, match='holds colours'):
+        read_volume(tmp_path / 'rgb.tif')

@@ -99,3 +99,18 @@ def test_a_scanners_own_file():
     values, white = read_xtekct(Path(os.environ['LINGO_MI_DATA']) / 'nikon' / 'radiogram.xtekct')
     assert white == 60000 and len(values['angles']) == 3142 and values['nDetector'] == [2000, 1500]
     assert values['angles'][-1] - values['angles'][0] == pytest.approx(360, abs=0.2)
+
+
+def test_the_white_level_has_the_dark_signal_in_it(tmp_path, xtekct):
+    views = np.full((4, 6, 8), 5000 + 55000 * np.exp(-1), np.float32)
+    np.save(tmp_path / 'v.npy', views)
+    np.save(tmp_path / 'd.npy', np.full((2, 6, 8), 5000, np.float32))
+    scan = lm.load_raw(tmp_path / 'v.npy', xtekct, progress=False, darks=tmp_path / 'd.npy')
+    np.testing.assert_allclose(scan.projections, 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize('number', ['1e300', '1e13', '0'])
+def test_numbers_of_projections(xtekct, number):
+    xtekct.write_text(xtekct.read_text().replace('Projections=4', f'Projections={number}'))
+    with pytest.raises(lm.InputError, match='needs Projections from 1 to 100000'):
+        read_xtekct(xtekct)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.results.event_log import EventLog
 
 pytest.importorskip('tensorboardX')
 
@@ -61,3 +62,15 @@ def test_without_the_library(data, tmp_path, monkeypatch):
     with pytest.raises(lm.InputError, match='tensorboard'):
         lm.fit(data, 'fast', iterations=2, n_points=300, progress=False, log_dir=tmp_path)
     assert np.all([not p.name.startswith('events') for p in tmp_path.iterdir()])
+
+
+def test_pictures_have_the_step_of_their_numbers(tmp_path):
+    from types import SimpleNamespace
+
+    log = EventLog(tmp_path)
+    for step in 7, 5000:
+        log.look(SimpleNamespace(volume=np.ones((4, 4, 4), np.float32), measured=None, test=None, views=None))
+        log.step(dict(iteration=step, loss=1.0), 5000)
+    log.close(True)
+    steps = {event.step for event in records(tmp_path) for value in event.summary.value if value.HasField('image')}
+    assert steps == {7, 5000}
