@@ -310,3 +310,17 @@ def test_a_result_with_modelled_effects_is_loaded(tmp_path):
     np.testing.assert_allclose(again.render(data.train.geometry), result.render(data.train.geometry), atol=1e-5)
     with pytest.raises(lm.InputError, match='load the folder of its result'):
         lm.load_result(tmp_path / 'out' / 'checkpoint.npz')
+
+
+@pytest.mark.parametrize('change', [dict(dVoxel=16.0), dict(offOrigin=(30.0, 0.0, 0.0))])
+def test_a_phantom_on_another_grid_is_its_voxels(change):
+    """Also one with exact projections of its own, which are those of its own grid alone."""
+    sizes = dict(DSO=1000, DSD=1500, nDetector=(40, 48), dDetector=12, nVoxel=32, angles=circular(3))
+    phantom = lm.phantom('shepp_logan', size=32)
+    own = lm.Geometry.cone(**sizes, dVoxel=8.0)
+    exact = lm.simulate(phantom, own, progress=False).train.projections
+    voxels = lm.simulate(phantom.data, own, progress=False).train.projections
+    assert 0.01 < np.std(exact - voxels) / exact.max() < 0.1
+    other = lm.Geometry.cone(**sizes | dict(dVoxel=8.0) | change)
+    found = lm.simulate(phantom, other, progress=False).train.projections
+    assert_same(found, lm.simulate(phantom.data, other, progress=False).train.projections)

@@ -351,3 +351,36 @@ def test_bad_arguments(home, arguments, message):
     code, _, err = batch(home, *arguments)
     assert code == 2 and message in err and err.count('\n') == 1, err
     assert not (home / 'out').exists()
+
+
+def test_files_that_a_geometry_names_belong_to_the_request(home):
+    """A mask and poses in files of their own; what lies beside the scan and is not read does not."""
+    geometry = lm.Geometry.cone(
+        DSO=100, DSD=150, nDetector=(20, 24), dDetector=1.8, nVoxel=16, dVoxel=1.5, angles=np.linspace(0, 3, 7)
+    )
+    scan = lm.simulate(lm.phantom('foot', size=16), geometry, progress=False).train
+    valid = np.ones(scan.projections.shape, bool)
+    valid[:, :2] = False
+    write_scan(home / 'one.npy', replace(scan, valid=valid), 'npy')
+    row = Row('one', 2, str(home), file='one.npy')
+    of_scene = Row('ct', 3, str(home), geometry='tiny.xml')
+    asked = row.request(), of_scene.request()
+    (home / 'one.png').write_text('x')
+    (home / 'one.calibrated.npy').write_text('x')
+    assert asked == (row.request(), of_scene.request())
+    (home / 'named').mkdir()
+    (home / 'one.yml').rename(home / 'named' / 'two.yml')
+    (home / 'one.valid.npy').rename(home / 'named' / 'one.valid.npy')
+    row = Row('one', 2, str(home), file='one.npy', geometry='named/two.yml')
+    asked = row.request()
+    np.save(home / 'named' / 'one.valid.npy', ~valid)
+    assert row.request() != asked
+    (home / 'tiny.xml').write_text(
+        SCENE.replace('"phantom" value="foot"', '"filename" value="$ct"').replace(
+            '<scene version="3.0.0">', '<scene version="3.0.0"><default name="ct" value="ct.npy"/>'
+        )
+    )
+    np.save(home / 'ct.npy', np.ones((4, 4, 4), np.float32))
+    asked = of_scene.request()
+    np.save(home / 'ct.npy', np.zeros((4, 4, 4), np.float32))
+    assert of_scene.request() != asked

@@ -405,6 +405,10 @@ def test_scan(scene_file):
             'scatter_box must be x, y, z',
         ),
         ('<integer name="scatter" value="9"/><string name="scatter_voxels" value="many"/>', 'scatter_voxels must be'),
+        (
+            '<integer name="scatter" value="1048576"/><string name="scatter_grid" value="256"/>',
+            'take too much memory: give at most 8192 paths',
+        ),
     ],
 )
 def test_one_line_that_names_element_and_place(scene_file, given, match):

@@ -51,6 +51,7 @@ PLAIN = (
     'scanner',
     'signal',
     'moments',
+    'traits',
 )
 VALUES = None, 'text', '', -1, 0, 1.5, float('nan'), float('inf'), 10**400, True, [], [1], {}, {'a': 1}, [{}]
 LEGAL = {  # a fit could have left these
@@ -149,7 +150,7 @@ def test_altered_plain_values(whole, refused, tmp_path, name):
         else:
             assert line(path), value
     write_as_before(path, content, {k: v for k, v in extra.items() if k != name})
-    if name in ('unit', 'effects', 'moments'):  # not in the first checkpoints
+    if name in ('unit', 'effects', 'moments', 'traits'):  # not in the first checkpoints
         checkpoint.load(path)
     else:
         assert f'{name} is missing' in line(path)

@@ -503,7 +503,7 @@ def test_another_mask_or_other_effects_are_refused(scan, tmp_path, what):
     change = dict(valid=valid) if what == 'valid pixels' else dict(effects=Effects(detector=detector))
     run(replace(scan, **change), settings, some_points(scan.geometry), path=path)
     run(replace(scan, **change), settings, None, path=path)
-    with pytest.raises(InputError, match=f'other values of the {what};'):
+    with pytest.raises(InputError, match=f'other values of .*the {what};'):
         run(scan, settings, None, path=path)
 
 

@@ -13,6 +13,7 @@ from helpers.effect_parts import detector, rendered_from_files, stepper_of, tube
 from helpers.effects import XML
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from helpers.script import fit
+from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
@@ -355,3 +356,13 @@ def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path):
         Fitted.from_checkpoint(path)
     again = Fitted.from_checkpoint(path, effects)
     np.testing.assert_allclose(again.render(scan.geometry), done.render(scan.geometry), rtol=1e-5, atol=1e-5)
+
+
+@physics
+def test_a_cloud_stands_for_all_shapes():
+    """A fit of shapes of several materials has one cloud: what starts from it asks for no shape's material."""
+    made = Tube.of(TubeParameters(kvp=120.0, material='water', materials=dict(bolt='Al'), split='.04, .09'))
+    scan = replace(tiny_scan(geometry(8)), effects=Effects(made))
+    scan = replace(scan, projections=scan.projections / 20)
+    fitted = run(scan, SHORT.changed(iterations=4, densify_from=100), some_points(scan.geometry), seed=3)
+    assert FittedCloud.of(fitted).effects.tube.made_of('cloud') == ('water', 'Al')

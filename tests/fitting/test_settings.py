@@ -44,6 +44,7 @@ def test_values(name, text, value):
         ('init_density', 'xyz', "'xyz' is unknown"),
         ('outside', 'left', "'invalid', 'ignore' or 'auto'"),
         ('lambda', '1', 'unknown'),
+        ('epsilon', '0', 'in [1e-30, 1]'),
         *(
             (name, '-1', f'{name} must lie in [0, ')
             for name in (
@@ -51,7 +52,6 @@ def test_values(name, text, value):
                 'lambda_ssim',
                 'lambda_gradient',
                 'lambda_tv',
-                'epsilon',
                 'decay_steps',
                 'densify_from',
                 'densify_threshold',
