@@ -117,16 +117,15 @@ def _response(geometry: Geometry, record: dict, path) -> Response | None:
     if 'response' not in record:
         return None
     try:
-        found = {name: np.array(values, float) for name, values in record['response'].items()}
-        values = dict(air=found.get('air_level'), gain=found.get('gain_percent'))
-        if any(x is not None and x.shape != (len(geometry),) for x in values.values()):
+        found = {name: np.array(values, float)[:, None] for name, values in record['response'].items()}
+        if any(x.shape != (len(geometry), 1) for x in found.values()):
             raise ValueError
-    except (AttributeError, TypeError, ValueError):
+    except (AttributeError, IndexError, TypeError, ValueError):
         raise InputError(f'{path}: the response in the {METRICS} beside it is of another fit') from None
-    response = Response.of(geometry, **{name: 'view' for name, x in values.items() if x is not None})
-    if response is not None:
-        factor = dict(air=1.0, gain=0.01)
-        response.restore({f'response.{k}': factor[k] * x[:, None] for k, x in values.items() if x is not None})
+    air, gain = ('view' if name in found else 'off' for name in ('air_level', 'gain_percent'))
+    response = Response.of(geometry, air=air, gain=gain)
+    for part in response.parts if response else ():
+        part.values = found['air_level'] if part.name == 'air' else found['gain_percent'] / 100
     return response
 
 
