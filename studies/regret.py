@@ -175,7 +175,7 @@ class Study:
             fixed = {name: found for name in names if (found := self.get(case, name))}
             cells = [f'{fixed[n]["psnr_3d"]:.2f} ({fixed[n]["seconds"]:.0f} s)' if n in fixed else '–' for n in names]
             best = max((found['psnr_3d'] for found in fixed.values()), default=np.nan)
-            photons = f'{case.photons:g}' if case.photons else 'no noise'
+            photons = f'{case.photons:g}' if case.photons else 'measured' if case.object == MEASURED else 'no noise'
             lines.append(
                 f'| {case.object} | x{case.finer} | {case.views} | {photons} '
                 f'| {chosen["psnr_3d"]:.2f} ({chosen["seconds"]:.0f} s) | {best - chosen["psnr_3d"]:+.2f} '

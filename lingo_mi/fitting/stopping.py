@@ -139,7 +139,7 @@ def record(iterations: list[int], errors: list[float], kept: int) -> dict:
     """What a search has seen and said, as plain values."""
     last = iterations[-1]
     if kept == last:
-        said = f'not before step {kept}: held-out error fell to the end'
+        said = f'took all {kept} steps: the held-out error fell to the end'
     else:
         said = f'stopped at step {kept}: held-out error did not fall for {last - kept} steps more'
     return dict(said=said, kept=kept, iterations=iterations, errors=errors)

@@ -113,7 +113,7 @@ def test_what_is_told(scan, whole):
 
 def test_a_search_to_the_end(scan):
     found = run(scan, SETTINGS.changed(iterations=20), some_points(scan.geometry), seed=3)
-    assert found.steps == 20 and found.search['said'] == 'not before step 20: held-out error fell to the end'
+    assert found.steps == 20 and found.search['said'] == 'took all 20 steps: the held-out error fell to the end'
 
 
 def test_auto_is_for_scans_whose_noise_is_known(scan):
