@@ -1,6 +1,6 @@
 """Public measured scans, each as one .npz with its geometry in its authors' terms.
 
-Helsinki Tomography Challenge 2022 (Zenodo 7418878)
+Helsinki Tomography Challenge 2022 (Zenodo 6984868, CC BY 4.0)
     sinogram_<name> [angles, pixels], angles_deg, DSO, DSD, dDetector: a fan beam, which is a cone beam with one row
 Walnut (Meaney 2022, Zenodo 6986012, CC BY 4.0)
     projections [view, v, u], row 0 at the top; angles in degrees; DSO, DSD, dDetector; air, the line integral of empty
