@@ -59,9 +59,8 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             fail(f'has values of the type {dtype} in the shape {list(shape)}, not one number a voxel')
         if any(n != 1 for n, name in zip(shape, names) if name not in SPACE) or min(shape) < 1:
             fail(f'has the shape {list(shape)} along {" ".join(names)}; a single volume is needed')
-        together = math.prod(
-            map(max, shape, _piece(array))
-        )  # a piece is unpacked whole, also where it is larger than the array
+        # A piece is unpacked whole, also where it is larger than the array.
+        together = math.prod(map(max, shape, _piece(array)))
         require_room(together * (dtype.itemsize + 8), path)
         try:
             values = np.asarray(array[...])
