@@ -40,12 +40,13 @@ class Calibration:
     def needed(self) -> bool:
         """Whether anything is more than three standard errors from zero."""
         drift = self.found.drift
-        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._responds
+        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._response is not None
 
     @property
-    def _responds(self) -> bool:
+    def _response(self) -> Response | None:
+        """The response, if any of its numbers was found."""
         response = self.found.response
-        return response is not None and any(part.values.any() for part in response.parts)
+        return response if response is not None and any(part.values.any() for part in response.parts) else None
 
     def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
         """The same views with the panel where it was found. Views that were held out get what was found for their time, which
@@ -64,8 +65,8 @@ class Calibration:
             raise InputError('this calibration is that of a scan by another scanner: calibrate this one')
         if not self.needed:
             return scan
-        response = self.found.response
-        if response is not None and self._responds:
+        response = self._response
+        if response is not None:
             if scan.effects is not None:  # it was found on line integrals
                 scan = linearised(scan, scan.effects)
             scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))

@@ -68,6 +68,7 @@ from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
 from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
+from lingo_mi.scene.checks import thinned
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
 
@@ -237,7 +238,7 @@ def reconstruct_into(
     effects      'model' or 'ignore'
     parameters   of the scene file
     """
-    slab = args.slab or 0
+    slab: int = args.slab or 0
     scene = load_scene(args.scene, parameters, slab)
     cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
     opacities = isinstance(cloud, Fitted) and not cloud.settings.volumetric
@@ -254,14 +255,13 @@ def reconstruct_into(
             check_room(scene.scanner.geometry, algorithm, views)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, slab)
     scan, inputs = dataset.train, {}
-    parts = scan.geometry.slabs(args.slab or scan.geometry.nVoxel[2])
     require_rays(scan.geometry)
-    if not (args.slab and isinstance(algorithm, Sweeps)):  # whose `slabs` knows better
-        check_room(scan.geometry.slab(*parts[0]), algorithm, views)
+    if not (slab and isinstance(algorithm, Sweeps)):  # whose `slabs` knows better
+        check_room(thinned(scan.geometry, slab), algorithm, views)
     if algorithm is None:
         assert cloud is not None  # as `check_arguments` has made sure
-        if args.slab:
-            sample = sampled(cloud)
+        if slab:
+            sample, parts = sampled(cloud), scan.geometry.slabs(slab)
             write_in_slabs(out, scan, (sample(scan.geometry.slab(*part)) for part in parts), args)
             return
         began = time.perf_counter()
@@ -276,7 +276,7 @@ def reconstruct_into(
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
-        if args.slab:
+        if slab:
             make_in_slabs(out, scan, algorithm, args)
             return
         with progress_bar(algorithm, scan) as progress:

@@ -103,6 +103,7 @@ _KEYS = {
 
 
 MOST_LISTED = 1000  # poses in a geometry file
+VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 
 # ---- geometry files ----------------------------------------------------------------------------------------
@@ -255,7 +256,7 @@ def _read_npy(path, geometry):
 
 def written_files(path: Path) -> list[Path]:
     """All files that a scan `path`, an .npy, may be written to."""
-    return [path, path.with_suffix('.yml'), *(path.with_name(path.stem + end) for end in ('.valid.npy', '.poses.npy'))]
+    return [path, path.with_suffix('.yml'), *(path.with_name(path.stem + ending) for ending in (VALID, POSES))]
 
 
 def named_files(geometry: PathLike | str) -> list[Path]:
@@ -281,11 +282,11 @@ def _write_npy(path, dataset, history=None):
         more['history'] = history
     content = {path: dataset.train.projections}
     if dataset.train.valid is not None:
-        more['valid'] = path.stem + '.valid.npy'
+        more['valid'] = path.stem + VALID
         content[path.with_name(more['valid'])] = dataset.train.valid
     geometry = dataset.train.geometry
     if len(geometry) > MOST_LISTED and not isinstance(geometry, CircularGeometry):
-        more['poses'] = path.stem + '.poses.npy'
+        more['poses'] = path.stem + POSES
         content[path.with_name(more['poses'])] = astra.to_vectors(geometry.rays(), geometry.nDetector)
     # An earlier scan stays whole until all of the new one is on the disk.
     with ExitStack() as files:

@@ -33,7 +33,8 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
         raise InputError(
             f'batch is the number of views in a step: at most the {len(scan)} of the scan, not {settings.batch}'
         )
-    settings = settings.changed(stop='on' if _stops(settings, scan) else 'off')
+    valid = trusted(scan, settings).valid
+    settings = settings.changed(stop='on' if _stops(settings, scan, valid) else 'off')
     if not settings.cloud:
         needed = FIELD_BYTES * sum(n for n, _ in parameter_shapes(settings, 0).values())
         if needed > (has := room()):
@@ -44,7 +45,6 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
         return settings
     control, bounds = settings.densification, settings.bounds
     if control.values_per_gaussian > 0:
-        valid = trusted(scan, settings).valid
         measured = scan.projections.size if valid is None else int(valid.sum())
         most = min(max(int(measured / control.values_per_gaussian), 1), control.max_gaussians)
         settings = settings.changed(max_gaussians=most, n_points=min(settings.start.n_points, most))
@@ -66,11 +66,10 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     return settings.changed(scale_max=min(bounds.scale_max, largest))
 
 
-def _stops(settings: Settings, scan: Scan) -> bool:
-    """Whether a fit of the scan is to stop early, by views that are held out."""
+def _stops(settings: Settings, scan: Scan, valid: np.ndarray | None) -> bool:
+    """Whether a fit of the scan, of whose pixels those are valid, is to stop early, by views that are held out."""
     free = max(settings.adam.rate_pose) > 0 and settings.calibration.pose_motion == 'view'
     why = None
-    valid = trusted(scan, settings).valid
     views = len(scan) if valid is None else int(valid.any((1, 2)).sum())
     if views < LEAST_VIEWS:
         why = f'needs at least {LEAST_VIEWS} with valid pixels, but the scan has {views}'
