@@ -216,7 +216,7 @@ class Joseph(Stack):
 
 
 def _on_device(values):
-    """A copy, as NumPy's memory may lie where kernels and recordings are others."""
+    """A copy. Where NumPy's memory is aligned otherwise than the device's, it would need a kernel and a recording of its own."""
     return mi.Float(values.ravel()) + dr.opaque(mi.Float, 0)
 
 

@@ -15,6 +15,7 @@ import mitsuba as mi
 from lingo_mi.projectors.joseph import Block, Joseph, Tables, Views
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.reconstruction.system import System, evaluated, scalar
+from lingo_mi.runtime import one_at_a_time
 
 
 def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool) -> mi.Float:
@@ -25,7 +26,8 @@ def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool)
         return _update(A, views, step, noneg, *volumes)
     t, block = A.tables, Block.of(views)
     arrays = t.columns, *t.rows, t.matrices, block.numbers, block.count, step, *volumes
-    return _REPLAY(*arrays, size=t.size, panel=t.panel, margin=t.margin, noneg=noneg)
+    with one_at_a_time():
+        return _REPLAY(*arrays, size=t.size, panel=t.panel, margin=t.margin, noneg=noneg)
 
 
 def _update(A, views, step, noneg, x, b, weights, weighed):

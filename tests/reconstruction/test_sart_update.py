@@ -1,4 +1,7 @@
-"""An update of SART is traced once: scans of one size share the recording, and a replayed update is the traced one to the bit."""
+"""An update of SART is traced once: scans of one size and threads share the recording, and a replayed update is the traced one to
+the bit."""
+
+from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
 import numpy as np
@@ -45,3 +48,12 @@ def test_scans_of_one_size_share_a_recording(monkeypatch):
     for start in (0.0, 0.1, 0.2):
         SART(niter=3).run(scan(start=start))
     assert [recording.n_recordings for recording in replay.recordings.values()] == [1]
+
+
+def test_threads_share_a_recording(monkeypatch):
+    measured, algorithm = scan(), SART(niter=20)
+    alone = algorithm.run(measured).volume
+    monkeypatch.setattr(sart_update, '_REPLAY', Replay(sart_update._replayed))
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(algorithm.run, [measured] * 8):
+            np.testing.assert_array_equal(found.volume, alone)

@@ -10,7 +10,6 @@ import pytest
 from helpers.checkpoints import contents
 from helpers.fields import SMALL
 from helpers.fits import assert_equal_states, error_of, geometry, stop_at, tiny_scan
-from helpers.same import adds_in_any_order
 from lingo_mi.errors import InputError
 from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting import checkpoint
@@ -24,10 +23,8 @@ from lingo_mi.reconstruction.fdk import FDK
 
 
 @pytest.fixture
-def one_thread(variant):
+def one_thread(sums_in_order):
     """Sums of derivatives take the order in which threads come to their parts."""
-    if adds_in_any_order():
-        pytest.skip('a GPU adds in any order')
     before = dr.thread_count()
     dr.set_thread_count(1)
     yield
