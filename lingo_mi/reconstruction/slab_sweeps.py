@@ -34,7 +34,7 @@ from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.sart_update import normalised, updated
-from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, scalar
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
@@ -168,7 +168,7 @@ class _Slabs:
     def _updated(self, part, error, views, lmbda, noneg):
         """The projector of a slab, and the slab after an update."""
         A, inside = self._projector(part)
-        rule = updated(self._load(part), scalar(lmbda), noneg)
+        rule = updated(self._load(part), lmbda, noneg)
 
         def between_zeros(voxel, *sums):
             return dr.select(inside(voxel), rule(voxel, *sums), 0)
