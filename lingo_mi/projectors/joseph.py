@@ -18,7 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import prod
 from typing import Any
 
 import drjit as dr
@@ -68,6 +69,31 @@ def column_table(geometry: Geometry) -> np.ndarray:
     return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class Block:
+    """Some views of a scan, on the device.
+
+    numbers   mi.UInt, with an extra entry: an array of length one would need another kernel
+    count     how many, mi.UInt [1]
+    """
+
+    numbers: Any
+    count: Any
+
+    @classmethod
+    def of(cls, views: Views) -> Block:
+        """The views with these numbers."""
+        if isinstance(views, Block):
+            return views
+        return cls(mi.UInt([*map(int, views), 0]), dr.opaque(mi.UInt, len(views)))
+
+    def __len__(self) -> int:
+        return dr.width(self.numbers) - 1
+
+
+Views = Sequence[int] | np.ndarray | Block
+
+
 class Stack:
     """Volumes and stacks of images of a scan on the device. Raises InputError for 2^32 voxels or more."""
 
@@ -79,15 +105,32 @@ class Stack:
 
     def images(self, projections: np.ndarray) -> Any:
         """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
-        return mi.Float(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1).ravel()) + dr.opaque(
-            mi.Float, 0
-        )
+        return _on_device(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1))
 
-    def select(self, images: Any, views: Sequence[int] | np.ndarray) -> Any:
+    def select(self, images: Any, views: Views) -> Any:
         """The images of the views `views` out of those of all views."""
-        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
+        chosen = Block.of(views)
+        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
         block = index // self.pixels
-        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen, block) - block) * self.pixels)
+        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.pixels)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """A scan's data for the kernels.
+
+    size, panel      voxels along x, y and z; rows and columns
+    columns, rows    Float, see `column_table`; (source, top, step) of the heights
+    matrices         Float, see `Joseph._column_matrix`
+    margin           rows of zeros above and below images, at least as many as the rows with hats that cover a voxel
+    """
+
+    size: tuple[int, int, int]
+    panel: tuple[int, int]
+    columns: Any
+    rows: Sequence[Any]
+    matrices: Any
+    margin: int
 
 
 class Joseph(Stack):
@@ -110,52 +153,61 @@ class Joseph(Stack):
                 f'{half:.4g} mm from the axis; lower nVoxel or dVoxel'
             )
         rays, voxel = geometry.rays(), geometry.dVoxel[2]
-        self._columns = mi.Float(column_table(geometry).ravel())
-        self._rows = _heights(geometry)
-        self._matrix = mi.Float(self._column_matrix().ravel())
         # The largest number of rows with hats that cover a voxel; it is reached nearest to the source.
         nearest = 1.0 if rays.parallel else (geometry.DSO - half) / geometry.DSD
         rows = int(np.ceil(2 * voxel / (nearest * abs(rays.v[0, 2])) + 1e-3))
-        self._margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
+        self.tables = Tables(
+            self.size,
+            self.panel,
+            _on_device(column_table(geometry)),
+            _heights(geometry),
+            _on_device(self._column_matrix()),
+            rows if rows <= ROWS else -(-rows // ROWS) * ROWS,
+        )
+
+    @classmethod
+    def of_tables(cls, tables: Tables) -> Joseph:
+        """The matrix that these tables tell."""
+        out = cls.__new__(cls)
+        out.tables, out.size, out.panel = tables, tables.size, tables.panel
+        out.voxels, out.pixels = prod(tables.size), prod(tables.panel)
+        return out
 
     def of_slab(self, slab: Geometry) -> Joseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
         Stack.__init__(out, slab)
-        out._rows = _heights(slab)
+        out.tables = replace(self.tables, size=slab.nVoxel, rows=_heights(slab))
         return out
 
     def _column_matrix(self):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
         return self.geometry.voxel_matrices()[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
 
-    def forward(self, volume: Any, views: Sequence[int] | np.ndarray) -> tuple[Any, Any]:
+    def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
         A 1 is the length of the ray inside the box, mm.
         """
-        chosen, index = _numbers(views), dr.arange(mi.UInt, len(views) * self.pixels)
+        chosen = Block.of(views)
+        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
         column = index // self.panel[0]
         block = column // self.panel[1]
         row = index - column * self.panel[0]
-        column += (dr.gather(mi.UInt, chosen, block) - block) * self.panel[1]
-        return _integrate(volume, self.size, self._columns, self._rows, column, row)
+        column += (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.panel[1]
+        return _integrate(volume, self.size, self.tables.columns, self.tables.rows, column, row)
 
-    def adjoint(
-        self, images: Any, views: Sequence[int] | np.ndarray, rule: Callable[[Any, Any, Any], Any] | None = None
-    ) -> Any:
+    def adjoint(self, images: Any, views: Views, rule: Callable[[Any, Any, Any], Any] | None = None) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
         images : mi.Float [block, u, v]
         rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt of some voxels and their sums; its result is
                  stored instead. It is traced into the kernel, which saves memory for whole volumes
         """
-        chosen, n_views = _numbers(views), dr.opaque(mi.UInt, len(views))
-        ones = rule is not None
-        tables = _Tables(self.size, self.panel, self._columns, self._rows, self._matrix, self._margin)
-        weighted = _weighted(images, chosen, tables, ones)
+        chosen, ones = Block.of(views), rule is not None
+        weighted = _weighted(images, chosen.numbers, self.tables, ones)
         dr.eval(weighted)
-        voxels, sums = _collect(weighted, chosen, n_views, tables, ones)
+        voxels, sums = _collect(weighted, chosen.numbers, chosen.count, self.tables, ones)
         out = dr.empty(mi.Float, self.voxels)
         for voxel, inside, value in zip(*voxels, sums):
             value = value[0] if rule is None else rule(dr.select(inside, voxel, 0), *value)
@@ -163,22 +215,9 @@ class Joseph(Stack):
         return out
 
 
-@dataclass
-class _Tables:
-    """A scan's data for the kernels.
-
-    size, panel      voxels along x, y and z; rows and columns
-    columns, rows    Float, see `column_table`; (source, top, step) of the heights
-    matrices         Float, see `_column_matrix`
-    margin           rows of zeros above and below images, at least as many as the rows with hats that cover a voxel
-    """
-
-    size: tuple
-    panel: tuple
-    columns: Any
-    rows: Sequence
-    matrices: Any
-    margin: int
+def _on_device(values):
+    """A copy. Where NumPy's memory is aligned otherwise than the device's, it would need a kernel and a recording of its own."""
+    return mi.Float(values.ravel()) + dr.opaque(mi.Float, 0)
 
 
 def _heights(geometry):
@@ -188,11 +227,6 @@ def _heights(geometry):
     source = 0.0 if rays.parallel else (rays.source[0, 2] - first) / voxel
     top = (rays.corner[0, 2] + rays.v[0, 2] / 2 - first) / voxel
     return [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
-
-
-def _numbers(views):
-    """View numbers on the device, with an extra entry: an array of length one would need another kernel."""
-    return mi.UInt(np.append(np.asarray(views, np.uint32), np.uint32(0)))
 
 
 def _hat(position, index, n):
@@ -246,7 +280,7 @@ def _integrate(data, size, columns, rows, column, row):
     return path * total, path * count
 
 
-def _weighted(images, chosen, tables: _Tables, ones):
+def _weighted(images, chosen, tables: Tables, ones):
     """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
 
     With `ones`, mi.Vector2f interleaved: the second component comes from an image of ones, treated alike.
@@ -267,7 +301,7 @@ def _weighted(images, chosen, tables: _Tables, ones):
 
 
 @dr.syntax
-def _collect(weighted, chosen, n_views, tables: _Tables, ones):
+def _collect(weighted, chosen, n_views, tables: Tables, ones):
     """A^T y of voxels. Each lane computes RUN voxels of a line along z, spaced as far apart as possible.
 
     Neighbouring lanes then fetch neighbouring values, and a lane computes only once what does not depend on z.

@@ -43,7 +43,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
-from lingo_mi.reconstruction.sart_update import normalised, updated
+from lingo_mi.reconstruction.sart_update import update
 from lingo_mi.reconstruction.slab_sweeps import swept
 from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
@@ -87,13 +87,9 @@ def sweep(
     system: System, x: mi.Float, lmbda: float, parts: Sequence[Sequence[int] | np.ndarray], noneg: bool
 ) -> mi.Float:
     """One pass over all blocks of views, from a volume (mi.Float [voxels], density per mm) to the next."""
-    A, start = system.A, x
+    start = x
     for views in parts:
-        ax, path = A.forward(x, views)
-        if system.weights is not None:
-            path = A.select(system.weighed, views)
-        error = normalised(A.select(system.b, views) - ax, path)
-        x = evaluated(A.adjoint(error, views, updated(x, lmbda, noneg, system.weights)))
+        x = update(system, x, views, lmbda, noneg)
     if system.between is None and system.blur is None:
         return x
     change = x - start

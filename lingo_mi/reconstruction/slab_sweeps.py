@@ -34,7 +34,7 @@ from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.sart_update import normalised, updated
-from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
@@ -93,16 +93,12 @@ def discard(folder: Path) -> None:
 
 def _complete(system: _Slabs, updates: Sequence[Update], noneg: bool, progress: Progress | None) -> None:
     """The updates that are left."""
-    volume, projections, lengths = system.volume, system.scan.projections, system.lengths()
+    volume, lengths = system.volume, system.lengths()
     parts, ax = len(volume.parts), system.project(updates[volume.done][1])
     for done in range(volume.done, len(updates)):
         lmbda, views = updates[done]
-        b = system.A.images(projections[views])
-        error = evaluated(b - ax)
-        relative = norm(error) / (norm(b) or 1.0)
-        if not np.isfinite(relative):
-            raise InputError(DIVERGED)
-        error = normalised(error, mi.Float(lengths[views].ravel()))
+        error, relative = system.error(ax, views, lengths)
+        del ax
         following = updates[done + 1][1] if done + 1 < len(updates) else None
 
         def report(slabs, done=done, relative=relative):
@@ -142,6 +138,15 @@ class _Slabs:
                 ax = evaluated(ax + A.forward(self._load(part), views)[0])
         return ax
 
+    def error(self, ax: mi.Float, views: np.ndarray, lengths: np.ndarray) -> tuple[mi.Float, float]:
+        """The normalised error of A x in some views, and |A x - b| / |b|. lengths: of all views, see `lengths`."""
+        b = self.A.images(self.scan.projections[views])
+        error = evaluated(b - ax)
+        relative = norm(error) / (norm(b) or 1.0)
+        if not np.isfinite(relative):
+            raise InputError(DIVERGED)
+        return evaluated(normalised(error, mi.Float(lengths[views].ravel()))), relative
+
     def update(
         self,
         error: mi.Float,
@@ -168,7 +173,7 @@ class _Slabs:
     def _updated(self, part, error, views, lmbda, noneg):
         """The projector of a slab, and the slab after an update."""
         A, inside = self._projector(part)
-        rule = updated(self._load(part), lmbda, noneg)
+        rule = updated(self._load(part), scalar(lmbda), noneg)
 
         def between_zeros(voxel, *sums):
             return dr.select(inside(voxel), rule(voxel, *sums), 0)
