@@ -1,4 +1,4 @@
-"""Joseph's projector and its exact transpose for circular scans, fast enough to iterate with (Dr.Jit, llvm or cuda).
+"""Joseph's projector and its exact transpose before an upright panel, fast enough to iterate with (Dr.Jit, llvm or cuda).
 
 Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982): a ray's main axis is x or y,
 whichever has more slices of voxels on its way. The ray is sampled where it meets the slices of voxel centres along this axis, by
@@ -7,9 +7,10 @@ bilinear interpolation in each slice. If the main axis is x, the weight of voxel
     a = L(u, v) hat(y(u, i) - j) hat(z(u, v, i) - k),    hat(s) = max(0, 1 - |s|)
 
 with L the path per slice. As in `grid`, the edge value is held in the outer half voxel, where the box ends. The panel's
-columns are parallel to the axis of rotation, so y depends on the column alone, and the few pixels with hats that cover a given
-voxel can be listed. So both directions are gathers with the same weights. Nothing is scattered, and results do not depend
-on the order of threads.
+columns are parallel to z, so y depends on the column alone, and the few pixels with hats that cover a given voxel can be listed.
+So both directions are gathers with the same weights. Nothing is scattered, and results do not depend on the order of threads.
+
+Source and panel may lie anywhere else, and differ from view to view: circles, helices, shifts.
 
 Volumes and images are on the device: volumes mi.Float [nx * ny * nz], z fastest; images mi.Float [block, u, v], v fastest.
 """
@@ -27,11 +28,14 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.rays import Rays
 
 COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
 ROWS = 4  # most rows of the panel that its innermost loop unrolls
+TILT = 1e-3  # pixels that corners of an upright panel may be off
+MOST_ROWS = 64  # of a small panel that rays of one voxel may meet
 
 
 def column_table(geometry: Geometry) -> np.ndarray:
@@ -115,53 +119,85 @@ class Stack:
         return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.pixels)
 
 
+def serves(geometry: Geometry) -> bool:
+    """Whether `Joseph` can project a scan: an upright panel, and all of the volume well before the source."""
+    return is_upright(geometry) and _rows_of_voxel(geometry) <= max(MOST_ROWS, 2 * geometry.nDetector[0])
+
+
+def is_upright(geometry: Geometry) -> bool:
+    """Whether every view's columns are parallel to z and its rows, and a parallel beam, perpendicular to it."""
+    rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
+    pixel = np.minimum(np.linalg.norm(rays.u, axis=1), np.linalg.norm(rays.v, axis=1))
+    off = np.abs(rays.u[:, 2]) * n_u + np.linalg.norm(rays.v[:, :2], axis=1) * n_v
+    if rays.parallel:
+        off = off + np.abs(rays.source[:, 2]) * np.linalg.norm(geometry.sVoxel[:2])
+    return bool((off < TILT * pixel).all())
+
+
+def _rows_of_voxel(geometry):
+    """The largest number of rows with hats that cover a voxel; infinity where a voxel lies beside the source or behind it."""
+    rays = geometry.rays()
+    nearest = _nearest(rays, geometry)
+    if nearest <= 0:
+        return np.inf
+    return np.ceil(2 * geometry.dVoxel[2] / (nearest * np.abs(rays.v[:, 2]).min()) + 1e-3)
+
+
+def _nearest(rays: Rays, geometry):
+    """The smallest share of the way from the source to the panel at which a voxel lies; parallel: 1."""
+    if rays.parallel:
+        return 1.0
+    half, middle = np.array(geometry.sVoxel[:2]) / 2, np.array(geometry.offOrigin[:2])
+    corners = middle + half * [(-1, -1), (-1, 1), (1, -1), (1, 1)]
+    normal = np.cross(rays.u, rays.v)[:, :2]
+    to_panel = ((rays.corner - rays.source)[:, :2] * normal).sum(1)
+    return (((corners - rays.source[:, None, :2]) * normal[:, None]).sum(2) / to_panel[:, None]).min()
+
+
 @dataclass(frozen=True)
 class Tables:
     """A scan's data for the kernels.
 
     size, panel      voxels along x, y and z; rows and columns
-    columns, rows    Float, see `column_table`; (source, top, step) of the heights
+    columns, rows    Float, see `column_table` and `row_table`
     matrices         Float, see `Joseph._column_matrix`
+    valid            Float, 1 for valid pixels and 0 for others, as images of all views; None: all are valid
     margin           rows of zeros above and below images, at least as many as the rows with hats that cover a voxel
     """
 
     size: tuple[int, int, int]
     panel: tuple[int, int]
     columns: Any
-    rows: Sequence[Any]
+    rows: Any
     matrices: Any
+    valid: Any
     margin: int
 
 
 class Joseph(Stack):
-    """The matrix A of a circular scan, view by view. `adjoint` is its transpose to rounding.
+    """The matrix A of a scan with an upright panel, with zero rows for invalid pixels. `adjoint` is its transpose to rounding.
 
     The same compiled kernels (one forward, two backward) serve blocks of any number of views.
 
-    Raises InputError if the source of a cone beam is inside the volume, or the volume has 2^32 voxels or more.
+    valid   bool [view, v, u]; None: all
+
+    Raises InputError for a scan that it does not serve (see `serves`), or a volume of 2^32 voxels or more.
     """
 
-    def __init__(self, geometry: Geometry):
+    def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry)
-        if not isinstance(geometry, CircularGeometry):
-            raise InputError('this projector needs a source on a circle about z and an upright panel')
-        x, y = (abs(o) + s / 2 for o, s in zip(geometry.offOrigin[:2], geometry.sVoxel[:2]))
-        half = np.hypot(x, y)
-        if geometry.mode == 'cone' and geometry.DSO <= half:
+        if not serves(geometry):
             raise InputError(
-                f'the source can be inside the volume: DSO = {geometry.DSO:g} mm, but the volume reaches '
-                f'{half:.4g} mm from the axis; lower nVoxel or dVoxel'
+                'this projector needs an upright panel, and a source that is not beside or inside the volume'
             )
-        rays, voxel = geometry.rays(), geometry.dVoxel[2]
-        # The largest number of rows with hats that cover a voxel; it is reached nearest to the source.
-        nearest = 1.0 if rays.parallel else (geometry.DSO - half) / geometry.DSD
-        rows = int(np.ceil(2 * voxel / (nearest * abs(rays.v[0, 2])) + 1e-3))
+        rows = int(_rows_of_voxel(geometry))
         self.tables = Tables(
             self.size,
             self.panel,
             _on_device(column_table(geometry)),
-            _heights(geometry),
+            _on_device(row_table(geometry)),
             _on_device(self._column_matrix()),
+            None if valid is None else self.images(valid),
             rows if rows <= ROWS else -(-rows // ROWS) * ROWS,
         )
 
@@ -177,7 +213,7 @@ class Joseph(Stack):
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
         Stack.__init__(out, slab)
-        out.tables = replace(self.tables, size=slab.nVoxel, rows=_heights(slab))
+        out.tables = replace(self.tables, size=slab.nVoxel, rows=_on_device(row_table(slab)))
         return out
 
     def _column_matrix(self):
@@ -187,7 +223,7 @@ class Joseph(Stack):
     def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:
         """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
 
-        A 1 is the length of the ray inside the box, mm.
+        A 1 is the length of the ray inside the box, mm; zero for invalid pixels.
         """
         chosen = Block.of(views)
         index = dr.arange(mi.UInt, len(chosen) * self.pixels)
@@ -195,7 +231,11 @@ class Joseph(Stack):
         block = column // self.panel[1]
         row = index - column * self.panel[0]
         column += (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.panel[1]
-        return _integrate(volume, self.size, self.tables.columns, self.tables.rows, column, row)
+        ax, path = _integrate(volume, self.tables, column, row)
+        if self.tables.valid is None:
+            return ax, path
+        used = dr.gather(mi.Float, self.tables.valid, column * self.panel[0] + row) > 0
+        return dr.select(used, ax, 0), dr.select(used, path, 0)
 
     def adjoint(self, images: Any, views: Views, rule: Callable[[Any, Any, Any], Any] | None = None) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
@@ -220,13 +260,17 @@ def _on_device(values):
     return mi.Float(values.ravel()) + dr.opaque(mi.Float, 0)
 
 
-def _heights(geometry):
-    """Height of the source, of the first row over it, and between rows, in voxels, on the device."""
+def row_table(geometry: Geometry) -> np.ndarray:
+    """Heights of the source, of the first row over it, and between rows, in voxels: float32 [view, 3]."""
     rays, voxel = geometry.rays(), geometry.dVoxel[2]
     first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
-    source = 0.0 if rays.parallel else (rays.source[0, 2] - first) / voxel
-    top = (rays.corner[0, 2] + rays.v[0, 2] / 2 - first) / voxel
-    return [dr.opaque(mi.Float, float(x)) for x in (source, top - source, rays.v[0, 2] / voxel)]
+    source = 0.0 * rays.v[:, 2] if rays.parallel else (rays.source[:, 2] - first) / voxel
+    top = (rays.corner[:, 2] + rays.v[:, 2] / 2 - first) / voxel
+    return np.stack([source, top - source, rays.v[:, 2] / voxel], -1).astype(np.float32)
+
+
+def _rows(rows, view):
+    return [dr.gather(mi.Float, rows, view * 3 + i) for i in range(3)]
 
 
 def _hat(position, index, n):
@@ -247,11 +291,11 @@ def _span(a, b, n):
 
 
 @dr.syntax
-def _integrate(data, size, columns, rows, column, row):
-    """(A x, A 1) of rays, one per lane."""
-    nx, ny, nz = size
-    a, b, c, e, g, h, along_y = _column(columns, column)
-    source, top, step = rows
+def _integrate(data, tables: Tables, column, row):
+    """(A x, A 1) of rays, one per lane. column: of all views."""
+    nx, ny, nz = tables.size
+    a, b, c, e, g, h, along_y = _column(tables.columns, column)
+    source, top, step = _rows(tables.rows, column // tables.panel[1])
     on_y = along_y > 0
     height = dr.fma(mi.Float(row), step, top)
     n_main, n_other = dr.select(on_y, mi.Float(ny), mi.Float(nx)), dr.select(on_y, mi.Float(nx), mi.Float(ny))
@@ -285,18 +329,23 @@ def _weighted(images, chosen, tables: Tables, ones):
 
     With `ones`, mi.Vector2f interleaved: the second component comes from an image of ones, treated alike.
     """
-    (n_v, n_u), columns, rows, margin = tables.panel, tables.columns, tables.rows, tables.margin
+    (n_v, n_u), columns, margin = tables.panel, tables.columns, tables.margin
     pitch = n_v + 2 * margin
     index = dr.arange(mi.UInt, dr.width(images) // n_v * pitch)
     column = index // pitch
     row = mi.Int(index - column * pitch) - margin
     inside = (row >= 0) & (row < n_v)
     block = column // n_u
-    entry = (column + (dr.gather(mi.UInt, chosen, block) - block) * n_u) * COLUMN
-    height = dr.fma(mi.Float(row), rows[2], rows[1])
-    g, h = (dr.gather(mi.Float, columns, entry + i) for i in (4, 5))
+    view = dr.gather(mi.UInt, chosen, block)
+    original = view * n_u + (column - block * n_u)  # column, among those of all views
+    _, top, step = _rows(tables.rows, view)
+    height = dr.fma(mi.Float(row), step, top)
+    g, h = (dr.gather(mi.Float, columns, original * COLUMN + i) for i in (4, 5))
+    pixel = mi.UInt(dr.clip(row, 0, n_v - 1))
+    if tables.valid is not None:
+        inside &= dr.gather(mi.Float, tables.valid, original * n_v + pixel) > 0
     path = dr.select(inside, dr.sqrt(dr.fma(h, height * height, g)), 0)
-    value = path * dr.gather(mi.Float, images, column * n_v + mi.UInt(dr.clip(row, 0, n_v - 1)))
+    value = path * dr.select(inside, dr.gather(mi.Float, images, column * n_v + pixel), 0)
     return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
 
@@ -311,8 +360,7 @@ def _collect(weighted, chosen, n_views, tables: Tables, ones):
     Returns ((voxels, whether they exist), sums), lists of RUN. A sum is a list; with `ones`, its second entry is A^T 1.
     """
     (nx, ny, nz), (n_v, n_u), margin = tables.size, tables.panel, tables.margin
-    columns, matrices = tables.columns, tables.matrices
-    source, top, step = tables.rows
+    columns, rows, matrices = tables.columns, tables.rows, tables.matrices
     run = min(RUN, nz)
     stride = -(-nz // run)
     index = dr.arange(mi.UInt, nx * ny * stride)
@@ -322,13 +370,14 @@ def _collect(weighted, chosen, n_views, tables: Tables, ones):
     exists = [first_z + s * stride < nz for s in range(run)]
     x = mi.Float(line // ny)
     y, z0 = mi.Float(line) - x * ny, mi.Float(first_z)
-    inv_step = dr.rcp(step)
     pitch, chunks = n_v + 2 * margin, -(-margin // ROWS)
     sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
     block = mi.UInt(0)
     while block < n_views:
         view = dr.gather(mi.UInt, chosen, block)
         r = [dr.gather(mi.Float, matrices, view * 6 + i) for i in range(6)]
+        source, top, step = _rows(rows, view)
+        inv_step = dr.rcp(step)
         # The columns with rays that pass within one voxel along x or y.
         top_u = dr.fma(r[0], x, dr.fma(r[1], y, r[2]))
         bottom = dr.fma(r[3], x, dr.fma(r[4], y, r[5]))

@@ -25,7 +25,7 @@ def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool)
     if not isinstance(A, Joseph):
         return _update(A, views, step, noneg, *volumes)
     t, block = A.tables, Block.of(views)
-    arrays = t.columns, *t.rows, t.matrices, block.numbers, block.count, step, *volumes
+    arrays = t.columns, t.rows, t.matrices, t.valid, block.numbers, block.count, step, *volumes
     with one_at_a_time():
         return _REPLAY(*arrays, size=t.size, panel=t.panel, margin=t.margin, noneg=noneg)
 
@@ -38,8 +38,8 @@ def _update(A, views, step, noneg, x, b, weights, weighed):
     return evaluated(A.adjoint(error, views, updated(x, step, noneg, weights)))
 
 
-def _replayed(columns, source, top, row, matrices, numbers, count, step, *volumes, size, panel, margin, noneg):
-    A = Joseph.of_tables(Tables(size, panel, columns, (source, top, row), matrices, margin))
+def _replayed(columns, rows, matrices, valid, numbers, count, step, *volumes, size, panel, margin, noneg):
+    A = Joseph.of_tables(Tables(size, panel, columns, rows, matrices, valid, margin))
     return _update(A, Block(numbers, count), step, noneg, *volumes)
 
 

@@ -29,12 +29,10 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, parsed_json, reading, write_text, writing
 from lingo_mi.folder_lock import locked
-from lingo_mi.projectors.grid_pair import GridPair
-from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.joseph import serves
 from lingo_mi.reconstruction.algorithm import Progress
-from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.sart_update import normalised, updated
-from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, scalar
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
@@ -98,7 +96,6 @@ def _complete(system: _Slabs, updates: Sequence[Update], noneg: bool, progress: 
     for done in range(volume.done, len(updates)):
         lmbda, views = updates[done]
         error, relative = system.error(ax, views, lengths)
-        del ax
         following = updates[done + 1][1] if done + 1 < len(updates) else None
 
         def report(slabs, done=done, relative=relative):
@@ -117,7 +114,7 @@ class _Slabs:
     def __init__(self, scan: Scan, volume: _Volume):
         self.scan, self.volume = scan, volume
         one = scan.geometry.slab(0, 1)
-        self.A: Joseph | GridPair = Joseph(one) if is_circular(scan) else GridPair(one, scan.valid)
+        self.A = projector(one, scan.valid)
 
     def lengths(self) -> np.ndarray:
         """A 1, float32 [view, pixel]."""
@@ -299,7 +296,7 @@ class _Volume:
 
 def _digest(scan, updates, noneg, thickness):
     """Of all that the result depends on."""
-    found = hashlib.sha256(repr((scan.digest(), is_circular(scan), noneg, thickness)).encode())
+    found = hashlib.sha256(repr((scan.digest(), serves(scan.geometry), noneg, thickness)).encode())
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
     return found.hexdigest()

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid_pair import GridPair
-from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.joseph import Joseph, serves
 from lingo_mi.reconstruction.parameters import check_bound
-from lingo_mi.reconstruction.preconditions import is_circular
 from lingo_mi.reconstruction.wide_pixels import Between
 from lingo_mi.scan import Scan
 
@@ -38,8 +37,8 @@ class System:
     """
 
     def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
-        self.geometry = scan.geometry
-        self.A = Joseph(scan.geometry) if is_circular(scan) else GridPair(scan.geometry, scan.valid)
+        self.geometry, self.valid = scan.geometry, scan.valid
+        self.A = projector(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))
         self.b = self.measured = self.A.images(scan.projections)
         self.size_b = norm(self.b) or 1.0
@@ -94,7 +93,7 @@ class System:
         exact projector.
         """
         if isinstance(self.A, Joseph):
-            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, GridPair(self.geometry)))
+            joseph, exact = (A.forward(x, self.views)[0] for A in (self.A, GridPair(self.geometry, self.valid)))
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x: mi.Float) -> np.ndarray:
@@ -103,6 +102,11 @@ class System:
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
         return volume
+
+
+def projector(geometry: Geometry, valid: np.ndarray | None) -> Joseph | GridPair:
+    """The matrix A of a scan: Joseph's where the panel is upright, else the exact one. valid: bool [view, v, u], or None."""
+    return (Joseph if serves(geometry) else GridPair)(geometry, valid)
 
 
 def evaluated(x: Any) -> mi.Float:

@@ -1,5 +1,7 @@
 """Joseph's projector against a literal transcription, its transpose, and the analytic ball."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,15 +10,48 @@ import pytest
 from helpers.grids import scan
 from helpers.matrices import matrix
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.projectors.grid import project
-from lingo_mi.projectors.joseph import Joseph, Stack
+from lingo_mi.projectors.joseph import Joseph, Stack, serves
 
 
 def device_images(y):
     return mi.Float(np.ascontiguousarray(y.transpose(0, 2, 1), np.float32).ravel())
 
 
+def posed(motion, mode='cone'):
+    """The scan with its views moved: motion(rays, a random generator) returns what differs in the rays."""
+    geo = scan(mode, n=3)
+    rays = geo.rays()
+    rays = replace(rays, **motion(rays, np.random.default_rng(5)))
+    return Geometry.from_poses(rays, geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
+
+
+def climbing(rays, _):
+    shift = [-6.0, 2.0, 9.0] * np.array([[0], [0], [1.0]])
+    return dict(corner=rays.corner + shift.T) | ({} if rays.parallel else dict(source=rays.source + shift.T))
+
+
+def shaken(rays, rng):
+    shift = rng.normal(size=(2, 3, 3)) * [3.0, 3.0, 3.0]
+    return dict(corner=rays.corner + shift[0]) | ({} if rays.parallel else dict(source=rays.source + shift[1]))
+
+
+def turned(rays, _):
+    """Panels by 0.3 radians about z."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1.0]])
+    return dict(u=rays.u @ turn.T, corner=rays.corner + 21 / 2 * (rays.u - rays.u @ turn.T))
+
+
+def reversed_panel(rays, _):
+    """Rows from below, columns from the other side."""
+    return dict(u=-rays.u, v=-rays.v, corner=rays.corner + 21 * rays.u + 17 * rays.v)
+
+
+POSED = [
+    *(posed(motion) for motion in (climbing, shaken, turned, reversed_panel)),
+    *(posed(motion, 'parallel') for motion in (climbing, shaken, turned)),
+]
 GEOMETRIES = [
     dict(),
     dict(mode='parallel'),
@@ -29,23 +64,26 @@ GEOMETRIES = [
 ]
 
 
-@pytest.mark.parametrize('changes', GEOMETRIES)
-def test_against_the_transcription(changes):
-    geometry = scan(n=3, **changes)
-    A, J, rng = matrix(geometry), Joseph(geometry), np.random.default_rng(0)
+@pytest.mark.parametrize('masked', [False, True])
+@pytest.mark.parametrize('geometry', [*(scan(n=3, **changes) for changes in GEOMETRIES), *POSED])
+def test_against_the_transcription(geometry, masked):
+    """`masked`: with a third of the pixels left out, whatever stands in them."""
+    rng = np.random.default_rng(0)
     x, y = rng.normal(size=geometry.nVoxel), rng.normal(size=(3, *geometry.nDetector))
+    valid = rng.random(y.shape) < (0.67 if masked else 2)
+    A, J = matrix(geometry) * valid.reshape(-1, 1), Joseph(geometry, valid if masked else None)
     views = [2, 0]
     rows = A.reshape(3, -1, A.shape[1])[views].reshape(-1, A.shape[1])
     ax, paths = J.forward(mi.Float(np.float32(x).ravel()), views)
     shape = (2, *geometry.nDetector[::-1])
     result = ax.numpy().reshape(shape).transpose(0, 2, 1).ravel()
     expected = rows @ x.ravel()
-    assert np.count_nonzero(expected) > 20
+    assert np.count_nonzero(expected) > 15
     np.testing.assert_allclose(result, expected, atol=2e-5 * np.abs(expected).max())
     np.testing.assert_allclose(paths.numpy().reshape(shape).transpose(0, 2, 1).ravel(), rows.sum(1), atol=1e-3)
-    images = device_images(y[views])
-    aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
     expected = rows.T @ y[views].ravel()
+    images = device_images(np.where(valid, y, np.nan)[views])
+    aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
     np.testing.assert_allclose(aty.numpy(), expected, atol=2e-5 * np.abs(expected).max())
     np.testing.assert_allclose(sums.numpy(), rows.sum(0), atol=2e-5 * rows.sum(0).max())
 
@@ -132,9 +170,20 @@ def test_kernels_serve_any_views():
     assert len(history) == 6 and len({k['hash'] for k in history}) == 3 and all(k['cache_hit'] for k in history)
 
 
-def test_source_inside_the_volume_is_refused():
-    with pytest.raises(InputError, match='inside'):
-        Joseph(scan(DSO=15.0, DSD=300.0))
+def test_scans_it_does_not_serve():
+    """The volume reaches beyond the source, or so near that a voxel would cover hundreds of rows; a panel leans or is turned."""
+    lean = np.array([0, 1e-3, 0])
+    others = [
+        scan(DSO=15.0, DSD=300.0),
+        scan(DSO=28.35, DSD=300.0, n=90),
+        posed(lambda rays, _: dict(v=rays.v + lean)),
+        posed(lambda rays, _: dict(u=rays.u + lean[::-1] + [0, 0, 1e-3])),
+        posed(lambda rays, _: dict(source=np.array([[0.6, 0, 0.8]] * 3)), 'parallel'),
+    ]
+    for geometry in others:
+        assert not serves(geometry)
+        with pytest.raises(InputError, match='upright panel'):
+            Joseph(geometry)
 
 
 def test_voxels_that_32_bits_cannot_count():
