@@ -279,13 +279,15 @@ def view_rays(row: Any, n_v: int, n_u: int) -> tuple[Any, Any, Any]:
     return pixel_rays(row, mi.Float(column) + 0.5, mi.Float(index - column * n_v) + 0.5)
 
 
-def pixel_rays(row: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
-    """Rays through the positions x (along u) and y (along v) of a view: (origin, direction, t_min).
+def pixel_rays(rows: Any, x: Any, y: Any, view: Any = 0) -> tuple[Any, Any, Any]:
+    """Rays through the positions x (along u) and y (along v) of views: (origin, direction, t_min).
 
-    Positions are in pixels, centres at i + 1/2; row is one row of `view_table` as an evaluated mi.Float [19].
+    Positions are in pixels, centres at i + 1/2. rows is an evaluated mi.Float [19 n], rows of `view_table`; view says which of
+    them, mi.UInt.
     """
-    v: list[Any] = [mi.Vector3f(*(dr.gather(mi.Float, row, 3 * k + i) for i in range(3))) for k in range(6)]
-    return v[0] + x * v[1] + y * v[2], v[3] + x * v[4] + y * v[5], dr.gather(mi.Float, row, 18)
+    first = view * 19
+    v: list[Any] = [mi.Vector3f(*(dr.gather(mi.Float, rows, first + 3 * k + i) for i in range(3))) for k in range(6)]
+    return v[0] + x * v[1] + y * v[2], v[3] + x * v[4] + y * v[5], dr.gather(mi.Float, rows, first + 18)
 
 
 def _occupied(volume):
@@ -300,10 +302,10 @@ def _occupied(volume):
     return low, high
 
 
-def pixel_walk(geometry: Geometry, row: Any, x: Any, y: Any) -> tuple[Walk, Any]:
+def pixel_walk(geometry: Geometry, rows: Any, x: Any, y: Any, view: Any = 0) -> tuple[Walk, Any]:
     """The `Walk` along `pixel_rays` through the whole volume, and the length of a unit of t, in mm."""
     half = mi.Vector3f(*(s / 2 for s in geometry.sVoxel))
-    return _walk(geometry.nVoxel, -half, half, Lines(*pixel_rays(row, x, y)), *whole_box(geometry.nVoxel))
+    return _walk(geometry.nVoxel, -half, half, Lines(*pixel_rays(rows, x, y, view)), *whole_box(geometry.nVoxel))
 
 
 def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, Any]:

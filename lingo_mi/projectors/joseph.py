@@ -8,20 +8,14 @@ bilinear interpolation in each slice. If the main axis is x, the weight of voxel
 
 with L the path per slice. As in `grid`, the edge value is held in the outer half voxel, where the box ends. The panel's
 columns are parallel to z, so y depends on the column alone, and the few pixels with hats that cover a given voxel can be listed.
-So both directions are gathers with the same weights. Nothing is scattered, and results do not depend on the order of threads.
+So both directions are gathers with the same weights.
 
-Source and panel may lie anywhere else, and differ from view to view: circles, helices, shifts.
-
-Volumes and images are on the device: volumes mi.Float [nx * ny * nz], z fastest; images mi.Float [block, u, v], v fastest.
+Source and panel may lie anywhere else, and differ from view to view: circles, helices, shifts. `tilted_joseph` is for all others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
-from math import prod
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +24,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.projectors.stack import Gathered, hat, on_device, span
 
 COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
@@ -73,58 +68,16 @@ def column_table(geometry: Geometry) -> np.ndarray:
     return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Block:
-    """Some views of a scan, on the device.
-
-    numbers   mi.UInt, with an extra entry: an array of length one would need another kernel
-    count     how many, mi.UInt [1]
-    """
-
-    numbers: Any
-    count: Any
-
-    @classmethod
-    def of(cls, views: Views) -> Block:
-        """The views with these numbers."""
-        if isinstance(views, Block):
-            return views
-        return cls(mi.UInt([*map(int, views), 0]), dr.opaque(mi.UInt, len(views)))
-
-    def __len__(self) -> int:
-        return dr.width(self.numbers) - 1
+def row_table(geometry: Geometry) -> np.ndarray:
+    """Heights of the source, of the first row over it, and between rows, in voxels: float32 [view, 3]."""
+    rays, voxel = geometry.rays(), geometry.dVoxel[2]
+    first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
+    source = 0.0 * rays.v[:, 2] if rays.parallel else (rays.source[:, 2] - first) / voxel
+    top = (rays.corner[:, 2] + rays.v[:, 2] / 2 - first) / voxel
+    return np.stack([source, top - source, rays.v[:, 2] / voxel], -1).astype(np.float32)
 
 
-Views = Sequence[int] | np.ndarray | Block
-
-
-class Stack:
-    """Volumes and stacks of images of a scan on the device. Raises InputError for 2^32 voxels or more."""
-
-    def __init__(self, geometry: Geometry):
-        self.geometry, self.size, self.panel = geometry, geometry.nVoxel, geometry.nDetector
-        self.voxels, self.pixels = int(np.prod(self.size)), int(np.prod(self.panel))
-        if self.voxels >= 2**32:
-            raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
-
-    def images(self, projections: np.ndarray) -> Any:
-        """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
-        return _on_device(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1))
-
-    def select(self, images: Any, views: Views) -> Any:
-        """The images of the views `views` out of those of all views."""
-        chosen = Block.of(views)
-        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
-        block = index // self.pixels
-        return dr.gather(mi.Float, images, index + (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.pixels)
-
-
-def serves(geometry: Geometry) -> bool:
-    """Whether `Joseph` can project a scan: an upright panel, and all of the volume well before the source."""
-    return is_upright(geometry) and _rows_of_voxel(geometry) <= max(MOST_ROWS, 2 * geometry.nDetector[0])
-
-
-def is_upright(geometry: Geometry) -> bool:
+def _is_upright(geometry: Geometry) -> bool:
     """Whether every view's columns are parallel to z and its rows, and a parallel beam, perpendicular to it."""
     rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
     pixel = np.minimum(np.linalg.norm(rays.u, axis=1), np.linalg.norm(rays.v, axis=1))
@@ -154,154 +107,76 @@ def _nearest(rays: Rays, geometry):
     return (((corners - rays.source[:, None, :2]) * normal[:, None]).sum(2) / to_panel[:, None]).min()
 
 
-@dataclass(frozen=True)
-class Tables:
-    """A scan's data for the kernels.
-
-    size, panel      voxels along x, y and z; rows and columns
-    columns, rows    Float, see `column_table` and `row_table`
-    matrices         Float, see `Joseph._column_matrix`
-    valid            Float, 1 for valid pixels and 0 for others, as images of all views; None: all are valid
-    margin           rows of zeros above and below images, at least as many as the rows with hats that cover a voxel
-    """
-
-    size: tuple[int, int, int]
-    panel: tuple[int, int]
-    columns: Any
-    rows: Any
-    matrices: Any
-    valid: Any
-    margin: int
-
-
-class Joseph(Stack):
-    """The matrix A of a scan with an upright panel, with zero rows for invalid pixels. `adjoint` is its transpose to rounding.
-
-    The same compiled kernels (one forward, two backward) serve blocks of any number of views.
+class Joseph(Gathered):
+    """The matrix A of a scan with an upright panel: see `Gathered`.
 
     valid   bool [view, v, u]; None: all
+
+    On the device: `columns` and `rows`, see `column_table` and `row_table`; `matrices`, see `_column_matrix`. `margin`
+    rows of zeros above and below images are at least as many as the rows with hats that cover a voxel.
 
     Raises InputError for a scan that it does not serve (see `serves`), or a volume of 2^32 voxels or more.
     """
 
+    ARRAYS = ('columns', 'rows', 'matrices', 'valid')
+    SETTINGS = (*Gathered.SETTINGS, 'margin')
+
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
-        super().__init__(geometry)
-        if not serves(geometry):
+        super().__init__(geometry, valid)
+        if not self.serves(geometry):
             raise InputError(
                 'this projector needs an upright panel, and a source that is not beside or inside the volume'
             )
         rows = int(_rows_of_voxel(geometry))
-        self.tables = Tables(
-            self.size,
-            self.panel,
-            _on_device(column_table(geometry)),
-            _on_device(row_table(geometry)),
-            _on_device(self._column_matrix()),
-            None if valid is None else self.images(valid),
-            rows if rows <= ROWS else -(-rows // ROWS) * ROWS,
-        )
+        self.margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
+        self.columns, self.rows = on_device(column_table(geometry)), on_device(row_table(geometry))
+        self.matrices = on_device(self._column_matrix())
 
     @classmethod
-    def of_tables(cls, tables: Tables) -> Joseph:
-        """The matrix that these tables tell."""
-        out = cls.__new__(cls)
-        out.tables, out.size, out.panel = tables, tables.size, tables.panel
-        out.voxels, out.pixels = prod(tables.size), prod(tables.panel)
-        return out
+    def serves(cls, geometry: Geometry) -> bool:
+        """Whether it can project a scan: an upright panel, and all of the volume well before the source."""
+        return _is_upright(geometry) and _rows_of_voxel(geometry) <= max(MOST_ROWS, 2 * geometry.nDetector[0])
 
     def of_slab(self, slab: Geometry) -> Joseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        Stack.__init__(out, slab)
-        out.tables = replace(self.tables, size=slab.nVoxel, rows=_on_device(row_table(slab)))
+        out.geometry, out.size, out.rows = slab, slab.nVoxel, on_device(row_table(slab))
         return out
 
     def _column_matrix(self):
         """(x w, w) of the projected column of a voxel from its indices (i, j, 1): float32 [view, 6]."""
         return self.geometry.voxel_matrices()[:, [0, 2]][:, :, [0, 1, 3]].reshape(-1, 6).astype(np.float32)
 
-    def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:
-        """Line integrals of a volume in the views `views` (integers): (A x, A 1), each mi.Float [block, u, v].
+    def _integrate(self, volume, view, u, v):
+        return _integrate(volume, self, view, u, v)
 
-        A 1 is the length of the ray inside the box, mm; zero for invalid pixels.
-        """
-        chosen = Block.of(views)
-        index = dr.arange(mi.UInt, len(chosen) * self.pixels)
-        column = index // self.panel[0]
-        block = column // self.panel[1]
-        row = index - column * self.panel[0]
-        column += (dr.gather(mi.UInt, chosen.numbers, block) - block) * self.panel[1]
-        ax, path = _integrate(volume, self.tables, column, row)
-        if self.tables.valid is None:
-            return ax, path
-        used = dr.gather(mi.Float, self.tables.valid, column * self.panel[0] + row) > 0
-        return dr.select(used, ax, 0), dr.select(used, path, 0)
+    def _weighted(self, images, block, ones):
+        return _weighted(images, block.numbers, self, ones)
 
-    def adjoint(self, images: Any, views: Views, rule: Callable[[Any, Any, Any], Any] | None = None) -> Any:
-        """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
-
-        images : mi.Float [block, u, v]
-        rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt of some voxels and their sums; its result is
-                 stored instead. It is traced into the kernel, which saves memory for whole volumes
-        """
-        chosen, ones = Block.of(views), rule is not None
-        weighted = _weighted(images, chosen.numbers, self.tables, ones)
-        dr.eval(weighted)
-        voxels, sums = _collect(weighted, chosen.numbers, chosen.count, self.tables, ones)
-        out = dr.empty(mi.Float, self.voxels)
-        for voxel, inside, value in zip(*voxels, sums):
-            value = value[0] if rule is None else rule(dr.select(inside, voxel, 0), *value)
-            dr.scatter(out, value, voxel, inside, mode=dr.ReduceMode.Permute)
-        return out
-
-
-def _on_device(values):
-    """A copy. Where NumPy's memory is aligned otherwise than the device's, it would need a kernel and a recording of its own."""
-    return mi.Float(values.ravel()) + dr.opaque(mi.Float, 0)
-
-
-def row_table(geometry: Geometry) -> np.ndarray:
-    """Heights of the source, of the first row over it, and between rows, in voxels: float32 [view, 3]."""
-    rays, voxel = geometry.rays(), geometry.dVoxel[2]
-    first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
-    source = 0.0 * rays.v[:, 2] if rays.parallel else (rays.source[:, 2] - first) / voxel
-    top = (rays.corner[:, 2] + rays.v[:, 2] / 2 - first) / voxel
-    return np.stack([source, top - source, rays.v[:, 2] / voxel], -1).astype(np.float32)
+    def _collect(self, weighted, block, ones):
+        return _collect(weighted, block.numbers, block.count, self, ones)
 
 
 def _rows(rows, view):
     return [dr.gather(mi.Float, rows, view * 3 + i) for i in range(3)]
 
 
-def _hat(position, index, n):
-    """Weight of grid index `index` at a position along an axis of n voxels, edge values held for half a voxel."""
-    weight = dr.maximum(1 - dr.abs(dr.clip(position, 0, n - 1) - index), 0)
-    return dr.select((position >= -0.5) & (position <= n - 0.5), weight, 0)
-
-
 def _column(columns, index, active=True):
     return [dr.gather(mi.Float, columns, index * COLUMN + i, active) for i in range(7)]
 
 
-def _span(a, b, n):
-    """First and last index m >= 0 at which a + b m may be in [-1/2, n - 1/2], as floats; too many are harmless."""
-    inv = dr.rcp(dr.select(dr.abs(b) < 1e-12, 1e-12, b))
-    p, q = (-0.51 - a) * inv, (n - 0.49 - a) * inv  # a little more: a ray may run along a face
-    return dr.minimum(p, q), dr.maximum(p, q)
-
-
 @dr.syntax
-def _integrate(data, tables: Tables, column, row):
-    """(A x, A 1) of rays, one per lane. column: of all views."""
-    nx, ny, nz = tables.size
-    a, b, c, e, g, h, along_y = _column(tables.columns, column)
-    source, top, step = _rows(tables.rows, column // tables.panel[1])
+def _integrate(data, A: Joseph, view, column, row):
+    """(A x, A 1) of rays, one per lane."""
+    nx, ny, nz = A.size
+    a, b, c, e, g, h, along_y = _column(A.columns, view * A.panel[1] + column)
+    source, top, step = _rows(A.rows, view)
     on_y = along_y > 0
     height = dr.fma(mi.Float(row), step, top)
     n_main, n_other = dr.select(on_y, mi.Float(ny), mi.Float(nx)), dr.select(on_y, mi.Float(nx), mi.Float(ny))
     s_main, s_other = dr.select(on_y, mi.UInt(nz), mi.UInt(ny * nz)), dr.select(on_y, mi.UInt(ny * nz), mi.UInt(nz))
-    low, high = _span(a, b, n_other)
-    z_low, z_high = _span(dr.fma(c, height, source), e * height, mi.Float(nz))
+    low, high = span(a, b, n_other)
+    z_low, z_high = span(dr.fma(c, height, source), e * height, mi.Float(nz))
     m = dr.floor(dr.clip(dr.maximum(low, z_low), 0, n_main))
     last = dr.ceil(dr.clip(dr.minimum(high, z_high), -1, n_main - 1))
     total, count = mi.Float(0), mi.Float(0)
@@ -324,12 +199,12 @@ def _integrate(data, tables: Tables, column, row):
     return path * total, path * count
 
 
-def _weighted(images, chosen, tables: Tables, ones):
+def _weighted(images, chosen, A: Joseph, ones):
     """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
 
     With `ones`, mi.Vector2f interleaved: the second component comes from an image of ones, treated alike.
     """
-    (n_v, n_u), columns, margin = tables.panel, tables.columns, tables.margin
+    (n_v, n_u), columns, margin = A.panel, A.columns, A.margin
     pitch = n_v + 2 * margin
     index = dr.arange(mi.UInt, dr.width(images) // n_v * pitch)
     column = index // pitch
@@ -337,20 +212,19 @@ def _weighted(images, chosen, tables: Tables, ones):
     inside = (row >= 0) & (row < n_v)
     block = column // n_u
     view = dr.gather(mi.UInt, chosen, block)
-    original = view * n_u + (column - block * n_u)  # column, among those of all views
-    _, top, step = _rows(tables.rows, view)
+    u = column - block * n_u
+    _, top, step = _rows(A.rows, view)
     height = dr.fma(mi.Float(row), step, top)
-    g, h = (dr.gather(mi.Float, columns, original * COLUMN + i) for i in (4, 5))
+    g, h = (dr.gather(mi.Float, columns, (view * n_u + u) * COLUMN + i) for i in (4, 5))
     pixel = mi.UInt(dr.clip(row, 0, n_v - 1))
-    if tables.valid is not None:
-        inside &= dr.gather(mi.Float, tables.valid, original * n_v + pixel) > 0
+    inside &= A.used(view, u, pixel)
     path = dr.select(inside, dr.sqrt(dr.fma(h, height * height, g)), 0)
     value = path * dr.select(inside, dr.gather(mi.Float, images, column * n_v + pixel), 0)
     return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
 
 @dr.syntax
-def _collect(weighted, chosen, n_views, tables: Tables, ones):
+def _collect(weighted, chosen, n_views, A: Joseph, ones):
     """A^T y of voxels. Each lane computes RUN voxels of a line along z, spaced as far apart as possible.
 
     Neighbouring lanes then fetch neighbouring values, and a lane computes only once what does not depend on z.
@@ -359,8 +233,8 @@ def _collect(weighted, chosen, n_views, tables: Tables, ones):
 
     Returns ((voxels, whether they exist), sums), lists of RUN. A sum is a list; with `ones`, its second entry is A^T 1.
     """
-    (nx, ny, nz), (n_v, n_u), margin = tables.size, tables.panel, tables.margin
-    columns, rows, matrices = tables.columns, tables.rows, tables.matrices
+    (nx, ny, nz), (n_v, n_u), margin = A.size, A.panel, A.margin
+    columns, rows, matrices = A.columns, A.rows, A.matrices
     run = min(RUN, nz)
     stride = -(-nz // run)
     index = dr.arange(mi.UInt, nx * ny * stride)
@@ -391,7 +265,7 @@ def _collect(weighted, chosen, n_views, tables: Tables, ones):
             on_y = along_y > 0
             m = dr.select(on_y, y, x)
             t = dr.fma(e, m, c)
-            weight = _hat(dr.fma(b, m, a), dr.select(on_y, x, y), dr.select(on_y, mi.Float(nx), mi.Float(ny)))
+            weight = hat(dr.fma(b, m, a), dr.select(on_y, x, y), dr.select(on_y, mi.Float(nx), mi.Float(ny)))
             weight = dr.select(t > 0, weight, 0)
             # Heights go from row to row by `slope` voxels; z meets the panel at the row `middle`.
             inv, slope = dr.rcp(dr.maximum(t, 1e-6)), t * step
@@ -405,7 +279,7 @@ def _collect(weighted, chosen, n_views, tables: Tables, ones):
                     for i in range(ROWS if chunks > 1 else margin):
                         offset = (row + i - centre) * slope
                         if s == 0 or s == (nz - 1) // stride:
-                            w = weight * _hat(z0 + s * stride + offset, z0 + s * stride, nz)
+                            w = weight * hat(z0 + s * stride + offset, z0 + s * stride, nz)
                         else:
                             w = weight * dr.maximum(1 - dr.abs(offset), 0)
                         here = mi.UInt(mi.Int(column) + mi.Int(row) + i)

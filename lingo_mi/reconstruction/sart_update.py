@@ -12,8 +12,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.projectors.joseph import Block, Joseph, Tables, Views
+from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.replay import Replay
+from lingo_mi.projectors.stack import Block, Views
 from lingo_mi.reconstruction.system import System, evaluated, scalar
 from lingo_mi.runtime import one_at_a_time
 
@@ -22,12 +23,13 @@ def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool)
     """The next volume of x (mi.Float [voxels], density per mm) by a block of views."""
     A, step = system.A, scalar(lmbda)
     volumes = x, system.b, system.weights, system.weighed
-    if not isinstance(A, Joseph):
+    if isinstance(A, GridPair):
         return _update(A, views, step, noneg, *volumes)
-    t, block = A.tables, Block.of(views)
-    arrays = t.columns, t.rows, t.matrices, t.valid, block.numbers, block.count, step, *volumes
+    block = Block.of(views)
     with one_at_a_time():
-        return _REPLAY(*arrays, size=t.size, panel=t.panel, margin=t.margin, noneg=noneg)
+        return _REPLAY(
+            block.numbers, block.count, step, *volumes, *A.arrays, kind=type(A), settings=A.settings, noneg=noneg
+        )
 
 
 def _update(A, views, step, noneg, x, b, weights, weighed):
@@ -38,9 +40,8 @@ def _update(A, views, step, noneg, x, b, weights, weighed):
     return evaluated(A.adjoint(error, views, updated(x, step, noneg, weights)))
 
 
-def _replayed(columns, rows, matrices, valid, numbers, count, step, *volumes, size, panel, margin, noneg):
-    A = Joseph.of_tables(Tables(size, panel, columns, rows, matrices, valid, margin))
-    return _update(A, Block(numbers, count), step, noneg, *volumes)
+def _replayed(numbers, count, step, x, b, weights, weighed, *arrays, kind, settings, noneg):
+    return _update(kind.of(arrays, settings), Block(numbers, count), step, noneg, x, b, weights, weighed)
 
 
 _REPLAY = Replay(_replayed)

@@ -8,7 +8,7 @@ lacked, and the line integrals of the next ones are taken.
 
 The volume lies in two files, which updates read and write in turn, and a third file says how many updates they have had. So
 work that was stopped at any moment, `kill -9` included, goes on after the last whole update, to the same result: to the last bit
-with `Joseph`, to rounding with `GridPair`, whose transpose adds in any order.
+but where the source lies beside the volume: there `GridPair` projects, whose transpose adds in any order.
 """
 
 from __future__ import annotations
@@ -29,10 +29,9 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, parsed_json, reading, write_text, writing
 from lingo_mi.folder_lock import locked
-from lingo_mi.projectors.joseph import serves
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.sart_update import normalised, updated
-from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector, scalar
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector_class, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
@@ -114,7 +113,7 @@ class _Slabs:
     def __init__(self, scan: Scan, volume: _Volume):
         self.scan, self.volume = scan, volume
         one = scan.geometry.slab(0, 1)
-        self.A = projector(one, scan.valid)
+        self.A = projector_class(scan.geometry)(one, scan.valid)
 
     def lengths(self) -> np.ndarray:
         """A 1, float32 [view, pixel]."""
@@ -296,7 +295,7 @@ class _Volume:
 
 def _digest(scan, updates, noneg, thickness):
     """Of all that the result depends on."""
-    found = hashlib.sha256(repr((scan.digest(), serves(scan.geometry), noneg, thickness)).encode())
+    found = hashlib.sha256(repr((scan.digest(), projector_class(scan.geometry).__name__, noneg, thickness)).encode())
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
     return found.hexdigest()

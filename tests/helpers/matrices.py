@@ -1,10 +1,14 @@
 """What tests share with joseph."""
 
+import mitsuba as mi
 import numpy as np
 
 
-def matrix(geometry) -> np.ndarray:
-    """Joseph's matrix, dense, [view * v * u, x * y * z], ray by ray and slice by slice in float64."""
+def matrix(geometry, axes: int = 2) -> np.ndarray:
+    """Joseph's matrix, dense, [view * v * u, x * y * z], ray by ray and slice by slice in float64.
+
+    axes   among how many the main one is, from x on
+    """
     frames, size, voxel = geometry.rays(), np.array(geometry.nVoxel), np.array(geometry.dVoxel)
     first = np.array(geometry.offOrigin) + (voxel - geometry.sVoxel) / 2
     rows = []
@@ -13,7 +17,7 @@ def matrix(geometry) -> np.ndarray:
             for u in range(geometry.nDetector[1]):
                 o, d = frames.through(view, u + 0.5, v + 0.5)
                 weights = np.zeros(size)
-                main = int(abs(d[1] / voxel[1]) > abs(d[0] / voxel[0]))
+                main = int(np.argmax(abs(d / voxel)[:axes]))
                 for m in range(size[main]):
                     t = (first[main] + m * voxel[main] - o[main]) / d[main]
                     p = (o + t * d - first) / voxel
@@ -25,3 +29,33 @@ def matrix(geometry) -> np.ndarray:
                     weights += path * hats[0][:, None, None] * hats[1][:, None] * hats[2]
                 rows.append(weights.ravel())
     return np.array(rows)
+
+
+def device_images(y: np.ndarray):
+    """Projections [view, v, u] as images of a projector."""
+    return mi.Float(np.ascontiguousarray(y.transpose(0, 2, 1), np.float32).ravel())
+
+
+def assert_pair(kind: type, geometry, matrix: np.ndarray, masked: bool) -> None:
+    """Two views of a projector of three, and their transpose, are those of a dense matrix.
+
+    masked   with a third of the pixels left out, whatever stands in them
+    """
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=geometry.nVoxel), rng.normal(size=(3, *geometry.nDetector))
+    valid = rng.random(y.shape) < (0.67 if masked else 2)
+    A, J = matrix * valid.reshape(-1, 1), kind(geometry, valid if masked else None)
+    views = [2, 0]
+    rows = A.reshape(3, -1, A.shape[1])[views].reshape(-1, A.shape[1])
+    ax, paths = J.forward(mi.Float(np.float32(x).ravel()), views)
+    shape = (2, *geometry.nDetector[::-1])
+    result = ax.numpy().reshape(shape).transpose(0, 2, 1).ravel()
+    expected = rows @ x.ravel()
+    assert np.count_nonzero(expected) > 15
+    np.testing.assert_allclose(result, expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(paths.numpy().reshape(shape).transpose(0, 2, 1).ravel(), rows.sum(1), atol=1e-3)
+    expected = rows.T @ y[views].ravel()
+    images = device_images(np.where(valid, y, np.nan)[views])
+    aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
+    np.testing.assert_allclose(aty.numpy(), expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(sums.numpy(), rows.sum(0), atol=2e-5 * rows.sum(0).max())

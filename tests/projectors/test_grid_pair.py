@@ -15,6 +15,7 @@ from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.projectors.grid import backproject, project
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.tilted_joseph import TiltedJoseph
 from lingo_mi.reconstruction import ALGORITHMS, SART
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
@@ -71,9 +72,12 @@ def test_a_matrix_and_its_transpose(mode, masked):
 def test_which_projector_a_scan_gets():
     geo = scan(n=3)
     ones = np.ones((3, *geo.nDetector), np.float32)
+    valid = np.arange(ones.size).reshape(ones.shape) > 0
     assert isinstance(System(Scan(geo, ones)).A, Joseph)
-    assert isinstance(System(Scan(geo, ones, np.arange(ones.size).reshape(ones.shape) > 0)).A, GridPair)
-    assert isinstance(System(Scan(laminography(geo), ones)).A, GridPair)
+    assert isinstance(System(Scan(geo, ones, valid)).A, Joseph)
+    assert isinstance(System(Scan(spiral(geo, 20.0), ones)).A, Joseph)
+    assert isinstance(System(Scan(laminography(geo), ones)).A, TiltedJoseph)
+    assert isinstance(System(Scan(scan(n=3, DSO=19.0, DSD=300.0), ones, valid)).A, GridPair)
 
 
 @pytest.mark.parametrize(

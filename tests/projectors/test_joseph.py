@@ -1,52 +1,18 @@
 """Joseph's projector against a literal transcription, its transpose, and the analytic ball."""
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from helpers.grids import scan
-from helpers.matrices import matrix
+from helpers.matrices import assert_pair, device_images, matrix
+from helpers.motions import climbing, posed, reversed_panel, shaken, turned
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.grid import project
-from lingo_mi.projectors.joseph import Joseph, Stack, serves
-
-
-def device_images(y):
-    return mi.Float(np.ascontiguousarray(y.transpose(0, 2, 1), np.float32).ravel())
-
-
-def posed(motion, mode='cone'):
-    """The scan with its views moved: motion(rays, a random generator) returns what differs in the rays."""
-    geo = scan(mode, n=3)
-    rays = geo.rays()
-    rays = replace(rays, **motion(rays, np.random.default_rng(5)))
-    return Geometry.from_poses(rays, geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
-
-
-def climbing(rays, _):
-    shift = [-6.0, 2.0, 9.0] * np.array([[0], [0], [1.0]])
-    return dict(corner=rays.corner + shift.T) | ({} if rays.parallel else dict(source=rays.source + shift.T))
-
-
-def shaken(rays, rng):
-    shift = rng.normal(size=(2, 3, 3)) * [3.0, 3.0, 3.0]
-    return dict(corner=rays.corner + shift[0]) | ({} if rays.parallel else dict(source=rays.source + shift[1]))
-
-
-def turned(rays, _):
-    """Panels by 0.3 radians about z."""
-    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1.0]])
-    return dict(u=rays.u @ turn.T, corner=rays.corner + 21 / 2 * (rays.u - rays.u @ turn.T))
-
-
-def reversed_panel(rays, _):
-    """Rows from below, columns from the other side."""
-    return dict(u=-rays.u, v=-rays.v, corner=rays.corner + 21 * rays.u + 17 * rays.v)
-
+from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.stack import Stack
 
 POSED = [
     *(posed(motion) for motion in (climbing, shaken, turned, reversed_panel)),
@@ -67,25 +33,7 @@ GEOMETRIES = [
 @pytest.mark.parametrize('masked', [False, True])
 @pytest.mark.parametrize('geometry', [*(scan(n=3, **changes) for changes in GEOMETRIES), *POSED])
 def test_against_the_transcription(geometry, masked):
-    """`masked`: with a third of the pixels left out, whatever stands in them."""
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(size=geometry.nVoxel), rng.normal(size=(3, *geometry.nDetector))
-    valid = rng.random(y.shape) < (0.67 if masked else 2)
-    A, J = matrix(geometry) * valid.reshape(-1, 1), Joseph(geometry, valid if masked else None)
-    views = [2, 0]
-    rows = A.reshape(3, -1, A.shape[1])[views].reshape(-1, A.shape[1])
-    ax, paths = J.forward(mi.Float(np.float32(x).ravel()), views)
-    shape = (2, *geometry.nDetector[::-1])
-    result = ax.numpy().reshape(shape).transpose(0, 2, 1).ravel()
-    expected = rows @ x.ravel()
-    assert np.count_nonzero(expected) > 15
-    np.testing.assert_allclose(result, expected, atol=2e-5 * np.abs(expected).max())
-    np.testing.assert_allclose(paths.numpy().reshape(shape).transpose(0, 2, 1).ravel(), rows.sum(1), atol=1e-3)
-    expected = rows.T @ y[views].ravel()
-    images = device_images(np.where(valid, y, np.nan)[views])
-    aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
-    np.testing.assert_allclose(aty.numpy(), expected, atol=2e-5 * np.abs(expected).max())
-    np.testing.assert_allclose(sums.numpy(), rows.sum(0), atol=2e-5 * rows.sum(0).max())
+    assert_pair(Joseph, geometry, matrix(geometry), masked)
 
 
 @pytest.mark.parametrize('changes', [*GEOMETRIES, dict(offOrigin=(0.0, 0.0, 0.0), offDetector=(0.0, 0.0), n=8)])
@@ -181,7 +129,7 @@ def test_scans_it_does_not_serve():
         posed(lambda rays, _: dict(source=np.array([[0.6, 0, 0.8]] * 3)), 'parallel'),
     ]
     for geometry in others:
-        assert not serves(geometry)
+        assert not Joseph.serves(geometry)
         with pytest.raises(InputError, match='upright panel'):
             Joseph(geometry)
 

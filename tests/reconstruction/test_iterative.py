@@ -12,7 +12,6 @@ from scipy.sparse.linalg import lsqr
 from helpers.algorithms import ITERATIVE
 from helpers.grids import scan as small
 from helpers.matrices import matrix
-from helpers.same import assert_same
 from lingo_mi import phantoms
 from lingo_mi.completion.views import complete
 from lingo_mi.errors import InputError
@@ -21,7 +20,6 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
-from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refined
 from lingo_mi.reconstruction.asd_pocs import tv_floor, tv_gradient
 from lingo_mi.reconstruction.refined import structure
@@ -235,19 +233,21 @@ def test_asd_pocs_is_the_transcription(system):
     np.testing.assert_allclose(result.volume.ravel(), x, atol=2e-3 * np.abs(x).max())
 
 
-def test_asd_pocs_meets_exact_line_integrals():
-    """Corrected for what Joseph's projector is off, the volume's exact line integrals meet the projections; else Joseph's do."""
+@pytest.mark.parametrize('share', [1.0, 0.95])
+def test_asd_pocs_meets_exact_line_integrals(share):
+    """Corrected for what Joseph's projector is off, the volume's exact line integrals meet the projections; else Joseph's do.
+
+    share   of the pixels that are valid
+    """
     geo, rng = small(n=12), np.random.default_rng(0)
-    truth = rng.random(geo.nVoxel)
-    scan = Scan(geo, project(truth, geo))
+    projections = project(rng.random(geo.nVoxel), geo)
+    valid = rng.random(projections.shape) < share
+    scan = Scan(geo, projections, None if share == 1 else valid)
     missed = [
-        np.linalg.norm(project(ASDPOCS(80, alpha=1e-6, exact_every=n).run(scan).volume, geo) - scan.projections)
+        np.linalg.norm((project(ASDPOCS(80, alpha=1e-6, exact_every=n).run(scan).volume, geo) - projections)[valid])
         for n in (0, 2)
     ]
     assert missed[1] < 0.2 * missed[0]
-    valid = rng.random(scan.projections.shape) > 0.01
-    masked = Scan(geo, scan.projections, valid)  # of which the projector is the exact one
-    assert_same(ASDPOCS(2, exact_every=1).run(masked).volume, ASDPOCS(2).run(masked).volume)
 
 
 def test_asd_pocs_stops(system):
@@ -410,16 +410,6 @@ def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
     valid[0, 0, 0] = False
     with pytest.raises(InputError, match='not valid'):
         algorithm(Scan(geo, ones, valid))
-
-
-def test_the_projector_refuses_other_poses():
-    geo = small(n=2)
-    with pytest.raises(InputError, match='circle'):
-        Joseph(
-            Geometry.from_poses(
-                geo.rays().moved(shift=np.array([[0, 0, 0], [0, 0, 1.0]])), geo.nDetector, geo.nVoxel, geo.dVoxel
-            )
-        )
 
 
 def test_what_counts_as_matched_where_fdk_cannot_say(system):
