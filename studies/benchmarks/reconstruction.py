@@ -4,7 +4,7 @@ The Shepp-Logan phantom on size^3 voxels, views of size x size pixels over a ful
 operation in turn, on the same cores, from arrays in memory to an array in memory. The deviation is the relative RMS difference
 from our result, without the outermost voxels (RTK leaves out their outer halves). It is large where methods differ: diffct
 projects constant voxels (Siddon), ours and RTK's projectors interpolate (Joseph); RTK's SART backprojects by interpolation on
-the panel, ours by the matched transpose.
+the panel, ours by the matched transpose. `exact` is our own projector without Joseph's error, and its transpose.
 
     result = measure(size=64, views=50, repeats=3)
     result['operations']['FDK']['RTK']['ratio']
@@ -20,25 +20,28 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lingo_mi import phantoms, runtime
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.projectors.joseph import Joseph
+from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.sart import blocks, sweep
-from lingo_mi.reconstruction.system import System
+from lingo_mi.reconstruction.system import System, projector_class
 from lingo_mi.scan import Scan
 from lingo_mi.studies.benchmarks import rtk_bridge
 
 Operations = dict[str, Callable[[], np.ndarray]]  # by name: projector, transpose, FDK, SART
 
 
-def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = print) -> dict:
+def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callable[[str], object] = print) -> dict:
     """Times of all packages, `compare`d, with what they were measured on.
 
     size      voxels and pixels along a side
     repeats   rounds; the first one, which compiles, comes on top
+    tilt      of the axis of rotation against the volume's, about x, degrees
     say       called with a line for each package that is not installed
     """
     cores = runtime.cores()
@@ -47,24 +50,27 @@ def measure(size: int, views: int, repeats: int, say: Callable[[str], object] = 
     geometry = Geometry.cone(
         DSO=1000, DSD=1500, nDetector=size, dDetector=512 / size, nVoxel=size, dVoxel=256 / size, angles=circular(views)
     )
+    if tilt:
+        rays = geometry.rays().moved(Rotation.from_euler('x', tilt, degrees=True).as_matrix())
+        geometry = Geometry.from_poses(rays, size, size, 256 / size)
     empty = Scan(geometry, np.zeros((views, size, size), np.float32))
-    scan = Scan(geometry, ours(empty, volume)['projector']())
-    packages = dict(ours=ours(scan, volume))
+    scan = Scan(geometry, pair(projector_class(geometry), empty, volume)['projector']())
+    packages = dict(ours=ours(scan, volume), exact=pair(GridPair, scan, volume))
     for name, make in (('RTK', rtk), ('diffct', diffct)):
         functions = make(scan, volume, cores)
         if functions is None:
             say(f'{name}: not installed, left out')
         else:
             packages[name] = functions
-    return dict(size=size, views=views, cores=cores, repeats=repeats, operations=compare(packages, repeats))
+    return dict(size=size, views=views, tilt=tilt, cores=cores, repeats=repeats, operations=compare(packages, repeats))
 
 
 def describe(result: dict) -> Iterator[str]:
     """What `measure` found, line by line."""
     side = result['size']
     yield (
-        f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, {result["cores"]} cores, medians of '
-        f'{result["repeats"]} repeats'
+        f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, tilted by {result["tilt"]:g} degrees, '
+        f'{result["cores"]} cores, medians of {result["repeats"]} repeats'
     )
     for operation, found in result['operations'].items():
         parts = [f'{operation:9} ours {found["ours"]["seconds"]:8.3f} s']
@@ -76,18 +82,24 @@ def describe(result: dict) -> Iterator[str]:
         yield '   '.join(parts)
 
 
-def ours(scan: Scan, volume: np.ndarray) -> Operations:
-    """Our operations. volume   [x, y, z], what the projector projects; the others begin with the scan"""
+def pair(kind: type, scan: Scan, volume: np.ndarray) -> Operations:
+    """A projector of `volume` [x, y, z], and its transpose of the scan's projections. kind: its class."""
     geometry = scan.geometry
-    joseph, views = Joseph(geometry), np.arange(len(geometry))
+    A, views = kind(geometry), np.arange(len(geometry))
 
     def project():
-        x = mi.Float(volume.ravel())
-        images = joseph.forward(x, views)[0].numpy()
+        images = A.forward(mi.Float(volume.ravel()), views)[0].numpy()
         return images.reshape(len(views), *geometry.nDetector[::-1]).transpose(0, 2, 1)
 
     def transpose():
-        return joseph.adjoint(joseph.images(scan.projections), views).numpy().reshape(geometry.nVoxel)
+        return A.adjoint(A.images(scan.projections), views).numpy().reshape(geometry.nVoxel)
+
+    return dict(projector=project, transpose=transpose)
+
+
+def ours(scan: Scan, volume: np.ndarray) -> Operations:
+    """Our operations: a `pair`, SART, and FDK where the panel is one that it can take."""
+    geometry = scan.geometry
 
     def sart():
         system = System(scan)
@@ -97,7 +109,8 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
         dr.eval(x)
         return system.volume(x)
 
-    return dict(projector=project, transpose=transpose, FDK=lambda: FDK().run(scan).volume, SART=sart)
+    fdk = dict(FDK=lambda: FDK().run(scan).volume) if can_rectify(scan) else {}
+    return pair(projector_class(geometry), scan, volume) | fdk | dict(SART=sart)
 
 
 def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:

@@ -18,10 +18,17 @@ from lingo_mi.scan import Scan
 
 
 def gantry(geometry: Geometry, itk: Any) -> Any:
-    """RTK's geometry object. Raises InputError for a scan that is not one of a cone beam on a circle."""
-    if not isinstance(geometry, CircularGeometry) or geometry.mode != 'cone':
-        raise InputError('RTK is compared with on circles of a cone beam only')
+    """RTK's geometry object. Raises InputError for a parallel beam."""
+    if geometry.mode != 'cone':
+        raise InputError('RTK is compared with on cone beams only')
     out = itk.RTK.ThreeDCircularProjectionGeometry.New()
+    if not isinstance(geometry, CircularGeometry):
+        rays, place = geometry.rays(), [1, 2, 0]
+        right, up = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays.u, -rays.v))
+        for vectors in zip(rays.source, rays.centre(geometry.nDetector), right, up):
+            source, centre, *axes = (x[place].tolist() for x in vectors)
+            out.AddProjection(*map(itk.Point[itk.D, 3], (source, centre)), *map(itk.Vector[itk.D, 3], axes))
+        return out
     for angle in np.degrees(geometry.angles):
         out.AddProjection(geometry.DSO, geometry.DSD, float(angle), geometry.offDetector[1], geometry.offDetector[0])
     return out
