@@ -165,8 +165,12 @@ class Gathered(Stack, ABC):
 
 
 def on_device(values: np.ndarray) -> Any:
-    """A flat copy, mi.Float. By a gather, because a direct read would compile the alignment of NumPy's memory into the kernel."""
-    out = dr.gather(mi.Float, mi.Float(values.ravel()), dr.arange(mi.UInt, values.size))
+    """A flat copy, mi.Float.
+
+    By a gather, since a direct read would compile the alignment of NumPy's memory into the kernel. Dr.Jit would drop the gather
+    without the opaque zero.
+    """
+    out = dr.gather(mi.Float, mi.Float(values.ravel()), dr.arange(mi.UInt, values.size) + dr.opaque(mi.UInt, 0))
     dr.eval(out)
     return out
 

@@ -11,16 +11,13 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan, require_finite
 
 
-def is_circular(scan: Scan) -> bool:
-    """Whether the source moves on a circle about z before an upright panel, and every pixel is valid.
+def require_circle(scan: Scan, what: str) -> CircularGeometry:
+    """The geometry of a scan on a circle before an upright panel, with every pixel valid. Raises InputError for any other.
+
+    what   the method that needs it, for the message
 
     `rectify.can_rectify` also allows turned and tilted panels.
     """
-    return isinstance(scan.geometry, CircularGeometry) and scan.valid is None
-
-
-def require_circle(scan: Scan, what: str) -> CircularGeometry:
-    """The geometry of a scan. Raises InputError if it is not `is_circular`. what: the method that needs it, for the message."""
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')
     require_pixels(scan, what)

@@ -16,6 +16,7 @@ from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.tilted_joseph import TiltedJoseph
 from lingo_mi.reconstruction.parameters import check_bound
+from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.wide_pixels import Between
 from lingo_mi.scan import Scan
 
@@ -37,6 +38,7 @@ class System:
     """
 
     def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
+        require_rays(scan.geometry)
         self.geometry, self.valid = scan.geometry, scan.valid
         self.A = projector_class(scan.geometry)(scan.geometry, scan.valid)
         self.views = np.arange(len(scan))

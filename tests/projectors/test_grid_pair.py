@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from helpers.grids import scan
+from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.projectors.grid import backproject, project
@@ -77,7 +78,9 @@ def test_which_projector_a_scan_gets():
     assert isinstance(System(Scan(geo, ones, valid)).A, Joseph)
     assert isinstance(System(Scan(spiral(geo, 20.0), ones)).A, Joseph)
     assert isinstance(System(Scan(laminography(geo), ones)).A, TiltedJoseph)
-    assert isinstance(System(Scan(scan(n=3, DSO=19.0, DSD=300.0), ones, valid)).A, GridPair)
+    assert isinstance(System(Scan(scan(n=3, DSO=26.0, DSD=300.0), ones, valid)).A, GridPair)
+    with pytest.raises(InputError, match='lies within'):
+        System(Scan(scan(n=3, DSO=15.0, DSD=300.0), ones, valid))
 
 
 @pytest.mark.parametrize(
