@@ -134,7 +134,7 @@ class _Slabs:
                 ax = evaluated(ax + A.forward(self._load(part), views)[0])
         return ax
 
-    def error(self, ax: mi.Float, views: np.ndarray, lengths: np.ndarray) -> tuple[mi.Float, float]:
+    def error(self, ax: mi.Float | None, views: np.ndarray, lengths: np.ndarray) -> tuple[mi.Float, float]:
         """The normalised error of A x in some views, and |A x - b| / |b|. lengths: of all views, see `lengths`."""
         b = self.A.images(self.scan.projections[views])
         error = evaluated(b - ax)
