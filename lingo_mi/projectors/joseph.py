@@ -24,7 +24,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.projectors.stack import Gathered, hat, on_device, span
+from lingo_mi.projectors.stack import Gathered, hat, on_device, sampled, span
 
 COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
@@ -184,15 +184,7 @@ def _integrate(data, A: Joseph, view, column, row):
         y, t = dr.fma(b, m, a), dr.fma(e, m, c)
         z = dr.fma(t, height, source)
         inside = (y >= -0.5) & (y <= n_other - 0.5) & (z >= -0.5) & (z <= nz - 0.5) & (t > 0)
-        y, z = dr.clip(y, 0, n_other - 1), dr.clip(z, 0, nz - 1)
-        j, k = dr.floor(y), dr.floor(z)
-        fy, fz = y - j, z - k
-        near = mi.UInt(m) * s_main + mi.UInt(j) * s_other + mi.UInt(k)
-        up = dr.select(fz > 0, mi.UInt(1), 0)
-        far = near + dr.select(fy > 0, s_other, 0)
-        p = [dr.gather(mi.Float, data, i, inside) for i in (near, near + up, far, far + up)]
-        p0, p1 = dr.fma(fz, p[1] - p[0], p[0]), dr.fma(fz, p[3] - p[2], p[2])
-        total += dr.fma(fy, p1 - p0, p0)
+        total += sampled(data, inside, mi.UInt(m) * s_main, (y, z), (n_other, nz), (s_other, mi.UInt(1)))
         count += dr.select(inside, 1.0, 0.0)
         m += 1
     path = dr.sqrt(dr.fma(h, height * height, g))

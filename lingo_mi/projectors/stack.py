@@ -181,6 +181,23 @@ def hat(position: Any, index: Any, n: Any) -> Any:
     return dr.select((position >= -0.5) & (position <= n - 0.5), weight, 0)
 
 
+def sampled(data: Any, inside: Any, first: Any, position: Any, counts: Any, strides: Any) -> Any:
+    """A slice of a volume, interpolated bilinearly; edge values are held.
+
+    first              flat index of the slice's first voxel
+    position, counts   along both axes: in voxels, and how many there are
+    strides            from voxel to voxel, mi.UInt
+    """
+    y, z = (dr.clip(p, 0, n - 1) for p, n in zip(position, counts))
+    j, k = dr.floor(y), dr.floor(z)
+    fy, fz = y - j, z - k
+    near = first + mi.UInt(j) * strides[0] + mi.UInt(k) * strides[1]
+    up, far = dr.select(fz > 0, strides[1], 0), near + dr.select(fy > 0, strides[0], 0)
+    p = [dr.gather(mi.Float, data, i, inside) for i in (near, near + up, far, far + up)]
+    p0, p1 = dr.fma(fz, p[1] - p[0], p[0]), dr.fma(fz, p[3] - p[2], p[2])
+    return dr.fma(fy, p1 - p0, p0)
+
+
 def span(a: Any, b: Any, n: Any) -> tuple[Any, Any]:
     """First and last index m >= 0 at which a + b m may be in [-1/2, n - 1/2], as floats; too many are harmless."""
     inv = dr.rcp(dr.select(dr.abs(b) < 1e-12, 1e-12, b))

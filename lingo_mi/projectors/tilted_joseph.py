@@ -16,7 +16,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import view_table
-from lingo_mi.projectors.stack import Gathered, hat, on_device, span
+from lingo_mi.projectors.stack import Gathered, hat, on_device, sampled, span
 
 RAY = 21  # floats per view of `ray_table`
 RUN = 2  # voxels per lane of the transpose
@@ -156,14 +156,7 @@ def _integrate(data, size, ray: _Ray):
     while m <= last:
         y, z = dr.fma(b1, m, a1), dr.fma(b2, m, a2)
         inside = (y >= -0.5) & (y <= n1 - 0.5) & (z >= -0.5) & (z <= n2 - 0.5)
-        y, z = dr.clip(y, 0, n1 - 1), dr.clip(z, 0, n2 - 1)
-        j, k = dr.floor(y), dr.floor(z)
-        fy, fz = y - j, z - k
-        near = mi.UInt(m) * s + mi.UInt(j) * s1 + mi.UInt(k) * s2
-        up, far = dr.select(fz > 0, s2, 0), near + dr.select(fy > 0, s1, 0)
-        p = [dr.gather(mi.Float, data, i, inside) for i in (near, near + up, far, far + up)]
-        p0, p1 = dr.fma(fz, p[1] - p[0], p[0]), dr.fma(fz, p[3] - p[2], p[2])
-        total += dr.fma(fy, p1 - p0, p0)
+        total += sampled(data, inside, mi.UInt(m) * s, (y, z), (n1, n2), (s1, s2))
         count += dr.select(inside, 1.0, 0.0)
         m += 1
     return ray.path * total, ray.path * count

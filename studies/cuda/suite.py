@@ -25,6 +25,7 @@ SHARE = (
     'projectors/test_mesh.py',
     'projectors/test_voxelize.py',
     'projectors/test_joseph.py',
+    'projectors/test_tilted_joseph.py',
     'plugins/test_integrator.py',
     'reconstruction/test_iterative.py',
     'fitting/test_fit.py',
