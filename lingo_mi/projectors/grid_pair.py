@@ -1,7 +1,6 @@
 """The exact projector of `grid` and its transpose, for iterative algorithms: any poses, invalid pixels allowed (Dr.Jit).
 
-`joseph` and `tilted_joseph` project two to three times as fast, and backproject five to twelve times as fast, but do not serve a
-source beside the volume.
+`joseph` and `tilted_joseph` are faster (docs/benchmarks/speed.md says by how much), but do not serve a source beside the volume.
 """
 
 from __future__ import annotations

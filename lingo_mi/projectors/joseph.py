@@ -24,7 +24,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.projectors.stack import Gathered, hat, on_device, sampled, span
+from lingo_mi.projectors.stack import Gathered, hat, lanes, on_device, sampled, span
 
 COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
@@ -161,8 +161,8 @@ def _rows(rows, view):
     return [dr.gather(mi.Float, rows, view * 3 + i) for i in range(3)]
 
 
-def _column(columns, index, active=True):
-    return [dr.gather(mi.Float, columns, index * COLUMN + i, active) for i in range(7)]
+def _column(columns, index):
+    return [dr.gather(mi.Float, columns, index * COLUMN + i) for i in range(7)]
 
 
 @dr.syntax
@@ -194,7 +194,7 @@ def _integrate(data, A: Joseph, view, column, row):
 def _weighted(images, chosen, A: Joseph, ones):
     """Images times the path per slice, with `margin` rows of zeros above and below: mi.Float [block, u, row].
 
-    With `ones`, mi.Vector2f interleaved: the second component comes from an image of ones, treated alike.
+    See `Gathered`.
     """
     (n_v, n_u), columns, margin = A.panel, A.columns, A.margin
     pitch = n_v + 2 * margin
@@ -217,25 +217,11 @@ def _weighted(images, chosen, A: Joseph, ones):
 
 @dr.syntax
 def _collect(weighted, chosen, n_views, A: Joseph, ones):
-    """A^T y of voxels. Each lane computes RUN voxels of a line along z, spaced as far apart as possible.
-
-    Neighbouring lanes then fetch neighbouring values, and a lane computes only once what does not depend on z.
-
-    weighted : see `_weighted`
-
-    Returns ((voxels, whether they exist), sums), lists of RUN. A sum is a list; with `ones`, its second entry is A^T 1.
-    """
+    """See `Gathered`. A lane computes only once what does not depend on z."""
     (nx, ny, nz), (n_v, n_u), margin = A.size, A.panel, A.margin
     columns, rows, matrices = A.columns, A.rows, A.matrices
-    run = min(RUN, nz)
-    stride = -(-nz // run)
-    index = dr.arange(mi.UInt, nx * ny * stride)
-    line = index // stride
-    first_z = index - line * stride
-    voxels = [line * nz + first_z + s * stride for s in range(run)]
-    exists = [first_z + s * stride < nz for s in range(run)]
-    x = mi.Float(line // ny)
-    y, z0 = mi.Float(line) - x * ny, mi.Float(first_z)
+    (voxels, exists), (x, y, z0), stride = lanes(A.size, RUN)
+    run = len(voxels)
     pitch, chunks = n_v + 2 * margin, -(-margin // ROWS)
     sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
     block = mi.UInt(0)

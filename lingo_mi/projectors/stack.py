@@ -175,6 +175,25 @@ def on_device(values: np.ndarray) -> Any:
     return out
 
 
+def lanes(size: tuple[int, int, int], run: int) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], int]:
+    """Voxels for lanes that compute `run` (or all) of a line along z, spaced as far apart as possible.
+
+    Neighbouring lanes then fetch neighbouring values.
+
+    Returns (flat indices of a lane's voxels, whether they exist), its first voxel (x, y, z) as floats, and the step along z.
+    """
+    _, ny, nz = size
+    run = min(run, nz)
+    stride = -(-nz // run)
+    index = dr.arange(mi.UInt, size[0] * ny * stride)
+    line = index // stride
+    first_z = index - line * stride
+    voxels = [line * nz + first_z + s * stride for s in range(run)]
+    exists = [first_z + s * stride < nz for s in range(run)]
+    x = mi.Float(line // ny)
+    return (voxels, exists), (x, mi.Float(line) - x * ny, mi.Float(first_z)), stride
+
+
 def hat(position: Any, index: Any, n: Any) -> Any:
     """Weight of grid index `index` at a position along an axis of n voxels, edge values held for half a voxel."""
     weight = dr.maximum(1 - dr.abs(dr.clip(position, 0, n - 1) - index), 0)

@@ -16,7 +16,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import view_table
-from lingo_mi.projectors.stack import Gathered, hat, on_device, sampled, span
+from lingo_mi.projectors.stack import Gathered, hat, lanes, on_device, sampled, span
 
 RAY = 21  # floats per view of `ray_table`
 RUN = 2  # voxels per lane of the transpose
@@ -182,17 +182,10 @@ def _shadow(r, point, counts):
 
 @dr.syntax
 def _collect(weighted, chosen, n_views, A: TiltedJoseph, ones):
-    """Each lane computes RUN voxels of a line along z, spaced as far apart as possible: see `joseph`."""
+    """See `Gathered`."""
     (nx, ny, nz), (n_v, n_u), rays, matrices = A.size, A.panel, A.rays, A.matrices
-    run = min(RUN, nz)
-    stride = -(-nz // run)
-    index = dr.arange(mi.UInt, nx * ny * stride)
-    line = index // stride
-    first_z = index - line * stride
-    voxels = [line * nz + first_z + s * stride for s in range(run)]
-    exists = [first_z + s * stride < nz for s in range(run)]
-    x = mi.Float(line // ny)
-    y, z0 = mi.Float(line) - x * ny, mi.Float(first_z)
+    (voxels, exists), (x, y, z0), stride = lanes(A.size, RUN)
+    run = len(voxels)
     sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
     block = mi.UInt(0)
     while block < n_views:

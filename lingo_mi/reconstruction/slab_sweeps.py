@@ -30,6 +30,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, parsed_json, reading, write_text, writing
 from lingo_mi.folder_lock import locked
 from lingo_mi.reconstruction.algorithm import Progress
+from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.sart_update import normalised, updated
 from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector_class, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
@@ -56,6 +57,7 @@ def swept(
     Raises InputError for pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two
     volumes, for a folder that holds other work, and if the volume is not finite.
     """
+    require_rays(scan.geometry)
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
     begin, end = scan.geometry.slabs(thickness)[0]

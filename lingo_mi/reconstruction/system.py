@@ -107,7 +107,7 @@ class System:
 
 
 def projector_class(geometry: Geometry) -> type[Joseph | TiltedJoseph | GridPair]:
-    """The fastest projector for a scan: an update of 128^3 voxels by a view of 192^2 pixels takes 21, 50 or 260 ms (CPU)."""
+    """The fastest projector that serves a scan: see docs/benchmarks/speed.md."""
     for kind in (Joseph, TiltedJoseph):
         if kind.serves(geometry):
             return kind

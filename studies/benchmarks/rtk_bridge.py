@@ -18,7 +18,10 @@ from lingo_mi.scan import Scan
 
 
 def gantry(geometry: Geometry, itk: Any) -> Any:
-    """RTK's geometry object. Raises InputError for a parallel beam."""
+    """RTK's geometry object. Raises InputError for a parallel beam.
+
+    A circle is told in RTK's own numbers, so that a comparison also finds an error in this package's rays.
+    """
     if geometry.mode != 'cone':
         raise InputError('RTK is compared with on cone beams only')
     out = itk.RTK.ThreeDCircularProjectionGeometry.New()

@@ -1,5 +1,6 @@
 """What tests share with joseph."""
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -59,3 +60,21 @@ def assert_pair(kind: type, geometry, matrix: np.ndarray, masked: bool) -> None:
     aty, sums = J.adjoint(images, views), J.adjoint(images, views, lambda voxel, change, ones: ones)
     np.testing.assert_allclose(aty.numpy(), expected, atol=2e-5 * np.abs(expected).max())
     np.testing.assert_allclose(sums.numpy(), rows.sum(0), atol=2e-5 * rows.sum(0).max())
+
+
+def assert_kernels_serve_any_views(A) -> None:
+    """One kernel projects; two go back, the first weights the images. A: a projector of three views or more."""
+    x = dr.opaque(mi.Float, 1.0, A.voxels)
+
+    def both(views):
+        images = A.forward(x, views)[0]
+        dr.eval(images)
+        dr.eval(A.adjoint(images, views))
+
+    both([0, 1])
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        both([2])
+        both([2, 0, 1])
+        history = dr.kernel_history([dr.KernelType.JIT])
+    assert len(history) == 6 and len({k['hash'] for k in history}) == 3 and all(k['cache_hit'] for k in history)

@@ -1,12 +1,11 @@
 """Joseph's projector against a literal transcription, its transpose, and the analytic ball."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from helpers.grids import scan
-from helpers.matrices import assert_pair, device_images, matrix
+from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, shaken, turned
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
@@ -100,22 +99,7 @@ def test_smooth_ball_against_the_exact_projector(voxels):
 
 
 def test_kernels_serve_any_views():
-    """One kernel projects; two go back, the first weights the images."""
-    geometry = scan(n=7)
-    J, x = Joseph(geometry), dr.opaque(mi.Float, 1.0, 9 * 11 * 7)
-
-    def both(views):
-        images = J.forward(x, views)[0]
-        dr.eval(images)
-        dr.eval(J.adjoint(images, views))
-
-    both([0, 1])
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        both([3])
-        both([2, 6, 4])
-        history = dr.kernel_history([dr.KernelType.JIT])
-    assert len(history) == 6 and len({k['hash'] for k in history}) == 3 and all(k['cache_hit'] for k in history)
+    assert_kernels_serve_any_views(Joseph(scan(n=7)))
 
 
 def test_scans_it_does_not_serve():

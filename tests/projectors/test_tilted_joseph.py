@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from helpers.grids import scan
-from helpers.matrices import assert_pair, device_images, matrix
+from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, rolled, shaken, tilted, turned
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.grid import project
@@ -91,22 +90,7 @@ def test_smooth_ball_against_the_exact_projector(tilt):
 
 
 def test_kernels_serve_any_views():
-    """One kernel projects; two go back, the first weights the images."""
-    geometry = posed(tilted(*SMALL))
-    A, x = TiltedJoseph(geometry), dr.opaque(mi.Float, 1.0, 9 * 11 * 7)
-
-    def both(views):
-        images = A.forward(x, views)[0]
-        dr.eval(images)
-        dr.eval(A.adjoint(images, views))
-
-    both([0, 1])
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        both([2])
-        both([2, 0, 1])
-        history = dr.kernel_history([dr.KernelType.JIT])
-    assert len(history) == 6 and len({k['hash'] for k in history}) == 3 and all(k['cache_hit'] for k in history)
+    assert_kernels_serve_any_views(TiltedJoseph(posed(tilted(*SMALL))))
 
 
 def test_a_source_beside_the_volume_is_refused():
