@@ -257,7 +257,7 @@ def reconstruct_into(
     scan, inputs = dataset.train, {}
     require_rays(scan.geometry)
     if not (slab and isinstance(algorithm, Sweeps)):  # whose `slabs` knows better
-        check_room(thinned(scan.geometry, slab), algorithm, views)
+        check_room(thinned(scan.geometry, slab), algorithm, views, masked=scan.valid is not None)
     if algorithm is None:
         assert cloud is not None  # as `check_arguments` has made sure
         if slab:

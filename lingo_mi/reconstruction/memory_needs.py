@@ -32,10 +32,10 @@ NEEDS = {  # by the algorithms' names
 }
 
 
-def needed(algorithm: str, geometry: Geometry, views: int) -> float:
+def needed(algorithm: str, geometry: Geometry, views: int, masked: bool = False) -> float:
     """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus two sets of projections)
-    and of work on projections (plus one volume)."""
+    and of work on projections (plus one volume). Invalid pixels (masked) are one more set in both."""
     volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes
-    return max(volumes * volume + 2 * projections, volume + need.projections * projections)
+    return max(volumes * volume + 2 * projections, volume + need.projections * projections) + masked * projections

@@ -41,22 +41,28 @@ def reconstruct(
     Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and if the result
     is not finite.
     """
-    check_scan(scan.geometry, algorithm, max(len(scan), len(inputs.get('completed') or ())))
+    views = max(len(scan), len(inputs.get('completed') or ()))
+    check_scan(scan.geometry, algorithm, views, masked=scan.valid is not None)
     require_signal(scan)
     return algorithm.run(scan, start=start, progress=progress, **inputs)
 
 
-def check_scan(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
+def check_scan(
+    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, masked: bool = False
+) -> None:
     """Raises InputError if no ray meets the volume, if the source is inside it, or if memory is too small.
 
     algorithm   to check memory for (None: the least that any algorithm needs)
     views       number of views to reconstruct from (None: the geometry's own)
+    masked      some pixels are invalid, and images of them are kept
     """
     require_rays(geometry)
-    check_room(geometry, algorithm, views)
+    check_room(geometry, algorithm, views, masked)
 
 
-def check_room(geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None) -> None:
+def check_room(
+    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, masked: bool = False
+) -> None:
     """Raises InputError if memory or an array is too small; arguments as of `check_scan`."""
     views = views or len(geometry)
     pixels = views * math.prod(geometry.nDetector) if algorithm is not None and algorithm.name != 'fdk' else 0
@@ -69,7 +75,7 @@ def check_room(geometry: Geometry, algorithm: Algorithm | None = None, views: in
         check_memory(geometry, views=views)
     else:
         grid = algorithm.grid(geometry)
-        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views))
+        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views, masked))
 
 
 @contextmanager

@@ -100,7 +100,10 @@ def test_peak_memory_of_large_scans(algorithm):
 
 @pytest.mark.parametrize('algorithm', NEEDS)
 def test_needs_are_counted_in_float32(algorithm):
-    """4 bytes a voxel and a pixel: many voxels, or many pixels."""
+    """4 bytes a voxel and a pixel: many voxels, or many pixels. The invalid ones are one more image of every view."""
     need, voxels, pixels = NEEDS[algorithm], 4 * 300**3, 4 * 900**2
     assert needed(algorithm, scanned(300, 900, 1), 1) == pytest.approx(need.volumes * voxels + 2 * pixels)
     assert needed(algorithm, scanned(20, 900, 99), 99) == pytest.approx(4 * 20**3 + need.projections * 99 * pixels)
+    for views in (1, 99):
+        both = (needed(algorithm, scanned(20, 900, views), views, masked) for masked in (False, True))
+        assert next(both) + views * pixels == pytest.approx(next(both))
