@@ -27,7 +27,7 @@ from lingo_mi.plugins import watch_variants  # noqa: E402 - loads Mitsuba, and D
 
 watch_variants()
 
-__version__ = '0.1.0'
+__version__ = '0.2.0.dev0'
 
 __all__ = [  # noqa: RUF022 - in the order of their use
     'simulate',

@@ -43,7 +43,7 @@ LARGEST = 4.0  # line integral of every simulated scan: 1.8 % of the photons arr
 COMPLETED = 100  # views
 MEASURED = 'walnut'  # a scene of measured views; their reference is the FDK of all of them
 BEST = 'best'
-VOXELS = {'asd-pocs': 'ASD-POCS', 'refined': 'refined, own voxels', 'refined_finer': 'refined, half the size'}
+VOXELS = {'asd-pocs': 'ASD-POCS', 'refined': 'refined from ASD-POCS', 'refined_finer': 'the same, half the size'}
 CLOUDS = {
     'cloud': "cloud's volume",
     'completed': 'ASD-POCS, completed',
