@@ -30,7 +30,7 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
         if array.dtype.kind in 'cSUOMm':  # NumPy would take text for numbers, and drop imaginary parts
             raise TypeError(f'its values are {array.dtype}, not real numbers')
         return np.asarray(array, dtype)
-    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError, BufferError) as error:
         why = ' '.join(str(error).split()).rstrip('.')
         raise InputError(f'{name} cannot be read as an array ({why}); give a NumPy array') from None
 

@@ -180,6 +180,13 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
         yield temporary
 
 
+def new_file(path: Path, force: bool) -> None:
+    """Makes the folder of a file to be written. Raises InputError where the file exists, unless `force` replaces it."""
+    if path.exists() and not force:
+        raise InputError(f'{path}: exists already; give force=True to replace it')
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
 @contextmanager
 def writing(path: PathLike | str) -> Iterator[None]:
     """Turns what the file system says about `path` while files are written there into an InputError."""

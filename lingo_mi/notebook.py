@@ -41,7 +41,7 @@ def frames(
     chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_FRAMES)).round().astype(int))
     by = max(1, -(-max(images.shape[1:]) // SIDE))
     small = np.asarray(images)[chosen][:, ::by, ::by].astype(np.float32)
-    low, high = window_of(small) if window is None else window
+    low, high = grey_range(small) if window is None else window
     grey = (np.clip((small - low) / max(high - low, 1e-12), 0, 1) * 255).astype(np.uint8)
     rows, columns = grey.shape[1:]
     file = io.BytesIO()
@@ -75,7 +75,7 @@ def slices(volume: np.ndarray, spacing: ArrayLike, centre: ArrayLike = (0, 0, 0)
 
     slices(found.volume, (1, 1, 1))
     """
-    low, high = window_of(volume)
+    low, high = grey_range(volume)
     out = []
     for axis, name, letter in PLANES:
         stack = np.moveaxis(volume, axis, 0)
@@ -89,10 +89,14 @@ def slices(volume: np.ndarray, spacing: ArrayLike, centre: ArrayLike = (0, 0, 0)
     return ''.join(out)
 
 
-def window_of(values: np.ndarray) -> tuple[float, float]:
-    """From 0, or from the 0.1th percentile where that is negative, to the 99.9th; to the largest value where few are not 0."""
-    low, high = min(0.0, float(np.percentile(values, 0.1))), float(np.percentile(values, 99.9))
-    return low, high if high > low else max(float(np.max(values)), low + 1e-12)
+def grey_range(*arrays: np.ndarray) -> tuple[float, float]:
+    """A common grey scale, by the last array: from 0, or from the 0.1th percentile where that is negative, to the 99.9th.
+
+    Where few values are not 0, to the largest of all arrays.
+    """
+    reference = arrays[-1]
+    low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))
+    return low, high if high > low else max(low + 1e-12, *(float(a.max()) for a in arrays))
 
 
 def table(rows: dict[str, Any]) -> str:

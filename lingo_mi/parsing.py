@@ -29,14 +29,23 @@ def parse(name: str, text: str, like: Any) -> Any:
             return numbers * 2 if len(numbers) == 1 else numbers
         if isinstance(like, bool):
             return {'true': True, 'false': False}[text.lower()]
-        if isinstance(like, int) and float(text) != int(float(text)):
-            raise ValueError
-        return int(float(text)) if isinstance(like, int) else type(like)(text)
+        if isinstance(like, int):
+            return _whole(text)
+        return type(like)(text)
     except (ValueError, KeyError, OverflowError):
         kind = {bool: 'true or false', int: 'a whole number', float: 'a number', tuple: 'two numbers, first,last'}[
             type(like)
         ]
         raise InputError(f'{name} must be {kind}, not {shown(text)}') from None
+
+
+def _whole(text):
+    try:
+        return int(text)  # all digits count
+    except ValueError:
+        if float(text) != int(float(text)):  # such as 1e4
+            raise
+        return int(float(text))
 
 
 def checked(name: str, value: Any, like: Any) -> Any:

@@ -53,9 +53,9 @@ def find_libllvm() -> str | None:
     """
     if os.environ.get('DRJIT_LIBLLVM_PATH'):
         return os.environ['DRJIT_LIBLLVM_PATH']
-    for root in dict.fromkeys(
-        (sys.prefix, *(str(Path(p).parents[2]) for p in sys.path if p.endswith('site-packages')))
-    ):
+    packages = [Path(p) for p in sys.path if p.endswith('site-packages')]
+    # Two folders above it, if there are so many.
+    for root in dict.fromkeys((sys.prefix, *(str(above) for p in packages for above in p.parents[2:3]))):
         found = sorted(
             glob.glob(os.path.join(root, 'lib', 'libLLVM.so*')) + glob.glob(os.path.join(root, 'lib', 'libLLVM-*.so'))
         )

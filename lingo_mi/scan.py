@@ -68,7 +68,8 @@ class Scan:
             if not valid.any():
                 raise InputError('no pixel of the scan is valid')
             object.__setattr__(self, 'valid', None if valid.all() else valid)
-            p = np.where(valid, p, np.float32(0))
+            if self.valid is not None:
+                p = np.where(valid, p, np.float32(0))
         require_finite(p)
         object.__setattr__(self, 'projections', p)
 

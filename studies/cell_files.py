@@ -28,7 +28,7 @@ class CellFiles:
         """A stored cell, or None where there is none that can be read."""
         try:
             found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
-        except (FileNotFoundError, ValueError):
+        except (OSError, ValueError):
             return None
         return found if isinstance(found, dict) and found.keys() >= set(self.needed) else None
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from lingo_mi.completion.prepare import sampled
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import replacing, write_text
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
@@ -250,7 +250,8 @@ class Study:
                 axis.imshow(volume[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
                 axis.set_title(title, fontsize=9)
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=110)
 
 
 def _case(views: int) -> str:

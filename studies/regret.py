@@ -30,7 +30,8 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
-from lingo_mi.reconstruction.best import SPREAD, START, means, refine
+from lingo_mi.reconstruction.best import SPREAD, START, refine
+from lingo_mi.reconstruction.refined import means
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path

@@ -58,7 +58,16 @@ def test_without_a_copy():
 
 @pytest.mark.parametrize(
     'values',
-    [Elsewhere(), [[1, 2], [3]], 'none', VALUES.astype(str), VALUES.astype(complex), VALUES.astype(object), None],
+    [
+        Elsewhere(),
+        [[1, 2], [3]],
+        'none',
+        VALUES.astype(str),
+        VALUES.astype(complex),
+        VALUES.astype(object),
+        None,
+        [[[10**400]]],
+    ],
 )
 def test_what_is_no_array(values):
     with pytest.raises(InputError, match='the projections cannot be read as an array') as caught:
@@ -76,7 +85,7 @@ def test_pixels_that_are_not_finite_say_how_to_leave_them_out():
     assert Scan(GEOMETRY, values, valid=np.isfinite(values)).projections[1, 0, 2] == 0
 
 
-@pytest.mark.parametrize('index', [[2], [-3], 1, [0.5], 'all', None, [[0, 1]], [[0], [0, 1]], [True]])
+@pytest.mark.parametrize('index', [[2], [-3], 1, [0.5], 'all', None, [[0, 1]], [[0], [0, 1]], [True], True])
 def test_views_that_are_none(index):
     for some in Scan(GEOMETRY, VALUES), GEOMETRY:
         with pytest.raises(InputError, match='views are chosen by'):

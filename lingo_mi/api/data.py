@@ -14,6 +14,7 @@ from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
+from lingo_mi.geometry.trajectories import spread
 from lingo_mi.parsing import nearest, whole
 from lingo_mi.phantoms import Phantom, make
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
@@ -88,6 +89,8 @@ def simulate(
     volume = source.data if isinstance(source, Phantom) else as_numpy(source, 'the volume', np.float32)
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    if views:  # fails early
+        spread(len(geometry), views)
     require_densities(volume)
     check_memory(geometry, held_out)
     warn_if_truncated(geometry)

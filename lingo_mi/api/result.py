@@ -15,7 +15,7 @@ import numpy as np
 from lingo_mi import notebook
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.errors import InputError, require_type
-from lingo_mi.file_access import as_path, parsed_json, replacing, writing
+from lingo_mi.file_access import as_path, new_file, parsed_json, reading, replacing, writing
 from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting.fitted import Fitted, NeedsEffects
 from lingo_mi.fitting.settings import Settings
@@ -144,9 +144,7 @@ class Result:
         if geometry is not None:
             require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
         with writing(path):
-            if path.exists() and not force:
-                raise InputError(f'{path}: exists already; give force=True to replace it')
-            path.parent.mkdir(parents=True, exist_ok=True)
+            new_file(path, force)
         grid = self.fitted.geometry if geometry is None else geometry
         write_slabs(path, grid, (self.volume(grid.slab(*part)) for part in grid.slabs(slab)))
         return path
@@ -275,7 +273,8 @@ def load_result(path: str | PathLike) -> Result:
     stored = None
     if path.is_dir() and numbers.exists():
         try:
-            stored = current_names(parsed_json(numbers.read_text(encoding='utf-8')))
+            with reading(numbers):
+                stored = current_names(parsed_json(numbers.read_text(encoding='utf-8')))
         except (ValueError, AttributeError):  # no JSON, or no dictionary
             raise InputError(f'{numbers}: is damaged; remove it, and give metrics() the data to compare with') from None
     return Result(fitted, (stored or {}).get('method', 'checkpoint'), file.read_bytes(), stored=stored)

@@ -64,7 +64,7 @@ def reconstruct(
     if isinstance(start, Result):
         cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)
         if views is not None:
-            check_scan(scan.geometry, algorithm, views, masked=scan.valid is not None)
+            check_scan(scan.geometry, algorithm, views)
             scan, inputs = prepare_completed(dataset, cloud, views, algorithm)
         else:
             if isinstance(algorithm, Refined):

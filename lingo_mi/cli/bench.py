@@ -19,7 +19,7 @@ from typing import Any
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 from lingo_mi.runtime import use_variant
 
 MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
@@ -54,6 +54,8 @@ def main() -> None:
     from lingo_mi.studies.benchmarks.integrator import TREE, Bench, Work, describe_times, describe_tree
     from lingo_mi.studies.cuda.model import beside
 
+    if args.json:
+        require_writable(args.json.parent, args.json, 'choose another --json')
     bench = Bench(Work(args.gaussians, args.size, args.pixels, args.extent, args.repeats))
     result: dict[str, Any] = {**bench.times(), **dict.fromkeys(TREE)}
     print(describe_times(result, args.repeats))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lingo_mi.cli.common import Parser
 from lingo_mi.errors import InputError
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 
 
 def arguments() -> argparse.Namespace:
@@ -48,6 +48,9 @@ def main() -> int:
     cases = args.cases if args.total is None else -(-args.total // len(names))
     if not all(0 < x < math.inf for x in (cases, args.processes, args.seconds, args.memory)):
         raise InputError('--cases, --total, --processes, --seconds and --memory must be positive')
+    require_writable(args.out, args.out, 'choose another --out')
+    if args.markdown:
+        require_writable(args.markdown.parent, args.markdown, 'choose another --markdown')
     memory, start = int(args.memory * 2**30), time.monotonic()
     with Progress('Read', cases * len(names)) as bar:
         tallies = run(

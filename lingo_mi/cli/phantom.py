@@ -7,7 +7,7 @@ from typing import Any
 from lingo_mi import phantoms
 from lingo_mi.cli.common import Parser, check_seed
 from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import replacing
+from lingo_mi.file_access import replacing, require_writable
 from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.memory import room
 from lingo_mi.phantoms.x3d_scan import PIXELS
@@ -106,6 +106,7 @@ def check(args: argparse.Namespace) -> None:
             )
         if not path.absolute().parent.is_dir():
             raise InputError(f'{path}: the folder {path.parent} does not exist; make it first')
+        require_writable(path.parent, path)
     if args.out is not None and not args.out.name.endswith(('.nii', '.nii.gz')):
         if args.out.suffix != '.ply':
             raise InputError(f'{args.out}: volumes are written as NIfTI; give a name that ends in .nii.gz')

@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.file_access import write_text
+from lingo_mi.file_access import require_writable, write_text
 from lingo_mi.fitting.recipes import CLOUDS, METHODS
 
 
@@ -51,6 +51,9 @@ def main() -> None:
     from lingo_mi.studies.provenance import write_provenance
     from lingo_mi.studies.recipes import Comparison, draw, table
 
+    require_writable(args.out, args.out, 'choose another --out')
+    if args.figure:
+        require_writable(args.figure.parent, args.figure, 'choose another --figure')
     comparison = Comparison(args.out, args.views, args.iterations, tuple(args.define))
     results = comparison.results(args.scenes, args.methods)
     text = table(results)

@@ -32,6 +32,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import optional, require_writable, write_text
-from lingo_mi.files.slabs import NIFTI, ZARR, write_slabs
+from lingo_mi.files.slabs import NIFTI, ZARR, plan_and_error_map, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
 from lingo_mi.progress import Progress
@@ -60,7 +61,7 @@ from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, 
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
-from lingo_mi.reconstruction.run import check_room
+from lingo_mi.reconstruction.run import check_room, mask_images
 from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.reconstruction.slab_sweeps import discard
 from lingo_mi.report.data import ReportData
@@ -146,13 +147,6 @@ def output(path: Path, force: bool) -> Path:
     return writable_file(path, force)
 
 
-def beside(out: Path) -> tuple[Path, Path]:
-    """The files of `best` beside its volume: the plan and the map of errors."""
-    ending = next(ending for ending in (*NIFTI, *ZARR) if out.name.endswith(ending))
-    name = out.name.removesuffix(ending)
-    return out.with_name(f'{name}-plan.json'), out.with_name(f'{name}-error{ending}')
-
-
 def check_page(path: Path, force: bool) -> None:
     """Raises InputError where the page cannot be written, or would spoil a file."""
     if path.suffix.lower() not in ('.html', '.htm'):
@@ -222,7 +216,7 @@ def main() -> None:
     algorithm = algorithm_of(args.algorithm, chosen)
     out = output(args.out or Path('out') / f'{input_name(args)}-{args.algorithm}.nii.gz', args.force)
     if args.algorithm == 'best':
-        for path in beside(out):
+        for path in plan_and_error_map(out):
             writable_file(path, args.force)
     if args.report is not None:
         check_page(args.report, args.force)
@@ -256,8 +250,10 @@ def reconstruct_into(
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, slab)
     scan, inputs = dataset.train, {}
     require_rays(scan.geometry)
-    if not (slab and isinstance(algorithm, Sweeps)):  # whose `slabs` knows better
-        check_room(thinned(scan.geometry, slab), algorithm, views, masked=scan.valid is not None)
+    if not (slab and isinstance(algorithm, Sweeps | FDK)):  # whose `slabs` knows better
+        grid = thinned(scan.geometry, slab)
+        both = args.start and dataset.volume is not None  # a start and the truth, of which the needs have one
+        check_room(grid, algorithm, views, mask_images(scan) + (4 * prod(grid.nVoxel) if both else 0))
     if algorithm is None:
         assert cloud is not None  # as `check_arguments` has made sure
         if slab:
@@ -300,7 +296,7 @@ def reconstruct_into(
         print(args.report)
     if isinstance(found, Chosen):
         print(found.report())
-        plan, error = beside(out)
+        plan, error = plan_and_error_map(out)
         replace(found, volume=found.error).save(error, force=True)
         write_text(plan, json.dumps(found.record(), indent=1) + '\n')  # last: it says whose the map is
 

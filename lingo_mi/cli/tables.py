@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.cli.common import Parser, check_threads, cluster_arguments, runner_of
+from lingo_mi.cli.common import Parser, check_seed, check_threads, cluster_arguments, runner_of
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import leftovers, require_writable
 from lingo_mi.fitting.recipes import METHODS, settings_of
@@ -91,8 +91,7 @@ def main() -> None:
         raise InputError(f'--views must be from 1 to {SCANNED}, not {" ".join(map(str, views))}')
     if iterations[0] < 1:
         raise InputError(f'--iterations must be at least 1, not {iterations[0]}')
-    if args.seed < 0:
-        raise InputError(f'--seed must not be negative, but is {args.seed}')
+    check_seed(args.seed)
     if args.finer < 1:
         raise InputError(f'--finer must be at least 1, not {args.finer}')
     for method in args.methods:

@@ -73,7 +73,7 @@ class Row:
         and all else that the numbers depend on."""
         path = self.path
         size = path.stat().st_size if path is not None and path.is_file() else None
-        settings = {name: value for name, value in self.fit_settings().flat().items() if name != 'checkpoint_seconds'}
+        settings = _asked(self.fit_settings())
         kept = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
         geometry = Path(self.folder) / self.geometry
         if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
@@ -133,6 +133,11 @@ def _digest_of(files):
     return found.hexdigest()
 
 
+def _asked(settings):
+    """The settings that the numbers depend on."""
+    return {name: value for name, value in settings.flat().items() if name != 'checkpoint_seconds'}
+
+
 def stored(out: Path, row: Row) -> dict | None:
     """The metrics of a row's whole result in the folder `out`; None where it has not been completed.
 
@@ -153,6 +158,9 @@ def stored(out: Path, row: Row) -> dict | None:
         with reading(folder / METRICS):
             found = parsed_json((folder / METRICS).read_text(encoding='utf-8'))
         files, asked = found['files'], found.get('request')
+        if isinstance(asked, dict):
+            # Settings that the result does not know are newer than it; what they stand at changes nothing.
+            asked = json.loads(json.dumps(asked | dict(settings=_asked(Settings()) | asked['settings'])))
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):

@@ -14,7 +14,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.effects_correction import corrected
-from lingo_mi.reconstruction.preconditions import require_circle
+from lingo_mi.reconstruction.preconditions import require_circle, require_pixels
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.description import MOST_VIEWS
@@ -64,13 +64,14 @@ def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
     return replace(scan, geometry=replace(cloud.corrected, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin))
 
 
-def missing_angles(angles: np.ndarray, views: int, geometry: Geometry) -> np.ndarray:
-    """Angles (radians) of the views to add, so that `views` in all are spread as evenly as the given ones allow.
+def missing_angles(geometry: Geometry, views: int) -> np.ndarray:
+    """Angles (radians) of the views to add to a geometry's, so that `views` in all are spread as evenly as the given ones allow.
 
     The widest gap is divided first, until there are enough views. An open arc is not extended, unless one more gap makes it half
     a turn or more: then its last view is taken to be left out, as in half a turn of evenly spaced views.
     """
-    order, gap, is_open = gaps(replace(geometry, angles=angles), 2 * np.pi)
+    angles = geometry.angles
+    order, gap, is_open = gaps(geometry, 2 * np.pi)
     if is_open and gap.sum() < np.pi - 1e-3:
         order, gap = order[:-1], gap[:-1]
     parts = np.ones(len(gap), int)
@@ -111,12 +112,13 @@ def insert_views(
 
     circle   nominal geometry of the views, if a fit has corrected the poses (default: the scan's own)
 
-    Raises InputError for fewer views than are given.
+    Raises InputError for fewer views than are given, and for invalid pixels.
     """
+    require_pixels(scan, 'the completion of a scan')
     geometry = circle or scan.geometry
     if views < len(scan):
         raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
     if views == len(scan):
         return scan
-    rendered = replace(geometry, angles=missing_angles(geometry.angles, views, geometry))
+    rendered = replace(geometry, angles=missing_angles(geometry, views))
     return Scan(scan.geometry.joined(rendered), np.concatenate([scan.projections, render(rendered)]))

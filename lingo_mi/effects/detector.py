@@ -27,6 +27,7 @@ from scipy.ndimage import convolve
 
 from lingo_mi.effects.focal_spot import checked_order
 from lingo_mi.errors import InputError
+from lingo_mi.parsing import MOST_SEED
 from lingo_mi.projectors.view import View
 
 RESPONSES = 'energy', 'count'
@@ -85,7 +86,7 @@ class Detector:
             value = given[name]
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a number from 0 to {most:g}, not {value!r}')
-        for name, most in dict(bits=24, seed=2**62).items():
+        for name, most in dict(bits=24, seed=MOST_SEED).items():
             value = given[name]
             if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a whole number from 0 to {most}, not {value!r}')

@@ -165,7 +165,9 @@ class Effects:
         projections = scan.projections
         if self.tube and self.tube.hardens:
             bands = self.tube.signal(self.tube.fitted()[:1], self.response)
-            projections = np.stack([bands.precorrected(view) for view in projections])  # one by one, for memory
+            projections = np.empty_like(projections)
+            for out, view in zip(projections, scan.projections):  # view by view, for memory
+                out[:] = bands.precorrected(view)
         return replace(scan, projections=projections, effects=None)
 
     def measured(self, integrals: Any, view: View, seed: int) -> Any:

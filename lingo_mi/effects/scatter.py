@@ -29,6 +29,7 @@ from lingo_mi.effects.hardening import Tube, by_material
 from lingo_mi.effects.spectrum import attenuation
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.parsing import MOST_SEED
 from lingo_mi.projectors.objects import GridInCube
 from lingo_mi.projectors.sampling import bounds, on_grid
 from lingo_mi.projectors.view import View
@@ -61,7 +62,7 @@ class Scatter:
             ('scatter_orders', orders, -1, MOST_ORDERS),
             ('scatter_voxels', voxels, 1, MOST_VOXELS),
             ('scatter_energies', energies, 1, MOST_ENERGIES),
-            ('scatter_seed', seed, 0, 2**62),
+            ('scatter_seed', seed, 0, MOST_SEED),
         ):
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(f'{name} must be a whole number from {least} to {most}, not {value!r}')

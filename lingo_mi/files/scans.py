@@ -202,7 +202,10 @@ def _line_integrals(projections, values, where, projections_path):
             f'{projections_path}: an intensity is not positive (first at [view, v, u] = {bad}), '
             'so it has no logarithm; mask or repair dead pixels first'
         )
-    return np.log(i0 / projections.astype(float))
+    out = np.empty(projections.shape, np.float32)
+    for view, intensity in zip(out, projections):  # view by view, for memory
+        view[:] = np.log(i0 / intensity.astype(float))
+    return out
 
 
 def _dump_yaml(path, geometry, test=None, *, poses=None, **more):

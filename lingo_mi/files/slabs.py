@@ -27,6 +27,13 @@ CHUNK = 64  # voxels a side of an OME-Zarr's chunks, at most
 LEAST = 64  # voxels along the longest side of the coarsest level of a pyramid
 
 
+def plan_and_error_map(path: Path) -> tuple[Path, Path]:
+    """The files that stand beside a volume of the algorithm `best`: its plan, and its map of errors in the volume's format."""
+    ending = next((ending for ending in (*NIFTI, *ZARR) if path.name.endswith(ending)), path.suffix)
+    name = path.name.removesuffix(ending)
+    return path.with_name(f'{name}-plan.json'), path.with_name(f'{name}-error{ending}')
+
+
 def write_slabs(
     path: PathLike | str, geometry: Geometry, slabs: Iterable[np.ndarray], description: str = 'density per mm'
 ) -> None:

@@ -224,7 +224,10 @@ def read_volume(
         )
     data = numeric(data, path, 3)
     if affine is None:
-        steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))
+        try:
+            steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))
+        except (TypeError, ValueError):
+            steps = np.empty(0)
         if steps.shape not in ((1,), (3,)) or not (np.isfinite(steps).all() and steps.min() > 0):
             raise InputError(f'spacing must be one or three positive numbers, in mm, not {shown(spacing)}')
         affine = centred_affine(data.shape, np.broadcast_to(steps, 3))
@@ -285,8 +288,6 @@ def volume_header(
 
     affine, text = _placed(Path(path), shape, spacing, origin, description)
     header: Any = nibabel.Nifti1Header(endianness='<')
-    if max(shape) > np.iinfo(np.int16).max:
-        raise InputError(f'{path}: NIfTI has room for {np.iinfo(np.int16).max} voxels along a side; write .ome.zarr')
     header.set_data_dtype(np.float32)
     header.set_data_shape(shape)
     header.set_qform(affine, 'unknown')
@@ -299,6 +300,8 @@ def volume_header(
 
 def _placed(path, shape, spacing, origin, description):
     """The affine [4, 4] and the description of a NIfTI file, checked."""
+    if max(shape) > np.iinfo(np.int16).max:
+        raise InputError(f'{path}: NIfTI has room for {np.iinfo(np.int16).max} voxels along a side; write .ome.zarr')
     spacing = np.broadcast_to(np.asarray(spacing, float), 3)
     if not (np.isfinite(spacing).all() and spacing.min() > 0):
         raise InputError(f'{path}: the voxel size must be positive, not {tuple(spacing)}')

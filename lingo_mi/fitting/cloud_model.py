@@ -81,7 +81,8 @@ class CloudModel:
             out[i] = image.numpy().reshape(height, width)
             if progress:
                 progress(i + 1, len(geometry))
-        return out * np.float32(self.unit / g.scale)
+        out *= np.float32(self.unit / g.scale)
+        return out
 
     def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray | None:
         """The cloud's density at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).

@@ -31,22 +31,6 @@ REACH = len(WINDOW) // 2
 TAPS = range(-REACH, TILE + REACH)
 
 
-def l1(image: Any, truth: Any) -> Any:
-    """Mean absolute error of two arrays Float [N], in their own unit. Subgradient 0 where they agree."""
-    difference = image - truth
-    return dr.mean(difference * dr.detach(_sign(difference)))
-
-
-def ssim(image: Any, truth: Any, height: int, width: int) -> Any:
-    """Mean SSIM of an image with its truth, both Float [height * width], row by row; full scale is 1.
-
-    Wang et al. (IEEE TIP 2004) in the form of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5,
-    zeros around the images, C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode;
-    the truth is a constant. Raises InputError if an image has another number of pixels.
-    """
-    return 1 - _photometric(image, truth, height, width, 0.0, 1.0)
-
-
 def combined(
     image: Any,
     truth: Any,
@@ -56,11 +40,19 @@ def combined(
     lambda_gradient: float = 0.0,
     lambda_l1: float = 1.0,
 ) -> Any:
-    """lambda_l1 L1 + lambda_ssim (1 - SSIM) + lambda_gradient `gradient_error`, with the arguments of `ssim`.
+    """lambda_l1 L1 + lambda_ssim (1 - SSIM) + lambda_gradient `gradient_error` of an image and its truth, both Float
+    [height * width], row by row.
 
-    Differentiable in the image, in reverse mode; InputError as for `ssim`.
+    L1 is the mean absolute error, its subgradient 0 where the two agree. SSIM is that of Wang et al. (IEEE TIP 2004) in the form
+    of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5, zeros around the images, full scale 1,
+    C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode; the truth is a constant. Raises
+    InputError if an image has another number of pixels.
     """
-    loss = _photometric(image, truth, height, width, lambda_l1, lambda_ssim)
+    _check_size('image', image, height, width)
+    _check_size('truth', truth, height, width)
+    loss = dr.custom(
+        _Photometric, image, dr.detach(truth), height, width, lambda_l1, lambda_ssim, dr.grad_enabled(image)
+    )
     if lambda_gradient > 0:
         loss += lambda_gradient * gradient_error(image, truth, height, width)
     return loss
@@ -91,14 +83,6 @@ def tv(volume: Any, shape: tuple[int, int, int]) -> Any:
     """
     _check_size('volume', volume, *shape)
     return dr.custom(_TotalVariation, volume, tuple(shape))
-
-
-def _photometric(image, truth, height, width, weight_l1, weight_ssim):
-    _check_size('image', image, height, width)
-    _check_size('truth', truth, height, width)
-    return dr.custom(
-        _Photometric, image, dr.detach(truth), height, width, weight_l1, weight_ssim, dr.grad_enabled(image)
-    )
 
 
 def _check_size(what, array, *shape):

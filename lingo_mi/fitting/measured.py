@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy import ndimage
 
@@ -37,12 +35,14 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
     detector = scan.effects.detector if scan.effects else None
     if not (detector and (detector.photons or detector.bits)):
         raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
-    p = scan.projections
-    valid = np.ones(p.shape) if scan.valid is None else scan.valid.astype(float)
-    size: Any = 0, 3, 3  # SciPy declares one number
-    light, share = (ndimage.uniform_filter(a, size, mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
-    weights = 1 / detector.deviation(light / np.maximum(share, 0.1))
-    return (weights * (p.max() / (weights * p).max())).astype(np.float32)
+    weights = np.empty_like(scan.projections)
+    for i, p in enumerate(scan.projections):  # view by view, for memory
+        valid = np.ones(p.shape) if scan.valid is None else scan.valid[i].astype(float)
+        light, share = (ndimage.uniform_filter(a, 3, mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
+        weights[i] = 1 / detector.deviation(light / np.maximum(share, 0.1))
+    weighted = max((w * p).max() for w, p in zip(weights, scan.projections))
+    weights *= scan.projections.max() / weighted
+    return weights
 
 
 def knows_noise(scan: Scan) -> bool:

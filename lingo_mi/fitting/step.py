@@ -177,9 +177,13 @@ class Stepper:
             return
         undone = self.model.response.undone(self.measured.projections, self.geometry)
         scan = replace(self.measured, projections=undone)
-        for targets, views in ((self.targets, scan), (self.coarse, scan.binned(2))):
-            for target, new in zip(targets, _targets(views, self.unit, self.settings) if targets else ()):
+        for targets, views in self._panels(scan):
+            for target, new in zip(targets, _targets(views, self.unit, self.settings)):
                 target.pixels, target.weights = new.pixels, new.weights
+
+    def _panels(self, scan: Scan) -> list[tuple[list[Target], Scan]]:
+        """The targets of all views with a scan of these pixels; and the coarse ones, if there are any, with one of theirs."""
+        return [(self.targets, scan)] + ([(self.coarse, scan.binned(2))] if self.coarse else [])
 
     def renew_light(self, state: DeviceState) -> None:
         """Estimate again the light that the cloud scatters into the views."""
@@ -191,7 +195,7 @@ class Stepper:
         if self.scattered is None:
             return
         views = Scan(self.geometry, light_at_pixels(self.scattered, self.geometry))
-        for targets, scan in ((self.targets, views), (self.coarse, views.binned(2))):
+        for targets, scan in self._panels(views):
             for target, image in zip(targets, scan.projections):
                 target.scattered = uploaded(image.ravel())
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.arrays import as_numpy
 from lingo_mi.errors import InputError
 from lingo_mi.projectors.upload import uploaded_tensor
 from lingo_mi.runtime import ensure_variant, one_at_a_time
@@ -32,7 +33,7 @@ def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...],
     """
     kind = _kind(arrays, name)
     if kind == 'NumPy':
-        arrays = [_numpy(a, n, name) for a, n in zip(arrays, NAMES)]
+        arrays = [as_numpy(a, f'{name}: {n}', np.float32) for a, n in zip(arrays, NAMES)]
     _check_shapes(arrays, name)
 
     def of_tensors(*tensors):
@@ -72,17 +73,6 @@ def _kind_of(array) -> str:
         return 'Dr.Jit'
     packages = {base.__module__.partition('.')[0] for base in type(array).__mro__}
     return 'PyTorch' if 'torch' in packages else 'JAX' if packages & {'jax', 'jaxlib'} else 'NumPy'
-
-
-def _numpy(array, what: str, name: str) -> np.ndarray:
-    try:
-        if hasattr(array, '__dlpack__') and not hasattr(array, '__array__'):
-            array = np.from_dlpack(array)
-        return np.asarray(array, np.float32)
-    except (TypeError, ValueError, OverflowError, BufferError, RuntimeError) as error:
-        raise InputError(
-            f'{name}: {what} cannot be read as an array of numbers ({str(error).splitlines()[0]})'
-        ) from None
 
 
 def _check_shapes(arrays, name: str):

@@ -1,4 +1,4 @@
-"""Where a scan's rays are: scanners in TIGRE's terms, poses, and what other packages call them. NumPy only, no Mitsuba."""
+"""Where a scan's rays are: scanners in TIGRE's terms, poses, and what other packages call them. Needs no Mitsuba."""
 
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.camera import camera_matrices

@@ -39,6 +39,7 @@ from lingo_mi.geometry.drawing import drawing
 from lingo_mi.geometry.limits import MOST_COUNT
 from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import Motion, helix, scanner_rays
+from lingo_mi.parsing import whole
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -386,8 +387,7 @@ class Geometry(ABC):
 
         Raises InputError unless a slab has a slice.
         """
-        if thickness < 1:
-            raise InputError(f'a slab has one slice or more, not {thickness}')
+        thickness = whole('the thickness of a slab, in slices,', thickness, 1)
         return [(z, min(z + thickness, self.nVoxel[2])) for z in range(0, self.nVoxel[2], thickness)]
 
     @property
@@ -434,8 +434,7 @@ class Geometry(ABC):
 
     def bins(self, factor: int) -> tuple[int, int]:
         """How many rows and columns make one of `binned(factor)`: `factor`, or 1 along a side of fewer than two new pixels."""
-        if factor < 1:
-            raise InputError(f'pixels are averaged by a whole number from 1 on, not by {factor}')
+        factor = whole('the binning of pixels', factor, 1)
         by_v, by_u = (factor if n >= 2 * factor else 1 for n in self.nDetector)
         return by_v, by_u
 

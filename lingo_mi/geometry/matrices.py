@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.errors import InputError
-from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.limits import numbers
 from lingo_mi.geometry.rays import Rays
 
@@ -18,11 +17,6 @@ from lingo_mi.geometry.rays import Rays
 _TO_INDEX = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 
 MOST = 1e100  # of a matrix's entries, whose scale says nothing
-
-
-def to_matrices(rays: Rays) -> np.ndarray:
-    """The views' matrices, float64 [n, 3, 4]; w is 1 on the panel, 0 at the source (everywhere 1 for a parallel beam)."""
-    return _TO_INDEX @ camera_matrices(rays)
 
 
 def from_matrices(

@@ -27,7 +27,7 @@ def checked_views(index: Index, count: int) -> Index:
     except (TypeError, ValueError, OverflowError):  # lists of several lengths
         views = np.empty((0, 0))
     whole = views.dtype.kind in 'iu' and (views.size == 0 or -count <= views.min() and views.max() < count)
-    mask = views.dtype.kind == 'b' and len(views) == count
+    mask = views.dtype.kind == 'b' and views.shape == (count,)
     if views.ndim != 1 or not (whole or mask or views.size == 0):
         raise InputError(
             f'views are chosen by a slice or a list of numbers from 0 to {count - 1}, not by {shown(index)}'

@@ -127,8 +127,9 @@ def valid_voxels(
     matrices = camera_matrices(rays)
     low, high = [], []
     total = int(np.prod(grid))
-    cells = np.arange(total)
-    if total > CHUNK:
+    if total <= CHUNK:
+        cells = np.arange(total)
+    else:
         # With negative thresholds, or low_factor above 1, high is no part of low. Invalid pixels exclude no cell.
         possible = masks.low | masks.high
         if masks.valid is not None:

@@ -41,7 +41,7 @@ from lingo_mi.phantoms.solids import (
 SIDE = 256.0  # mm
 _SCALE = 0.93  # world mm per anatomical mm
 _CENTRE = np.array([2.0, 131.0, 106.0])  # the cube's centre in the anatomical frame
-AIR, FAT, MUSCLE, TENDON, SKIN, MARROW = 0.0, 0.17, 0.22, 0.24, 0.24, 0.19
+FAT, MUSCLE, TENDON, SKIN, MARROW = 0.17, 0.22, 0.24, 0.24, 0.19
 
 # Joints of the five toes, hallux first: head of the metatarsal, interphalangeal joints, tip.
 _TOES = (

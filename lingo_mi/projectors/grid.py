@@ -347,33 +347,3 @@ def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int
         if progress:
             progress(i + 1, len(geometry))
     return out
-
-
-def backproject(
-    projections: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None
-) -> np.ndarray:
-    """The exact transpose of `project`: float32 [x, y, z], in units of the projections times mm.
-
-    projections   [view, v, u], of the shape that `geometry` has
-    progress      called as progress(views done, views) after every view
-
-    Raises InputError if the shapes disagree.
-    """
-    projections = np.ascontiguousarray(projections, np.float32)
-    expected = (len(geometry), *geometry.nDetector)
-    if projections.shape != expected:
-        raise InputError(
-            f'the projections have the shape {projections.shape}, but the geometry says [view, v, u] = {expected}'
-        )
-    n_v, n_u = geometry.nDetector
-    target = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
-    for i, row in enumerate(view_table(geometry)):
-        # A gather, because a direct read of a NumPy buffer compiles the buffer's alignment into the kernel.
-        index = dr.arange(mi.UInt, n_v * n_u)
-        image = dr.gather(mi.Float, mi.Float(projections[i].ravel()), index % n_v * n_u + index // n_v)
-        walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))
-        scatter(target, length * image, geometry.nVoxel, walk)
-        dr.eval(target)
-        if progress:
-            progress(i + 1, len(geometry))
-    return target.numpy().reshape(geometry.nVoxel)

@@ -15,7 +15,8 @@ import numpy as np
 
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import gather, pixel_walk, scatter, view_table
-from lingo_mi.projectors.stack import Block, Stack, Views, on_device
+from lingo_mi.projectors.stack import Block, Stack, Views
+from lingo_mi.projectors.upload import uploaded
 
 
 class GridPair(Stack):
@@ -26,12 +27,12 @@ class GridPair(Stack):
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry, valid)
-        self._rays = on_device(view_table(geometry))
+        self._rays = uploaded(view_table(geometry).ravel())
 
     def of_slab(self, slab: Geometry) -> GridPair:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out._rays = slab, slab.nVoxel, on_device(view_table(slab))
+        out.geometry, out.size, out._rays = slab, slab.nVoxel, uploaded(view_table(slab).ravel())
         return out
 
     def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:

@@ -24,7 +24,8 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.projectors.stack import Gathered, hat, lanes, on_device, sampled, span
+from lingo_mi.projectors.stack import Gathered, hat, lanes, sampled, span
+from lingo_mi.projectors.upload import uploaded
 
 COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
@@ -129,8 +130,8 @@ class Joseph(Gathered):
             )
         rows = int(_rows_of_voxel(geometry))
         self.margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
-        self.columns, self.rows = on_device(column_table(geometry)), on_device(row_table(geometry))
-        self.matrices = on_device(self._column_matrix())
+        self.columns, self.rows = (uploaded(table(geometry).ravel()) for table in (column_table, row_table))
+        self.matrices = uploaded(self._column_matrix().ravel())
 
     @classmethod
     def serves(cls, geometry: Geometry) -> bool:
@@ -140,7 +141,7 @@ class Joseph(Gathered):
     def of_slab(self, slab: Geometry) -> Joseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out.rows = slab, slab.nVoxel, on_device(row_table(slab))
+        out.geometry, out.size, out.rows = slab, slab.nVoxel, uploaded(row_table(slab).ravel())
         return out
 
     def _column_matrix(self):

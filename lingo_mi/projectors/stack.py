@@ -17,6 +17,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.upload import uploaded
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -101,7 +102,7 @@ class Stack:
 
     def images(self, projections: np.ndarray) -> Any:
         """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
-        return on_device(np.ascontiguousarray(projections, np.float32).transpose(0, 2, 1))
+        return uploaded(np.asarray(projections, np.float32).transpose(0, 2, 1).ravel())
 
     def select(self, images: Any, views: Views) -> Any:
         """The images of the views `views` out of those of all views."""
@@ -162,17 +163,6 @@ class Gathered(Stack, ABC):
 
         A sum is a list; with `ones`, its second entry is A^T 1.
         """
-
-
-def on_device(values: np.ndarray) -> Any:
-    """A flat copy, mi.Float.
-
-    By a gather, since a direct read would compile the alignment of NumPy's memory into the kernel. Dr.Jit would drop the gather
-    without the opaque zero.
-    """
-    out = dr.gather(mi.Float, mi.Float(values.ravel()), dr.arange(mi.UInt, values.size) + dr.opaque(mi.UInt, 0))
-    dr.eval(out)
-    return out
 
 
 def lanes(size: tuple[int, int, int], run: int) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], int]:

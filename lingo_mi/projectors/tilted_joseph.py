@@ -16,7 +16,8 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import view_table
-from lingo_mi.projectors.stack import Gathered, hat, lanes, on_device, sampled, span
+from lingo_mi.projectors.stack import Gathered, hat, lanes, sampled, span
+from lingo_mi.projectors.upload import uploaded
 
 RAY = 21  # floats per view of `ray_table`
 RUN = 2  # voxels per lane of the transpose
@@ -72,8 +73,8 @@ class TiltedJoseph(Gathered):
         return out
 
     def _place(self, geometry):
-        self.rays = on_device(ray_table(geometry))
-        self.matrices = on_device(geometry.voxel_matrices().astype(np.float32))
+        self.rays = uploaded(ray_table(geometry).ravel())
+        self.matrices = uploaded(geometry.voxel_matrices().ravel())
 
     def _integrate(self, volume, view, u, v):
         return _integrate(volume, self.size, _Ray.through(self.rays, view, u, v))

@@ -131,7 +131,8 @@ def import_raw(
     out = out.binned(options.binning).subset(chosen)
     if not _grid_given(geometry):
         out = _own_grid(out)
-    require_room(5 * len(chosen) * float(np.prod(out.nDetector)), path)
+    # Line integrals and their mask, and the scan's copy of them without invalid pixels.
+    require_room(9 * len(chosen) * float(np.prod(out.nDetector)), path)
     p = np.zeros((len(chosen), *out.nDetector), np.float32)
     valid = np.zeros(p.shape, bool)
     levels, black, above = np.ones(len(chosen)), [], []
@@ -255,6 +256,14 @@ def _grid_given(geometry):
     return suffix in ('.yml', '.yaml') and load_yaml(geometry).get('nVoxel') is not None
 
 
+def _same(nDetector, shape):
+    """Whether a geometry file's nDetector, two numbers or one for both, is this shape."""
+    try:
+        return np.array_equal(np.broadcast_to(nDetector, 2), shape)
+    except ValueError:  # of another length, or lists of several
+        return False
+
+
 def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, float | None, tuple[int, int]]:
     """The geometry of whole frames, Nikon's white level, and the steps (1 or -1) that put rows and columns in its order."""
     n, shape = len(frames), frames.shape
@@ -262,7 +271,7 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
     if options.angles is not None:
         listed = isinstance(options.angles, str | PathLike)
         try:
-            angles = read_numbers(options.angles) if listed else np.asarray(options.angles, float)
+            angles = read_numbers(options.angles) if listed else np.atleast_1d(np.asarray(options.angles, float))
         except (TypeError, ValueError):
             raise InputError('angles must be a list of numbers, in degrees, or the name of a file of them') from None
     if angles is not None and len(angles) != n:
@@ -296,7 +305,7 @@ def _geometry(source, options, recorded, frames: Frames) -> tuple[Geometry, floa
     else:
         raise InputError(f'{path}: is no geometry file; give .yml, .xtekct or .xml (RTK)')
     values.setdefault('nDetector', list(shape))
-    if not np.array_equal(np.broadcast_to(values['nDetector'], 2), shape):
+    if not _same(values['nDetector'], shape):
         raise InputError(f'{path}: nDetector is {values["nDetector"]}, but the frames have {list(shape)} pixels (v, u)')
     if values.get('nVoxel') is None:
         for name in 'dVoxel', 'sVoxel':

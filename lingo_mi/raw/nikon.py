@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.errors import InputError, shown
 from lingo_mi.file_access import one_line, reading
 from lingo_mi.geometry.limits import MOST_VIEWS
 
@@ -74,19 +74,27 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
 def read_numbers(path: PathLike | str) -> np.ndarray:
     """Numbers [n] of a text file: one a line, or the second column, after the number of the view, as angles in Nikon's .ang.
 
-    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left.
+    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left, and for a line that
+    goes on with something else.
     """
     found = []
     with reading(path):
         lines = Path(path).read_text(encoding='utf-8', errors='replace').splitlines()
-    for line in lines:
-        cells = line.replace(':', ' ').replace(',', ' ').replace(';', ' ').split()
+    for number, line in enumerate(lines, 1):
+        cells = line.replace(':', ' ').replace(',', ' ').replace(';', ' ').split()[:2]  # times may follow
         try:
-            numbers = [float(cell) for cell in cells]
+            found += [float(cell) for cell in cells][-1:]
         except ValueError:
-            continue
-        if numbers:  # number and angle; further columns, such as times, follow
-            found.append(numbers[min(1, len(numbers) - 1)])
+            if _is_number(cells[0]):
+                raise InputError(f'{path}: line {number} has {shown(cells[1])} where a number must be') from None
     if not found or not np.isfinite(found).all():
         raise InputError(f'{path}: holds no numbers; write one a line')
     return np.array(found)
+
+
+def _is_number(text):
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from lingo_mi import notebook
 from lingo_mi.arrays import as_numpy, short_repr
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path, writing
+from lingo_mi.file_access import as_path, new_file, writing
 from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.geometry.base import Geometry
@@ -77,9 +76,7 @@ class Reconstruction:
         """
         path, geometry = as_path('path', path), self.geometry
         with writing(path):
-            if path.exists() and not force:
-                raise InputError(f'{path}: exists already; give force=True to replace it')
-            path.parent.mkdir(parents=True, exist_ok=True)
+            new_file(path, force)
             if path.name.endswith(ZARR):
                 write_slabs(path, geometry, (self.volume[:, :, a:b] for a, b in geometry.slabs(THICKNESS)))
             else:

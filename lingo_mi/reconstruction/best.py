@@ -18,7 +18,7 @@ from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstructio
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.held_out import Score, Trial, Watch, split
 from lingo_mi.reconstruction.parameters import check_counts
-from lingo_mi.reconstruction.refined import Refined, structure
+from lingo_mi.reconstruction.refined import Refined, means, structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 
@@ -225,8 +225,3 @@ def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
 def _parts(volume: np.ndarray, finer: int) -> np.ndarray:
     """A volume on `finer` times smaller voxels, interpolated linearly."""
     return volume if finer == 1 else np.asarray(ndimage.zoom(volume, finer, order=1, mode='nearest', grid_mode=True))
-
-
-def means(volume: np.ndarray, finer: int) -> np.ndarray:
-    """The means over `finer` voxels along each side."""
-    return volume.reshape([n for count in volume.shape for n in (count // finer, finer)]).mean((1, 3, 5))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from math import prod
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -27,8 +28,9 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.preconditions import require_circle
-from lingo_mi.reconstruction.rectify import rectified
+from lingo_mi.reconstruction.rectify import rectified, rectified_geometry
 from lingo_mi.scan import Scan
+from lingo_mi.scene.checks import check_memory
 
 fft: Any = scipy.fft  # untyped: its functions look like those that dispatch them
 
@@ -133,23 +135,20 @@ def _lacking(geometry: CircularGeometry) -> int:
     return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
 
 
-def extended(scan: Scan) -> Scan:
-    """A scan on a closed circle, padded with columns of zeros on the panel's shorter side, so that the panel is symmetric.
-
-    Filtering spreads measured values into these columns. Any other scan is returned unchanged.
+def extended(geometry: CircularGeometry) -> tuple[CircularGeometry, tuple[int, int]]:
+    """A geometry whose panel is symmetric, and the columns to add on either side of the real one: on a closed circle, on the
+    shorter side. Filtering spreads measured values into these columns. Any other geometry is returned unchanged.
     """
-    geometry = require_circle(scan, NAME)
     lacking = _lacking(geometry)
     if lacking == 0:
-        return scan
+        return geometry, (0, 0)
     (n_v, n_u), (off_v, off_u), side = geometry.nDetector, geometry.offDetector, np.sign(geometry.offDetector[1])
     wider = replace(
         geometry,
         nDetector=(n_v, n_u + lacking),
         offDetector=(off_v, off_u - side * lacking * geometry.dDetector[1] / 2),
     )
-    columns = (lacking, 0) if side > 0 else (0, lacking)
-    return Scan(wider, np.pad(scan.projections, ((0, 0), (0, 0), columns)))
+    return wider, (lacking, 0) if side > 0 else (0, lacking)
 
 
 def filtered(projections: np.ndarray, geometry: CircularGeometry, window: str = 'ram-lak') -> np.ndarray:
@@ -244,7 +243,7 @@ class FDK(Algorithm):
         projections, geometry = _weighted(scan)
 
         def images(first):
-            return filtered(projections[first : first + BATCH], geometry, self.filter).transpose(0, 2, 1)
+            return filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
 
         volume = _backprojected(geometry, images, progress)
         return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
@@ -254,17 +253,19 @@ class FDK(Algorithm):
 
         progress   called as progress(views done in all slabs, views of all slabs, None)
 
-        Takes memory for three sets of projections and for three slabs, however large the volume. Raises InputError as `run`.
+        Takes memory for two sets of projections and for three slabs, however large the volume. Raises InputError as `run`, and
+        for too little memory.
 
             for slab in FDK().slabs(scan, 64):
                 ...
         """
+        parts = scan.geometry.slabs(thickness)
+        check_memory(scan.geometry.slab(*parts[0]), needed=_slab_memory(scan, parts[0][1]))
         projections, geometry = _weighted(scan)
-        n, parts = len(geometry), geometry.slabs(thickness)
+        n = len(geometry)
         found = np.empty((n, *geometry.nDetector[::-1]), np.float32)  # filtered once, for all slabs
         for first in range(0, n, BATCH):
-            some = filtered(projections[first : first + BATCH], geometry, self.filter)
-            found[first : first + BATCH] = some.transpose(0, 2, 1)
+            found[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
         del projections
         for k, part in enumerate(parts):
 
@@ -280,12 +281,29 @@ class FDK(Algorithm):
         return len(scan) * len(scan.geometry.slabs(thickness))
 
 
-def _weighted(scan: Scan) -> tuple[np.ndarray, CircularGeometry]:
-    """Projections on an upright panel, rays weighted by how often they were measured; and their geometry."""
+def _slab_memory(scan: Scan, thickness: int) -> float:
+    """Peak memory of `FDK.slabs`, bytes: three slabs, the scan, its upright panel where that is another, all filtered views."""
+    level = rectified_geometry(scan.geometry, NAME)
+    pixels = 0 if level is scan.geometry else prod(level.nDetector)
+    pixels += prod(scan.geometry.nDetector) + prod(extended(level)[0].nDetector)
+    return 4 * (3 * prod(scan.geometry.nVoxel[:2]) * thickness + (len(scan) + 2 * BATCH) * pixels)
+
+
+def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry]:
+    """Projections on an upright panel, rays weighted by how often they were measured, and their geometry.
+
+    The projections are a function of the first of `BATCH` views, for memory.
+    """
     level = rectified(scan, NAME)
-    rays = ray_weights(require_circle(level, NAME))[:, None].astype(np.float32)
-    level = extended(Scan(level.geometry, level.projections * rays))
-    return level.projections, require_circle(level, NAME)
+    circle = require_circle(level, NAME)
+    rays = np.broadcast_to(ray_weights(circle)[:, None].astype(np.float32), (len(circle), 1, circle.nDetector[1]))
+    geometry, columns = extended(circle)
+
+    def projections(first):
+        some = slice(first, first + BATCH)
+        return np.pad(level.projections[some] * rays[some], ((0, 0), (0, 0), columns))
+
+    return projections, geometry
 
 
 def _backprojected(

@@ -5,12 +5,13 @@ from __future__ import annotations
 from math import prod
 from typing import NamedTuple
 
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.reconstruction.rectify import rectified_geometry
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 
 
 class Need(NamedTuple):
-    """volumes       peak of work on volumes, in volumes
+    """volumes       peak of work on volumes, in volumes. One of them is the caller's: a start, or the truth
     wide_pixels   the same if rays leave voxels out
     projections   peak of work on projections, in sets of all projections
     """
@@ -21,7 +22,7 @@ class Need(NamedTuple):
 
 
 NEEDS = {  # by the algorithms' names
-    'fdk': Need(3.4, 3.4, 2.5),
+    'fdk': Need(3.4, 3.4, 1.2),
     'sart': Need(4.6, 8.7, 4.2),
     'os-sart': Need(3.7, 7.7, 4.8),
     'sirt': Need(3.7, 7.7, 6.3),
@@ -32,10 +33,13 @@ NEEDS = {  # by the algorithms' names
 }
 
 
-def needed(algorithm: str, geometry: Geometry, views: int, masked: bool = False) -> float:
+def needed(algorithm: str, geometry: Geometry, views: int) -> float:
     """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus two sets of projections)
-    and of work on projections (plus one volume). Invalid pixels (masked) are one more set in both."""
+    and of work on projections (plus one volume). FDK has another set on the upright panel where the real one leans."""
     volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes
-    return max(volumes * volume + 2 * projections, volume + need.projections * projections) + masked * projections
+    level = 0
+    if algorithm == 'fdk' and not isinstance(geometry, CircularGeometry):
+        level = 4 * views * prod(rectified_geometry(geometry, 'FDK').nDetector)
+    return max(volumes * volume + 2 * projections, volume + need.projections * projections) + level

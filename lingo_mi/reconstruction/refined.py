@@ -135,9 +135,7 @@ class Refined(Algorithm):
             weights=structure(volume),
             blur=blur,
         )
-        parts = [n for count in geometry.nVoxel for n in (count, self.finer)]
-        means = found.volume.reshape(parts).mean((1, 3, 5))
-        return Reconstruction(means, found.residuals, time.perf_counter() - began, geometry)
+        return Reconstruction(means(found.volume, self.finer), found.residuals, time.perf_counter() - began, geometry)
 
     def on_measured(self) -> ASDPOCS:
         """The algorithm of the passes over the measured views."""
@@ -183,3 +181,8 @@ def structure(volume: np.ndarray) -> np.ndarray:
     ndimage.gaussian_filter(square, SPREAD, output=square)
     mean = square.mean(dtype=np.float64)
     return np.sqrt(np.maximum(square, FLOOR**2 * mean, out=square)) if mean > 0 else np.ones_like(volume)
+
+
+def means(volume: np.ndarray, finer: int) -> np.ndarray:
+    """The means over `finer` voxels along each side."""
+    return volume.reshape([n for count in volume.shape for n in (count // finer, finer)]).mean((1, 3, 5))

@@ -42,31 +42,40 @@ def reconstruct(
     is not finite.
     """
     views = max(len(scan), len(inputs.get('completed') or ()))
-    check_scan(scan.geometry, algorithm, views, masked=scan.valid is not None)
+    check_scan(scan.geometry, algorithm, views, mask_images(scan))
     require_signal(scan)
     return algorithm.run(scan, start=start, progress=progress, **inputs)
 
 
+def mask_images(scan: Scan) -> int:
+    """Bytes of the images that projectors keep of a scan's invalid pixels."""
+    return 0 if scan.valid is None else 4 * scan.valid.size
+
+
 def check_scan(
-    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, masked: bool = False
+    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, beside: float = 0
 ) -> None:
     """Raises InputError if no ray meets the volume, if the source is inside it, or if memory is too small.
 
     algorithm   to check memory for (None: the least that any algorithm needs)
     views       number of views to reconstruct from (None: the geometry's own)
-    masked      some pixels are invalid, and images of them are kept
+    beside      bytes that are held beside what the algorithm needs, such as `mask_images`
     """
     require_rays(geometry)
-    check_room(geometry, algorithm, views, masked)
+    check_room(geometry, algorithm, views, beside)
 
 
 def check_room(
-    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, masked: bool = False
+    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, beside: float = 0
 ) -> None:
     """Raises InputError if memory or an array is too small; arguments as of `check_scan`."""
     views = views or len(geometry)
-    pixels = views * math.prod(geometry.nDetector) if algorithm is not None and algorithm.name != 'fdk' else 0
-    for number, what in (math.prod(geometry.nVoxel), 'voxels'), (pixels, 'pixels in all views'):
+    grid, pixels = geometry, 0
+    if algorithm is not None:
+        grid = algorithm.grid(geometry)
+        if algorithm.name != 'fdk':
+            pixels = views * math.prod(geometry.nDetector)
+    for number, what in (math.prod(grid.nVoxel), 'voxels'), (pixels, 'pixels in all views'):
         if number >= MOST_ENTRIES:
             raise InputError(
                 f'{number:.4g} {what} are more than an array can hold, 2^32; take larger ones, or slabs (--slab)'
@@ -74,8 +83,7 @@ def check_room(
     if algorithm is None:
         check_memory(geometry, views=views)
     else:
-        grid = algorithm.grid(geometry)
-        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views, masked))
+        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views) + beside)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.arrays import as_numpy
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid_pair import GridPair
@@ -48,16 +49,16 @@ class System:
         self.weights = self.weighed = None
         self.blur = None
         if blur is not None:
-            if len(blur) != 3:
+            if np.shape(blur) != (3,):
                 raise InputError(f'blur must be three standard deviations, along x, y, z, not {blur!r}')
             for deviation in blur:
                 check_bound('blur', deviation)
             if any(blur):
                 self.blur = tuple(blur)
         if weights is not None:
-            if np.min(weights) < 0:
-                raise InputError('the weights of the voxels must not be negative')
             self.weights = self._device(weights, 'weights of the voxels')
+            if dr.min(self.weights)[0] < 0:
+                raise InputError('the weights of the voxels must not be negative')
             self.weighed = evaluated(self.A.forward(self.weights, self.views)[0])
 
     def start(self, volume: ArrayLike | None) -> mi.Float:
@@ -137,7 +138,7 @@ def norm(a: mi.Float) -> float:
 
 def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
     """A volume as float32 [x, y, z]. Raises InputError if it does not fit the geometry or is not finite."""
-    volume = np.ascontiguousarray(volume, np.float32)
+    volume = np.ascontiguousarray(as_numpy(volume, f'the {name}', np.float32))
     if volume.shape != geometry.nVoxel:
         raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
     if not np.isfinite(volume).all():

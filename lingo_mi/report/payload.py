@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.notebook import grey_range
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
 from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, block_means, preview
-from lingo_mi.report.planes import grey_range, planes, richest
+from lingo_mi.report.planes import planes, richest
 
 MOST_PIXELS = 60 * 256**2  # of all held-out views in a page, each of rendered and measured
 VOLUME_BYTES, VIEW_BYTES = 19e6, 6e6  # as text; with libraries, cloud and surfaces a page stays below 30 MB

@@ -51,10 +51,3 @@ def series(history: list[dict], x: str, y: str) -> tuple[np.ndarray, np.ndarray]
     points = np.array(points, float).reshape(-1, 2)
     points = points[np.isfinite(points).all(1)]
     return points[:, 0], points[:, 1]
-
-
-def grey_range(*arrays: Any) -> tuple[float, float]:
-    """A common grey scale: from 0 (or lower) to the 99.9th percentile, both of the last array."""
-    reference = arrays[-1]
-    low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))
-    return low, high if high > low else max(low + 1e-6, *(float(a.max()) for a in arrays))

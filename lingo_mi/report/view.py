@@ -8,8 +8,7 @@ import webbrowser
 from os import PathLike
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path, write_text, writing
+from lingo_mi.file_access import as_path, new_file, write_text, writing
 
 
 class Page:
@@ -33,9 +32,7 @@ class Page:
         """
         path = as_path('path', path)
         with writing(path):
-            if path.exists() and not force:
-                raise InputError(f'{path}: exists already; give force=True to replace it')
-            path.parent.mkdir(parents=True, exist_ok=True)
+            new_file(path, force)
             write_text(path, self.text)
         return path
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path, optional, writing
-from lingo_mi.notebook import window_of
+from lingo_mi.notebook import grey_range
 from lingo_mi.report.planes import plane, richest
 from lingo_mi.results.watch import Snapshot
 
@@ -49,13 +49,13 @@ class EventLog:
         volume = snapshot.volume
         if volume is not None:
             shown = [volume] if snapshot.measured is None else [volume, snapshot.measured[1]]
-            window = window_of(shown[-1])
+            window = grey_range(shown[-1])
             for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
                 index = richest(shown[-1], axis)
                 self._picture(f'slices/{name}', [plane(v, axis, index)[::-1] for v in shown], window)
         if snapshot.test is not None and snapshot.views is not None:
             pair = [snapshot.views[0], snapshot.test.projections[0]]
-            self._picture('views/rendered_measured', pair, window_of(pair[1]))
+            self._picture('views/rendered_measured', pair, grey_range(pair[1]))
 
     def close(self, finished: bool) -> None:
         """See `watch.Watcher`."""

@@ -11,6 +11,7 @@ import numpy as np
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import as_path, parsed_json, reading
 from lingo_mi.files.images import read_exr
+from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.files.volumes import Volume, read_volume
 from lingo_mi.metrics import current_names
 from lingo_mi.output_folder import METRICS, VIEWS, VOLUME, require_together
@@ -56,10 +57,10 @@ def read_stored(path: PathLike | str) -> Stored:
     path = as_path('path', path)
     if path.is_file() or path.name.lower().endswith('.zarr'):
         name = path.name.removesuffix('.gz').removesuffix('.zarr').rsplit('.', 1)[0]
-        beside = path.with_name(f'{name}-error{path.name.removeprefix(name)}')
+        plan, errors = plan_and_error_map(path)
         volume = read_volume(path)
-        of_it = beside.exists() and _planned(path.with_name(f'{name}-plan.json')) in (None, values_digest(volume.data))
-        return Stored(name, volume=volume, error_map=read_volume(beside) if of_it else None)
+        of_it = errors.exists() and _planned(plan) in (None, values_digest(volume.data))
+        return Stored(name, volume=volume, error_map=read_volume(errors) if of_it else None)
     numbers = path / METRICS
     with reading(path, folder=True):
         if not numbers.exists():

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from lingo_mi.errors import brief
-from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.kinds import Model
 from lingo_mi.scan import Scan
 
 EVERY = 1.0  # seconds between two steps that watchers are told of
@@ -31,7 +31,7 @@ class Snapshot:
     numbers    what was measured, by name
     """
 
-    model: CloudModel
+    model: Model
     state: DeviceState
     test: Scan | None
     views: np.ndarray | None

@@ -160,7 +160,7 @@ class Cells:
         """The numbers of a cell, or None where it has not been computed, or its file is damaged or lacks a number."""
         try:
             found = json.loads(self.path(cell).read_text(encoding='utf-8'))
-        except (FileNotFoundError, ValueError):
+        except (OSError, ValueError):
             return None
         needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
         found = metrics.current_names(found) if isinstance(found, dict) else {}

@@ -12,8 +12,9 @@ import pytest
 from helpers.effect_parts import detector, tube
 from helpers.effects import physics
 from helpers.script import FIT, SCENE, fit, run
+from lingo_mi.completion import views
 from lingo_mi.completion.clouds import load_cloud
-from lingo_mi.completion.views import as_corrected, complete, fitted_views, missing_angles, without_effects
+from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
 from lingo_mi.errors import InputError
@@ -227,11 +228,11 @@ def test_refined(scene, dataset, fitted, tmp_path):
     np.testing.assert_array_equal(load(tmp_path / 'm.nii'), then.volume)
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'completed_niter=1', '--start', fitted)
     assert code == 2 and err.count('error') == 1 and 'completed_niter must be 0' in err, err
-    for wrong in ('0', '1000'):  # no voxels, and more than there is memory for
+    for wrong in ('0', '1000'):  # no voxels, and more than an array can hold
         code, _, err = run(
             RECONSTRUCT, scene, '--algorithm', 'refined', '-D', f'finer={wrong}', '--complete', fitted, '--views', 12
         )
-        assert code == 2 and err.count('\n') == 1 and ('finer' if wrong == '0' else 'memory') in err, err
+        assert code == 2 and err.count('\n') == 1 and ('finer' if wrong == '0' else 'array can hold') in err, err
 
 
 # ---- effects ---------------------------------------------------------------------------------------------------------
@@ -304,13 +305,17 @@ def test_measured_views_become_what_is_rendered(dataset, tmp_path):
 
 def test_missing_angles(dataset):
     geometry = dataset.train.geometry
-    np.testing.assert_allclose(np.sort(np.append(circular(5), missing_angles(circular(5), 20, geometry))), circular(20))
-    half = missing_angles(circular(5, 180), 20, geometry)
+
+    def missing_angles(angles, count):
+        return views.missing_angles(replace(geometry, angles=angles), count)
+
+    np.testing.assert_allclose(np.sort(np.append(circular(5), missing_angles(circular(5), 20))), circular(20))
+    half = missing_angles(circular(5, 180), 20)
     np.testing.assert_allclose(np.sort(np.append(circular(5, 180), half)), circular(20, 180))
-    assert len(missing_angles(circular(5), 7, geometry)) == 2
+    assert len(missing_angles(circular(5), 7)) == 2
     limited = np.radians([-30.0, 0, 30])  # no view is rendered outside of what was measured
-    np.testing.assert_allclose(np.degrees(np.sort(missing_angles(limited, 7, geometry))), [-20, -10, 10, 20])
-    np.testing.assert_allclose(np.sort(missing_angles(np.array([0.0]), 4, geometry)), circular(4)[1:])
+    np.testing.assert_allclose(np.degrees(np.sort(missing_angles(limited, 7))), [-20, -10, 10, 20])
+    np.testing.assert_allclose(np.sort(missing_angles(np.array([0.0]), 4)), circular(4)[1:])
 
 
 @pytest.mark.parametrize(

@@ -334,7 +334,22 @@ def test_a_damaged_result(home):
     assert batch(home)[0] == 0
     row = read_list(home / 'list.csv', SHORT)[0]
     assert stored(home / 'out', row)['views'] == 5
+    metrics = home / 'out' / 'a' / METRICS
+    values = json.loads(metrics.read_text())
+    del values['request']['settings']['lambda_gradient']  # of a version without this setting
+    metrics.write_text(json.dumps(values))
+    assert stored(home / 'out', row)['views'] == 5
+    del values['request']['settings']
+    metrics.write_text(json.dumps(values))
+    with pytest.raises(InputError, match='is damaged'):
+        stored(home / 'out', row)
     (home / 'out' / 'a' / 'gaussians.ply').unlink()
+    values['request']['settings'] = {}
+    metrics.write_text(json.dumps(values))
+    with pytest.raises(InputError, match='holds a result of other values of'):
+        stored(home / 'out', row)
+    values['request']['settings'] = row.request()['settings']
+    metrics.write_text(json.dumps(values))
     with pytest.raises(InputError, match=r'gaussians\.ply: is missing'):
         stored(home / 'out', row)
     (home / 'out' / 'a' / METRICS).write_text('{')

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from helpers.poses import to_matrices
 from lingo_mi.errors import InputError
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan, write_scan
@@ -67,7 +68,7 @@ def test_round_trips(tmp_path, mode):
     f = scan_of(mode).rays()
     parallel = mode == 'parallel'
     same_poses(astra.from_vectors(astra.to_vectors(f, SHAPE), SHAPE, parallel), f)
-    back = matrices.from_matrices(matrices.to_matrices(f) * -3.0, SHAPE, STEP, parallel)
+    back = matrices.from_matrices(to_matrices(f) * -3.0, SHAPE, STEP, parallel)
     np.testing.assert_allclose(pixels(back), pixels(f), atol=1e-9)
     if not parallel:  # the panel of a parallel beam may stand anywhere along it
         same_poses(back, f)
@@ -85,7 +86,7 @@ def test_files_of_poses(tmp_path, name):
     if name == 'g.xml':
         rtk.write(path, f, SHAPE)
     elif name == 'm.npy':
-        np.save(path, matrices.to_matrices(f))
+        np.save(path, to_matrices(f))
     elif name == 'p.npy':
         np.save(path, vectors)
     else:
@@ -116,14 +117,14 @@ def test_matrices_by_hand():
     circle = CircularGeometry(DSO=300.0, DSD=450.0, nDetector=SHAPE, dDetector=STEP, **GRID, angles=[np.pi / 4])
     for sign in (1, -1):
         same_poses(matrices.from_matrices([sign * P], SHAPE, STEP, False), circle.rays())
-    np.testing.assert_allclose(matrices.to_matrices(circle.rays())[0] * 450, P, atol=1e-9)
+    np.testing.assert_allclose(to_matrices(circle.rays())[0] * 450, P, atol=1e-9)
 
 
 @pytest.mark.parametrize('step', [0.01, 1.0, 100.0])
 def test_a_matrix_is_parallel_to_rounding(step):
     """Its last row, by the other rows' largest entry: one per pixel's size."""
     g = CircularGeometry(DSO=0.0, DSD=0.0, nDetector=SHAPE, dDetector=step, **GRID, angles=[0.0], mode='parallel')
-    P = matrices.to_matrices(g.rays())
+    P = to_matrices(g.rays())
     P[0, 2, 0] = 0.5e-9 / step
     same_poses(matrices.from_matrices(P, SHAPE, (step, step), True), g.rays(), 1e-7 * step)
     P[0, 2, 0] = 2e-9 / step
@@ -291,7 +292,7 @@ def test_poses_in_yaml(tmp_path):
     same_poses(
         read_scan(npy(tmp_path, poses=astra.to_vectors(f, SHAPE).tolist(), dDetector=...)).train.geometry.rays(), f
     )
-    np.save(tmp_path / 'matrices.npy', matrices.to_matrices(f))
+    np.save(tmp_path / 'matrices.npy', to_matrices(f))
     same_poses(read_scan(npy(tmp_path, poses='matrices.npy')).train.geometry.rays(), f)
     # Rows of RTK's images run up: the poses are given with the rows down, and the array is turned round to match.
     rtk.write(tmp_path / 'g.xml', f, SHAPE)
@@ -399,7 +400,7 @@ def test_bad_files_of_poses(tmp_path, name, content, match):
 
 
 def test_bad_matrices(tmp_path):
-    P = matrices.to_matrices(scan_of().rays())
+    P = to_matrices(scan_of().rays())
     for bad, parallel, match in (
         (P[:, :2], False, r'\[view, 3, 4\]'),
         (P * np.nan, False, 'NaN'),

@@ -89,7 +89,7 @@ def test_ome_zarr_is_valid(tmp_path):
 def test_bad_slabs(tmp_path, name):
     g, v = geometry((70, 6, 11)), noise((70, 6, 11))
     for bad in (slabs(v[:, :, :10], 4), slabs(v[:, :5], 4), slabs(np.concatenate([v, v], 2), 6), slabs(v * np.nan, 4)):
-        with pytest.raises(InputError):
+        with pytest.raises(InputError, match='slab|NaN'):
             write_slabs(tmp_path / name, g, bad)
         assert not any(tmp_path.iterdir())
     with pytest.raises(InputError, match='NIfTI'):
@@ -158,6 +158,9 @@ def test_a_scan_whose_volume_is_larger_than_memory(tmp_path, monkeypatch):
     for work in lambda: lm.fit(scan), lambda: lm.reconstruct(scan, lm.FDK()):
         with pytest.raises(InputError, match='of memory'):
             work()
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 4e5)
+    with pytest.raises(InputError, match='of memory'):
+        next(lm.FDK().slabs(scan, 4))
 
 
 def test_the_command(tmp_path):

@@ -105,6 +105,7 @@ def test_bad_values(tmp_path):
         (HU, 'mu_water must be', {'mu_water': 0}),
         (COUNTS, 'spacing must be', {'spacing': (1, 2)}),
         (COUNTS, 'spacing must be', {'spacing': 0}),
+        (COUNTS, 'spacing must be', {'spacing': 'a'}),
     ):
         np.save(tmp_path / 'v.npy', array)
         refused(tmp_path / 'v.npy', match, **options)

@@ -1,6 +1,7 @@
 """A response of the detector found together with the cloud: recovery, checkpoints, held-out views, and nothing when off."""
 
 import json
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -83,6 +84,15 @@ def test_checkpoints_keep_the_response(tmp_path, sums_in_order):
         np.testing.assert_array_equal(again.model.response.arrays()[name], values)
         np.testing.assert_array_equal(loaded.model.response.arrays()[name], values)
     assert whole.model.response.parts[-1].values.any()
+
+
+def test_dead_columns_of_a_fit_without_coarse_views():
+    """Binned by two, no pixel of such a scan is valid."""
+    scan, _ = measured(true_views(4), air=[[0.05], [0.03]])
+    valid = np.ones(scan.projections.shape, bool)
+    valid[..., ::2] = False
+    found = run(replace(scan, valid=valid), SHORT.changed(iterations=20, **ALL), some_points(scan.geometry), seed=3)
+    assert np.isfinite(found.render(scan.geometry)).all()
 
 
 def test_held_out_views_and_files_know_the_response(tmp_path):

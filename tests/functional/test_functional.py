@@ -407,7 +407,9 @@ def test_results_larger_than_memory(count):
             function(*GOOD, geometry)
 
 
-@pytest.mark.parametrize('values', [None, 'abc', [['a', 'b', 'c']] * 4, [[1, 2], [3]]])
+@pytest.mark.parametrize(
+    'values', [None, 'abc', [['a', 'b', 'c']] * 4, [['1', '2', '3']] * 4, [[1j, 2, 3]] * 4, [[1, 2], [3]]]
+)
 def test_what_is_no_array(values):
     with pytest.raises(InputError, match='means'):
         project(values, *GOOD[1:], scan())

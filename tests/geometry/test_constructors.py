@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from helpers.poses import to_matrices
 from lingo_mi.errors import InputError
 from lingo_mi.geometry import astra, rtk
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
-from lingo_mi.geometry.matrices import from_matrices, to_matrices
+from lingo_mi.geometry.matrices import from_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, scanner_rays
 

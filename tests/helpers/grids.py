@@ -1,7 +1,12 @@
 """What tests share with grid projector."""
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors.grid import scatter, view_table, view_walk, whole_box
 
 
 def scan(mode='cone', n=4, **changes):
@@ -18,3 +23,14 @@ def scan(mode='cone', n=4, **changes):
         offDetector=(2.0, -4.0),
     )
     return CircularGeometry(**{**settings, **changes})
+
+
+def backproject(projections, geometry):
+    """The transpose of `grid.project`, view by view: float32 [x, y, z], in units of the projections [view, v, u] times mm."""
+    n_v, n_u = geometry.nDetector
+    target = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    for image, row in zip(np.asarray(projections, np.float32), view_table(geometry)):
+        walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))
+        scatter(target, length * mi.Float(image.T.ravel()), geometry.nVoxel, walk)
+        dr.eval(target)
+    return target.numpy().reshape(geometry.nVoxel)

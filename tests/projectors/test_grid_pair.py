@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
-from helpers.grids import scan
+from helpers.grids import backproject, scan
 from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular, helix
-from lingo_mi.projectors.grid import backproject, project
+from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.tilted_joseph import TiltedJoseph
@@ -119,5 +119,5 @@ def test_kernels_serve_any_views():
         ALGORITHMS[algorithm](niter=2).run(measured)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            ALGORITHMS[algorithm](niter=3).run(measured)
+            ALGORITHMS[algorithm](niter=3).run(measured.subset([0, 2, 3]))
             assert all(k['cache_hit'] for k in dr.kernel_history([dr.KernelType.JIT]))

@@ -222,6 +222,7 @@ def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
         (dict(views=(9, None, 1)), 'no view is left of 6'),
         (dict(exposure=[1, 2]), 'one for each of 6 views'),
         (dict(angles=[1.0, 2.0]), 'there are 2 angles for 6 views'),
+        (dict(angles=5.0), 'there are 1 angles for 6 views'),
         (dict(bining=2), "no option 'bining', did you mean binning"),
     ],
 )
@@ -485,6 +486,14 @@ def test_a_square_panel_in_one_number(tmp_path, scan_yml):
     np.save(tmp_path / 'v.npy', np.full((6, 5, 5), 100.0, np.float32))
     scan_yml.write_text(scan_yml.read_text() + 'nDetector: 5\n')
     assert load(tmp_path / 'v.npy', scan_yml, i0=100.0).geometry.nDetector == (5, 5)
+
+
+@pytest.mark.parametrize('value', ['[1, 2, 3]', '[[1], [1, 2]]', '[5, 4]', 'wide'])
+def test_a_panel_of_another_size(tmp_path, scan_yml, value):
+    np.save(tmp_path / 'v.npy', np.full((6, 5, 5), 100.0, np.float32))
+    scan_yml.write_text(scan_yml.read_text() + f'nDetector: {value}\n')
+    with pytest.raises(InputError, match='nDetector is .*, but the frames have'):
+        load(tmp_path / 'v.npy', scan_yml, i0=100.0)
 
 
 def test_colours_are_refused(tmp_path, scan_yml):

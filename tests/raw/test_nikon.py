@@ -89,6 +89,11 @@ def test_angles(tmp_path):
     assert read_numbers(path).tolist() == [0.5, 1.5]
     path.write_text('0.5\n1.5\n2.5')
     assert read_numbers(path).tolist() == [0.5, 1.5, 2.5]
+    path.write_text('1 0.5 10:30:00\n2 1.5 late\n')
+    assert read_numbers(path).tolist() == [0.5, 1.5]
+    path.write_text('1 0.5\n2 lost\n')
+    with pytest.raises(lm.InputError, match="line 2 has 'lost' where a number must be"):
+        read_numbers(path)
     path.write_text('none')
     with pytest.raises(lm.InputError, match='holds no numbers'):
         read_numbers(path)

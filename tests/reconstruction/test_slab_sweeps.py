@@ -176,7 +176,7 @@ def test_spoiled_files(scan, tmp_path):
 def test_bad_input(scan, tmp_path, monkeypatch):
     with pytest.raises(InputError, match='leave out tol'):
         SART(tol=0.1).slabs(scan, 8, tmp_path / 'work')
-    with pytest.raises(InputError, match='a slab has one slice or more, not 0'):
+    with pytest.raises(InputError, match='thickness of a slab, in slices, must be a whole number from 1 on, not 0'):
         next(SART().slabs(scan, 0, tmp_path / 'work'))
     monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 1000)
     with pytest.raises(InputError, match='need at least .* of memory'):

@@ -11,6 +11,7 @@ from helpers.browser import browser, opened, readout
 from helpers.script import run
 from lingo_mi.errors import InputError
 from lingo_mi.files.images import write_exr
+from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.results.compare import compare_page
 from lingo_mi.results.stored import read_stored
@@ -64,6 +65,12 @@ def test_a_map_of_errors_is_that_of_its_volume(tmp_path):
     assert read_stored(tmp_path / 'v.nii.gz').error_map is not None
     plan.write_text(json.dumps(dict(volume=values_digest(2 * volume))))
     assert read_stored(tmp_path / 'v.nii.gz').error_map is None
+
+
+@pytest.mark.parametrize('ending', ['.nii.gz', '.nii', '.ome.zarr', '.zarr'])
+def test_the_names_beside_a_volume(ending):
+    plan, errors = plan_and_error_map(Path(f'of/a.b{ending}'))
+    assert (str(plan), str(errors)) == ('of/a.b-plan.json', f'of/a.b-error{ending}')
 
 
 def test_numbers_and_what_differs(pair):

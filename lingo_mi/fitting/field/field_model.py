@@ -77,7 +77,8 @@ class FieldModel:
                 out[i, pixels] = self.integrals(state.values, on_device, x, y, 0.5).numpy()
             if progress:
                 progress(i + 1, len(geometry))
-        return out.reshape(len(geometry), height, width) * np.float32(self.unit / g.scale)
+        out *= np.float32(self.unit / g.scale)
+        return out.reshape(len(geometry), height, width)
 
     def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
         """What the scan's detector is expected to measure in the views of a geometry: `render`."""
