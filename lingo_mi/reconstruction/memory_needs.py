@@ -22,7 +22,7 @@ class Need(NamedTuple):
 
 
 NEEDS = {  # by the algorithms' names
-    'fdk': Need(3.4, 3.4, 1.2),
+    'fdk': Need(3.4, 3.4, 1.5),
     'sart': Need(4.6, 8.7, 4.2),
     'os-sart': Need(3.7, 7.7, 4.8),
     'sirt': Need(3.7, 7.7, 6.3),
@@ -34,12 +34,14 @@ NEEDS = {  # by the algorithms' names
 
 
 def needed(algorithm: str, geometry: Geometry, views: int) -> float:
-    """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus two sets of projections)
-    and of work on projections (plus one volume). FDK has another set on the upright panel where the real one leans."""
+    """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus at most two sets of
+    projections) and of work on projections (plus one volume). FDK has another set on the upright panel where the real one
+    leans."""
     volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes
     level = 0
     if algorithm == 'fdk' and not isinstance(geometry, CircularGeometry):
         level = 4 * views * prod(rectified_geometry(geometry, 'FDK').nDetector)
-    return max(volumes * volume + 2 * projections, volume + need.projections * projections) + level
+    sets = need.projections
+    return max(volumes * volume + min(sets, 2) * projections, volume + sets * projections) + level
