@@ -84,7 +84,11 @@ def _replayed(*arrays, **settled):
     dr.eval(chosen, place)
     dr.enable_grad(chosen)
     loss = _differentiated(chosen, low, step, factor, **settled)
-    return loss, [dr.gather(type(x), dr.grad(x), place, near) for x in chosen]
+    # Each gather alone would compute all derivatives. One kernel would need so many registers that few warps run at once.
+    gradients = centre, scale, rotation, density = dr.grad(chosen)
+    dr.eval(rotation)
+    dr.eval(centre, scale, density)
+    return loss, [dr.gather(type(x), x, place, near) for x in gradients]
 
 
 _REPLAY = Replay(_replayed)
