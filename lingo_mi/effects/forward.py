@@ -166,8 +166,8 @@ class Effects:
         if self.tube and self.tube.hardens:
             bands = self.tube.signal(self.tube.fitted()[:1], self.response)
             projections = np.empty_like(projections)
-            for out, view in zip(projections, scan.projections):  # view by view, for memory
-                out[:] = bands.precorrected(view)
+            for i, view in enumerate(scan.projections):  # one by one, for memory
+                projections[i] = bands.precorrected(view)
         return replace(scan, projections=projections, effects=None)
 
     def measured(self, integrals: Any, view: View, seed: int) -> Any:

@@ -203,8 +203,8 @@ def _line_integrals(projections, values, where, projections_path):
             'so it has no logarithm; mask or repair dead pixels first'
         )
     out = np.empty(projections.shape, np.float32)
-    for view, intensity in zip(out, projections):  # view by view, for memory
-        view[:] = np.log(i0 / intensity.astype(float))
+    for i, view in enumerate(projections):  # one by one, for memory
+        out[i] = np.log(i0 / view.astype(float))
     return out
 
 
