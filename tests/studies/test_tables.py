@@ -348,7 +348,7 @@ def test_recipes():
         (['views', '--views', '26'], '25'),
         (['views', '--views', '0'], '25'),
         (['ct', '--iterations', '0'], 'at least 1'),
-        (['views', '--seed', '-1'], 'negative'),
+        (['views', '--seed', '-1'], 'seed must be a whole number from 0 on'),
         (['figures'], 'invalid choice'),
         (['views', '--methods', 'nerf'], 'no such recipe'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
