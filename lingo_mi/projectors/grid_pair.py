@@ -27,12 +27,12 @@ class GridPair(Stack):
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry, valid)
-        self._rays = uploaded(view_table(geometry).ravel())
+        self._rays = uploaded(view_table(geometry))
 
     def of_slab(self, slab: Geometry) -> GridPair:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out._rays = slab, slab.nVoxel, uploaded(view_table(slab).ravel())
+        out.geometry, out.size, out._rays = slab, slab.nVoxel, uploaded(view_table(slab))
         return out
 
     def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:

@@ -130,8 +130,8 @@ class Joseph(Gathered):
             )
         rows = int(_rows_of_voxel(geometry))
         self.margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
-        self.columns, self.rows = (uploaded(table(geometry).ravel()) for table in (column_table, row_table))
-        self.matrices = uploaded(self._column_matrix().ravel())
+        self.columns, self.rows = (uploaded(table(geometry)) for table in (column_table, row_table))
+        self.matrices = uploaded(self._column_matrix())
 
     @classmethod
     def serves(cls, geometry: Geometry) -> bool:
@@ -141,7 +141,7 @@ class Joseph(Gathered):
     def of_slab(self, slab: Geometry) -> Joseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out.rows = slab, slab.nVoxel, uploaded(row_table(slab).ravel())
+        out.geometry, out.size, out.rows = slab, slab.nVoxel, uploaded(row_table(slab))
         return out
 
     def _column_matrix(self):

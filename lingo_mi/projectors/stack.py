@@ -102,7 +102,7 @@ class Stack:
 
     def images(self, projections: np.ndarray) -> Any:
         """Projections [view, v, u] as device images, mi.Float [view, u, v]."""
-        return uploaded(np.asarray(projections, np.float32).transpose(0, 2, 1).ravel())
+        return uploaded(np.asarray(projections).transpose(0, 2, 1))
 
     def select(self, images: Any, views: Views) -> Any:
         """The images of the views `views` out of those of all views."""

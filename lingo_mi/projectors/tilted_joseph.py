@@ -73,8 +73,8 @@ class TiltedJoseph(Gathered):
         return out
 
     def _place(self, geometry):
-        self.rays = uploaded(ray_table(geometry).ravel())
-        self.matrices = uploaded(geometry.voxel_matrices().ravel())
+        self.rays = uploaded(ray_table(geometry))
+        self.matrices = uploaded(geometry.voxel_matrices())
 
     def _integrate(self, volume, view, u, v):
         return _integrate(volume, self.size, _Ray.through(self.rays, view, u, v))

@@ -11,15 +11,15 @@ from numpy.typing import ArrayLike
 
 
 def uploaded(values: np.ndarray) -> Any:
-    """A copy of NumPy's values, Float [N], that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
+    """A copy of NumPy's values, of any shape, as Float [N] that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
 
     Dr.Jit uses NumPy's memory in place and compiles its alignment into kernels. Without this copy, each densification would
     compile new ones.
     """
-    room = np.empty(len(values) + 16, np.float32)
+    room = np.empty(values.size + 16, np.float32)
     start = -room.ctypes.data % 64 // 4
-    out = room[start : start + len(values)]
-    out[:] = values
+    out = room[start : start + values.size]
+    out.reshape(values.shape)[...] = values
     out = mi.Float(out)
     dr.make_opaque(out)  # a single value would otherwise become a literal, compiled into kernels
     return out
@@ -27,4 +27,4 @@ def uploaded(values: np.ndarray) -> Any:
 
 def uploaded_tensor(values: ArrayLike) -> Any:
     """A copy of NumPy's values of any shape, TensorXf."""
-    return mi.TensorXf(uploaded(np.ravel(values)), np.shape(values))
+    return mi.TensorXf(uploaded(np.asarray(values)), np.shape(values))
