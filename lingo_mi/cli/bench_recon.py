@@ -3,6 +3,7 @@
     lingo-mi bench-recon
     lingo-mi bench-recon --size 256 --views 100 --json bench_recon.json
     lingo-mi bench-recon --size 128 --tilt 5
+    lingo-mi bench-recon --variant cuda_ad_mono
 
 The Shepp-Logan phantom on SIZE^3 voxels, VIEWS views of SIZE x SIZE pixels over a full turn. In every repeat each operation
 is run by each package in turn, on the same cores, from arrays in memory to an array in memory; medians are printed, the first
@@ -11,6 +12,8 @@ relative RMS difference from our result, without the outermost voxels, whose out
 where methods differ: diffct projects voxels that are constant (Siddon), ours and RTK's interpolate (Joseph); RTK's SART
 backprojects by interpolating the panel, ours by the matched transpose. `exact` is our own projector without Joseph's error, and
 its transpose: what accuracy costs in time.
+
+On a GPU (--variant) ours compute there, the other packages still on the CPU.
 
 RTK comes with `pip install '.[reference]'` in a checkout, diffct with `pip install diffct torch`; what is not installed is
 left out.
@@ -42,6 +45,9 @@ def arguments() -> argparse.Namespace:
         help="of the axis of rotation against the volume's (default: 0)",
     )
     p.add_argument('--json', type=Path, metavar='F', help='write the numbers there')
+    p.add_argument(
+        '--variant', metavar='V', default='llvm_ad_mono', help='Mitsuba variant of ours (default: llvm_ad_mono)'
+    )
     return p.parse_args()
 
 
@@ -53,7 +59,7 @@ def main() -> None:
         raise InputError('--size must be at least 8, --views and --repeats at least 1')
     if not abs(args.tilt) <= 90:
         raise InputError(f'--tilt must be an angle from -90 to 90 degrees, not {args.tilt:g}')
-    use_variant('llvm_ad_mono')
+    use_variant(args.variant)
     from lingo_mi.studies.benchmarks.reconstruction import describe, measure
 
     result = measure(args.size, args.views, args.repeats, args.tilt)

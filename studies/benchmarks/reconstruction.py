@@ -62,7 +62,10 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
             say(f'{name}: not installed, left out')
         else:
             packages[name] = functions
-    return dict(size=size, views=views, tilt=tilt, cores=cores, repeats=repeats, operations=compare(packages, repeats))
+    measured_on = dict(variant=mi.variant(), cores=cores)
+    return dict(
+        size=size, views=views, tilt=tilt, **measured_on, repeats=repeats, operations=compare(packages, repeats)
+    )
 
 
 def describe(result: dict) -> Iterator[str]:
@@ -70,7 +73,7 @@ def describe(result: dict) -> Iterator[str]:
     side = result['size']
     yield (
         f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, tilted by {result["tilt"]:g} degrees, '
-        f'{result["cores"]} cores, medians of {result["repeats"]} repeats'
+        f'{result["variant"]}, {result["cores"]} cores, medians of {result["repeats"]} repeats'
     )
     for operation, found in result['operations'].items():
         parts = [f'{operation:9} ours {found["ours"]["seconds"]:8.3f} s']

@@ -1,5 +1,6 @@
 """Every bad input gives one line that starts with `error:`, exit code 2, and nothing half-made."""
 
+import os
 import pickle
 import subprocess
 import sys
@@ -368,7 +369,7 @@ def test_too_many_views_of_a_file(scene, scan, tmp_path):
 def test_without_llvm(scene, tmp_path):
     done = subprocess.run(
         [sys.executable, str(FIT), str(scene), '--variant', 'llvm_ad_mono', '--out', str(tmp_path / 'new')],
-        env=dict(PATH='', DRJIT_LIBLLVM_PATH='/nonexistent/libLLVM.so'),
+        env=os.environ | dict(PATH='', DRJIT_LIBLLVM_PATH='/nonexistent/libLLVM.so'),
         capture_output=True,
         text=True,
     )

@@ -11,6 +11,7 @@ import pytest
 
 from helpers.cohorts import BATCH, events, results
 from helpers.dask_cluster import cluster, wait_until
+from helpers.same import fits_alike
 from helpers.script import SCENE, run
 from lingo_mi.output_folder import CHECKPOINT, METRICS
 
@@ -65,8 +66,7 @@ def require_same(home, name, address):
     code, _, err = run(BATCH, home / 'one.csv', '--out', home / 'alone', '--cluster', address, '--threads', '1')
     assert code == 0, err
     wanted = json.loads((home / 'alone' / name / METRICS).read_text())
-    tolerance = 0 if mi.variant().startswith('llvm') else 1e-3
-    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=tolerance)
+    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=fits_alike(0))
 
 
 def test_a_worker_is_killed(home):

@@ -22,6 +22,7 @@ class Server:
     def __enter__(self):
         paths = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get('PYTHONPATH', '')])
         environment = os.environ | dict(PYTHONPATH=paths, OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1')
+        environment['CUDA_VISIBLE_DEVICES'] = ''  # a forked process cannot use a GPU that its parent has begun to use
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'helpers.fault_server'], stdin=-1, stdout=-1, text=True, env=environment
         )

@@ -21,3 +21,16 @@ def assert_same(found, expected):
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-6 * np.abs(expected).max())
     else:
         np.testing.assert_array_equal(found, expected)
+
+
+def assert_same_volume(found, expected):
+    """Of an iterative method, which amplifies rounding: to the last bit, or to a thousandth of its norm."""
+    if adds_in_any_order():
+        assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+    else:
+        np.testing.assert_array_equal(found, expected)
+
+
+def fits_alike(otherwise: float) -> float:
+    """Relative tolerance of the measures of two like fits: where sums are in any order, a fit amplifies their rounding."""
+    return 1e-2 if adds_in_any_order() else otherwise
