@@ -12,16 +12,12 @@ from lingo_mi import parsing
 from lingo_mi.api.result import Result
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.file_access import as_path, require_writable, writing
-from lingo_mi.fitting.initial import initial_cloud
-from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.folder_lock import LOCK, locked
-from lingo_mi.interrupts import between_steps
 from lingo_mi.output_folder import CHECKPOINT
 from lingo_mi.progress import Progress
-from lingo_mi.results.measure import quick_measure
-from lingo_mi.results.watch import watched
+from lingo_mi.results.watched_fit import watched_fit
 from lingo_mi.results.watchers import watchers_of
 from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
@@ -84,20 +80,12 @@ def fit(
             if path.exists() and not resume:
                 raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
         require_writable(path.parent, path)
-    with _lock(path), tempfile.TemporaryDirectory() as folder, between_steps() as check:
-        cloud = None if resume else initial_cloud(dataset.train, chosen, seed)
+    with _lock(path), tempfile.TemporaryDirectory() as folder:
         # Kept even where nobody names a file: `Result.save` writes it.
         file = Path(folder) / CHECKPOINT if path is None else path
         watchers = watchers_of(dataset.train.geometry, live, log_dir, name)
-        with watched(watchers, chosen.iterations) as watch, Progress('Fit', chosen.iterations, shown=progress) as bar:
-
-            def report(iteration, **fields):
-                bar.update(iteration, **fields)
-                watch.step(iteration, **fields)
-                check()
-
-            measure = quick_measure(dataset, look=watch.look if watch.watchers else None)
-            fitted = run(dataset.train, chosen, cloud, seed, measure, report, file)
+        with Progress('Fit', chosen.iterations, shown=progress) as bar:
+            fitted = watched_fit(dataset, chosen, seed, bar.update, watchers, file, resume)
         return Result(fitted, name, file.read_bytes(), dataset)
 
 

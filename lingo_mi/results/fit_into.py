@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lingo_mi.fitting.initial import initial_cloud
-from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.interrupts import between_steps
 from lingo_mi.output_folder import CHECKPOINT, require_ours
-from lingo_mi.results.measure import measure, quick_measure
+from lingo_mi.results.measure import measure
 from lingo_mi.results.save import result_names, save
-from lingo_mi.results.watch import Watcher, watched
+from lingo_mi.results.watch import Watcher
+from lingo_mi.results.watched_fit import watched_fit
 from lingo_mi.scan import Dataset
 
 
@@ -33,7 +31,7 @@ def fit_into(
     """Fit a scan, measure the fit, and write all files of the result; returns its metrics.
 
     folder     which no other process writes to
-    progress   called between steps, as of `fitting.loop.run`. After its KeyboardInterrupt, or Ctrl-C, `resume` goes on
+    progress   as of `watched_fit`
     resume     from the checkpoint in the folder
     request    what was asked for, kept in metrics.json
     watchers   of the fit, such as a live page
@@ -43,15 +41,6 @@ def fit_into(
     Raises InputError where the fit or the folder does not work out.
     """
     require_ours(folder, result_names(settings, 0 if dataset.test is None else len(dataset.test)))
-    cloud = None if resume else initial_cloud(dataset.train, settings, seed)
-    with watched(watchers, settings.iterations) as watch, between_steps() as check:
-
-        def report(iteration, **fields):
-            progress(iteration, **fields)
-            watch.step(iteration, **fields)
-            check()
-
-        look = quick_measure(dataset, look=watch.look if watchers else None)
-        fit = run(dataset.train, settings, cloud, seed, look, report, folder / CHECKPOINT)
+    fit = watched_fit(dataset, settings, seed, progress, watchers, folder / CHECKPOINT, resume)
     measured = measure(fit, dataset.test, dataset.volume)
     return save(folder, fit, measured, title=title, method=method, command=command, request=request)

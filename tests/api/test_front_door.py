@@ -196,7 +196,7 @@ def test_undershoots_are_no_hounsfield_units(geometry):
 def test_where_nothing_can_be_written(result, data, tmp_path, monkeypatch):
     """A file where a folder is needed, and a folder where a file is: one line, for a fit before it starts."""
     (tmp_path / 'file').write_text('')
-    monkeypatch.setattr('lingo_mi.api.fitting.initial_cloud', None)
+    monkeypatch.setattr('lingo_mi.results.watched_fit.initial_cloud', None)
     for path in tmp_path / 'file' / 'fit.npz', tmp_path / 'file' / 'folder' / 'fit.npz', tmp_path:
         with pytest.raises(lm.InputError, match='cannot write there|is a folder|cannot be written') as caught:
             lm.fit(data, checkpoint=path, progress=False, **TINY)
