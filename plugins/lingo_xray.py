@@ -65,7 +65,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     - `ellipsoids` shapes with a `density` attribute: a cloud of 3D Gaussians, in closed form (see
       `lingo_mi.projectors.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
-    - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation;
+    - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation. Mitsuba does
+      not tell which `filter_type` and `wrap_mode` a volume has, so the defaults, `trilinear` and `clamp`, are assumed;
     - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
 
     An emitter `xray_tube` (spectrum, focal spot) and a film `ct_detector` (blur, noise and more) make the image what a
