@@ -62,10 +62,8 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
             say(f'{name}: not installed, left out')
         else:
             packages[name] = functions
-    measured_on = dict(variant=mi.variant(), cores=cores)
-    return dict(
-        size=size, views=views, tilt=tilt, **measured_on, repeats=repeats, operations=compare(packages, repeats)
-    )
+    scanned = dict(size=size, views=views, tilt=tilt)
+    return scanned | dict(variant=mi.variant(), cores=cores, repeats=repeats, operations=compare(packages, repeats))
 
 
 def describe(result: dict) -> Iterator[str]:
