@@ -19,7 +19,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.stats import spearmanr
 
-from lingo_mi.completion.prepare import sampled
+from lingo_mi.completion.prepare import fit_cloud, sampled
 from lingo_mi.completion.views import insert_views
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
@@ -42,7 +42,7 @@ from lingo_mi.studies.tables.objects import averaged, load_object
 
 LARGEST = 4.0  # line integral of every simulated scan: 1.8 % of the photons arrive
 COMPLETED = 100  # views
-MEASURED = 'walnut'  # a scene of measured views; their reference is the FDK of all of them
+MEASURED = 'walnut', 'htc2022'  # scenes of measured views; their reference is the FDK of all of them
 BEST = 'best'
 VOXELS = {'asd-pocs': 'ASD-POCS', 'refined': 'refined from ASD-POCS', 'refined_finer': 'the same, half the size'}
 CLOUDS = {
@@ -51,13 +51,14 @@ CLOUDS = {
     'cloud_refined': 'refined from the cloud',
     'cloud_finer': 'the same, half the size',
 }
+BEST_CLOUD = 'best_cloud'  # `Best(cloud=True)`
 
 
 @dataclass(frozen=True)
 class Case:
     """A scan.
 
-    object    one of `studies.tables.objects`, scanned over a full turn; or 'walnut'
+    object    one of `studies.tables.objects`, scanned over a full turn; or one of MEASURED
     finer     how many times as many voxels are scanned along each side
     views     reconstructed from
     photons   a pixel in the open beam; 0: no noise
@@ -89,7 +90,7 @@ class Study:
     ) -> None:
         """Compute and store the cells that are missing. `clouds`: also the settings that need a fitted cloud, minutes a case."""
         for case in cases:
-            for setting in [*VOXELS, BEST, *(CLOUDS if clouds else ())]:
+            for setting in [*VOXELS, BEST, *((*CLOUDS, BEST_CLOUD) if clouds else ())]:
                 if self.get(case, setting) is None:
                     found = self._compute(case, setting)
                     self.cells.put(self.name(case), setting, found)
@@ -101,8 +102,8 @@ class Study:
         if setting in CLOUDS:
             self._cloud(case)  # not in this setting's time, but in its sum
         began, extra = time.process_time(), {}
-        if setting == BEST:
-            found = Best().run(dataset.train)
+        if setting in (BEST, BEST_CLOUD):
+            found = Best(cloud=setting == BEST_CLOUD).run(dataset.train, fit=fit_cloud)
             volume = found.volume
             wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
             assert found.error is not None
@@ -140,7 +141,7 @@ class Study:
         return fit(scan, FAST, initial_cloud(scan, FAST, 0), 0), time.process_time() - began
 
     def _dataset(self, case: Case) -> Dataset:
-        if case.object == MEASURED:
+        if case.object in MEASURED:
             return self._measured(case)
         geometry, views, truth = simulated(case.object, self.size, 5 * self.size // 3, case.views, case.finer)
         return Dataset(Scan(geometry, noisy(views, case.photons) if case.photons else views), None, truth)
@@ -148,41 +149,49 @@ class Study:
     @staticmethod
     def check(case: Case) -> None:
         """Raises InputError for a case that there is not."""
-        if case.object == MEASURED and (case.finer != 1 or case.photons):
+        if case.object in MEASURED and (case.finer != 1 or case.photons):
             raise InputError(
-                f'{MEASURED} is measured: it has its own detail and noise, so give --finer 1 and --photons 0'
+                f'{case.object} is measured: it has its own detail and noise, so give --finer 1 and --photons 0'
             )
 
     def _measured(self, case: Case) -> Dataset:
-        parameters = dict(voxels=str(self.size), voxel_size=f'{128 * 0.305 / self.size}')
-        every = load_scene(scene_path(MEASURED), parameters).scanner.dataset
+        every = load_scene(scene_path(case.object)).scanner.dataset
         assert every is not None  # it has no object
-        train = every.train.binned(max(1, round(256 / (2 * self.size))))
+        train, whole = every.train, every.train.geometry
+        shape = [max(1, round(n * self.size / max(whole.nVoxel))) for n in whole.nVoxel]
+        train = train.binned(max(1, round(max(whole.nDetector) / (2 * self.size))))
+        spacing = [side / n for side, n in zip(whole.sVoxel, shape)]
+        train = replace(train, geometry=train.geometry.with_volume(shape, spacing))
         return replace(choose_views(Dataset(train), case.views), volume=FDK().run(train).volume)
 
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds, and the regret of `Best`."""
         names = VOXELS | CLOUDS
         lines = [
-            '| object | scanned | views | photons | **best** | regret, dB | error map | '
+            '| object | scanned | views | photons | **best** | regret, dB | error map | with a cloud | '
             + ' | '.join(names.values())
             + ' |',
-            '|---|---:|---:|---:|' + '---:|' * (len(names) + 3),
+            '|---|---:|---:|---:|' + '---:|' * (len(names) + 4),
         ]
         for case in cases:
             chosen = self.get(case, BEST)
             if chosen is None:
                 continue
             fixed = {name: found for name in names if (found := self.get(case, name))}
-            cells = [f'{fixed[n]["psnr_3d"]:.2f} ({fixed[n]["seconds"]:.0f} s)' if n in fixed else '–' for n in names]
+            cells = [_cell(fixed.get(name)) for name in names]
+            with_cloud = self.get(case, BEST_CLOUD)
             best = max((found['psnr_3d'] for found in fixed.values()), default=np.nan)
-            photons = f'{case.photons:g}' if case.photons else 'measured' if case.object == MEASURED else 'no noise'
+            photons = f'{case.photons:g}' if case.photons else 'measured' if case.object in MEASURED else 'no noise'
             lines.append(
                 f'| {case.object} | x{case.finer} | {case.views} | {photons} '
-                f'| {chosen["psnr_3d"]:.2f} ({chosen["seconds"]:.0f} s) | {best - chosen["psnr_3d"]:+.2f} '
-                f'| {chosen["error_map"]:.2f} | {" | ".join(cells)} |'
+                f'| {_cell(chosen)} | {best - chosen["psnr_3d"]:+.2f} '
+                f'| {chosen["error_map"]:.2f} | {_cell(with_cloud)} | {" | ".join(cells)} |'
             )
         return '\n'.join(lines)
+
+
+def _cell(found: dict | None) -> str:
+    return f'{found["psnr_3d"]:.2f} ({found["seconds"]:.0f} s)' if found else '–'
 
 
 def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tuple[Geometry, np.ndarray, np.ndarray]:

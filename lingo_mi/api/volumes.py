@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from lingo_mi.api.result import Result
 from lingo_mi.arrays import as_numpy
 from lingo_mi.completion.clouds import FittedCloud
-from lingo_mi.completion.prepare import prepare_completed, prepare_start
+from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.parsing import whole
-from lingo_mi.reconstruction import Algorithm, Reconstruction, Refined, check_scan, progress_bar
+from lingo_mi.reconstruction import Algorithm, Best, Reconstruction, Refined, check_scan, progress_bar
 from lingo_mi.reconstruction import reconstruct as run
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.runtime import ensure_variant
@@ -78,5 +78,7 @@ def reconstruct(
         if scan.effects is not None:
             scan = linearised(scan, scan.effects)
         inputs = {} if start is None else dict(start=as_numpy(start, 'the start volume', np.float32))
+        if isinstance(algorithm, Best):
+            inputs['fit'] = fit_cloud
     with progress_bar(algorithm, scan) if progress else nullcontext() as bar:
         return run(scan, algorithm, progress=bar, **inputs)

@@ -50,14 +50,14 @@ from lingo_mi.cli.common import (
     writing_file,
 )
 from lingo_mi.completion.clouds import load_cloud
-from lingo_mi.completion.prepare import prepare_completed, prepare_start, sampled
+from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import optional, require_writable, write_text
 from lingo_mi.files.slabs import NIFTI, ZARR, plan_and_error_map, write_slabs
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.parsing import parse
 from lingo_mi.progress import Progress
-from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Reconstruction, progress_bar, reconstruct
+from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Best, Reconstruction, progress_bar, reconstruct
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
@@ -272,6 +272,8 @@ def reconstruct_into(
             scan, inputs = prepare_start(dataset, cloud, algorithm)
         elif scan.effects is not None and effects == 'model':
             scan = linearised(scan, scan.effects)
+        if isinstance(algorithm, Best):
+            inputs = dict(fit=fit_cloud)
         if slab:
             make_in_slabs(out, scan, algorithm, args)
             return

@@ -1,7 +1,7 @@
 """Measure how far `best`, which knows no truth, is behind the best of fixed settings, with the truth at hand.
 
     lingo-mi regret --objects foot chest --finer 1 2 --photons 0 10000
-    lingo-mi regret --objects walnut --views 15 30 60
+    lingo-mi regret --objects walnut htc2022 --views 15 30 60
     lingo-mi regret --objects foot --clouds
 
 Simulated scans are cone beams over a full turn, with 4 as the largest line integral, of objects on --finer times as many voxels
@@ -23,7 +23,7 @@ from lingo_mi.runtime import use_variant
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
-    p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; of the walnut 1)')
+    p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; of measured scans 1)')
     p.add_argument('--views', nargs='+', type=int, default=[25], metavar='N', help='(default: 25)')
     p.add_argument(
         '--photons', nargs='+', type=float, default=[0.0], metavar='N', help='a pixel (default: 0, no noise)'
@@ -47,14 +47,14 @@ def main() -> None:
     from lingo_mi.studies.regret import MEASURED, Case, Study
     from lingo_mi.studies.tables.objects import available
 
-    simulated = [name for name in args.objects if name != MEASURED]
-    names = [*(available(simulated, print) if simulated else []), *(n for n in args.objects if n == MEASURED)]
+    simulated = [name for name in args.objects if name not in MEASURED]
+    names = [*(available(simulated, print) if simulated else []), *(n for n in args.objects if n in MEASURED)]
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size)
     cases = [
         Case(n, f, v, p)
         for n in names
-        for f in (args.finer or ((1,) if n == MEASURED else (1, 2)))
+        for f in (args.finer or ((1,) if n in MEASURED else (1, 2)))
         for v in args.views
         for p in args.photons
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
 from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.loop import run as fit
+from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.reconstruction import FDK, Algorithm, Best, Refined
 from lingo_mi.reconstruction.preconditions import require_rays
@@ -43,6 +47,16 @@ def _of_field(field: Fitted) -> Callable[[Geometry], np.ndarray]:
         return volume
 
     return sample
+
+
+def fit_cloud(scan: Scan, progress: Callable[[int, int], None]) -> Callable[[Geometry], np.ndarray]:
+    """Fit a cloud to line integrals by the recipe `fast`, and return the function that samples it; the `fit` of `Best`.
+
+    progress   called as progress(iterations done, iterations)
+    """
+    scan = replace(scan, effects=None)
+    iterations = FAST.iterations
+    return sampled(fit(scan, FAST, initial_cloud(scan, FAST), progress=lambda done, **_: progress(done, iterations)))
 
 
 def prepare_completed(

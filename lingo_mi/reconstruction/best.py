@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -22,11 +23,17 @@ from lingo_mi.reconstruction.refined import Refined, means, structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 
-START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
-PLAIN, REFINED, SMOOTHED = 'asd-pocs', 'refined', 'refined, smooth'
+PLAIN, REFINED, SMOOTHED, FROM_CLOUD = 'asd-pocs', 'refined', 'refined, smooth', 'refined, cloud'
+TICKS = 20  # steps of the progress for a fit
+
+# Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a geometry, which gives the
+# cloud's densities per mm [x, y, z] at the voxel centres.
+Fit = Callable[[Scan, Callable[[int, int], None]], Callable[[Geometry], np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +81,18 @@ class Best(Algorithm):
     2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
        over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits
        them, and more total variation is tried.
-    3. The setting that predicts the views best, with its number of passes, is applied to all views.
+    3. With `cloud`, a cloud of Gaussians is fitted to the same views, and the same steps are tried from its volume.
+    4. The setting that predicts the views best, with its number of passes, is applied to all views.
 
     Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks; the result is
-    their mean over each voxel. The scan's own voxels are taken for objects that have no such detail.
+    their mean over each voxel. The scan's own voxels are taken for objects that have no such detail. Streaks lie along the
+    views that were reconstructed from, and other views show little of them: so the scan's own voxels must be better
+    by `MARGIN`.
 
     niter      passes of a refinement, at most, at least 1
     finer      parts along each side of a voxel to try, at least 1 (1: the scan's voxels only); memory grows with its cube
     held_out   one view in so many is held out, at least 2
+    cloud      whether to try the volume of a fitted cloud as a start; it takes two fits, whose worth docs/how_to/best.md shows
     seed       of the random orders, at least 0
 
         >>> from lingo_mi.phantoms import make, x3d_scan
@@ -99,6 +110,7 @@ class Best(Algorithm):
     niter: int = 20
     finer: int = 2
     held_out: int = 5
+    cloud: bool = False
     seed: int = 0
 
     def __post_init__(self):
@@ -107,26 +119,31 @@ class Best(Algorithm):
         check_counts(least=0, seed=self.seed)
 
     def steps(self, scan: Scan) -> int:
-        return 2 * START + 2 * TRIAL + 3 * self.niter
+        return 2 * START + 2 * TRIAL + 3 * self.niter + (2 * TICKS + self.niter if self.cloud else 0)
 
     def grid(self, geometry: Geometry) -> Geometry:
         return Refined(finer=self.finer).grid(geometry)
 
-    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Chosen:
+    def run(
+        self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None, fit: Fit | None = None
+    ) -> Chosen:
         """Reconstruct the volume of a scan, see `Algorithm.run`. The residuals are those of the last refinement.
 
-        Raises InputError for a `start`, which would have seen the views that are held out.
+        fit   with `cloud`: fits one (`completion.prepare.fit_cloud`)
+
+        Raises InputError for a `start`, which would have seen the views that are held out, and where `fit` is missing.
         """
         if start is not None:
             raise InputError('best starts from nothing, since a volume has seen the views that it holds out')
+        if self.cloud and fit is None:
+            raise InputError('best tries a cloud where it is given a function that fits one: use lm.reconstruct')
         began, count = time.perf_counter(), self._counter(progress, self.steps(scan))
         kept, held_out = split(scan, self.held_out)
-        plan = self._plan(kept, held_out, count)
+        plan = self._plan(kept, held_out, count, fit if self.cloud else None)
         gc.collect()
         dr.flush_malloc_cache()  # two thirds of the memory that the trials took
-        taken = int(np.argmin([trial.score for trial in plan]))
-        found = self._apply(scan, plan[0].niter, plan[taken], count)
-        chosen = plan[taken]
+        chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
+        found = self._apply(scan, plan[0].niter, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
         tried = means(chosen.volume, chosen.finer)
         volume = means(found.volume, chosen.finer)
@@ -140,36 +157,52 @@ class Best(Algorithm):
             time.perf_counter() - began,
             scan.geometry,
             tuple(plan),
-            taken,
+            next(i for i, trial in enumerate(plan) if trial is chosen),
             error_map(volume, tried),
         )
 
-    def _plan(self, kept: Scan, held_out: Scan, count) -> list[Trial]:
+    def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
         plain = Trial(PLAIN, 1)
         ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain))
-        plan = [plain]
-        own = self._try(kept, held_out, plain, REFINED, 1, count, by=TRIAL)
+        assert plain.volume is not None  # of its best pass
+        start, plan = plain.volume, [plain]
+        own = self._try(kept, held_out, start, REFINED, 1, count, by=TRIAL)
         plan.append(own)
         if self.finer > 1:
-            plan.append(self._try(kept, held_out, plain, REFINED, self.finer, count, beat=own.score, by=TRIAL))
+            plan.append(self._try(kept, held_out, start, REFINED, self.finer, count, beat=own.score, by=TRIAL))
         ahead = any(min(trial.scores[:TRIAL]) < own.score for trial in plan[2:])
         if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
-            plan[1] = self._try(kept, held_out, plain, REFINED, 1, count)
-        best = min(plan[1:], key=lambda trial: trial.score)
+            plan[1] = self._try(kept, held_out, start, REFINED, 1, count)
+        best = _best(plan[1:])
         if best.niter < self.niter // 2:
-            plan.append(self._try(kept, held_out, plain, SMOOTHED, best.finer, count))
+            plan.append(self._try(kept, held_out, start, SMOOTHED, best.finer, count))
+        if fit is not None:
+            start = self._cloud(kept, best.finer, fit, count)
+            plan.append(self._try(kept, held_out, start, FROM_CLOUD, best.finer, count))
         return plan
 
-    def _try(self, kept, held_out, plain: Trial, name: str, finer: int, count, beat=None, by=0) -> Trial:
+    def _cloud(self, scan: Scan, finer: int, fit: Fit, count) -> np.ndarray:
+        """The volume of a cloud that is fitted to a scan."""
+
+        def progress(done: int, steps: int) -> None:
+            if count is not None and done * TICKS // steps > (done - 1) * TICKS // steps:
+                count(done, steps, None)
+
+        return fit(scan, progress)(Refined(finer=finer).grid(scan.geometry))
+
+    def _try(self, kept, held_out, start: np.ndarray, name: str, finer: int, count, beat=None, by=0) -> Trial:
         trial, grid = Trial(name, finer), Refined(finer=finer).grid
         score = Score(replace(held_out, geometry=grid(held_out.geometry)))
         niter = min(by, self.niter) if by and beat is None else self.niter
-        assert plain.volume is not None  # of its best pass
-        refine(kept, plain.volume, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
+        refine(kept, start, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
         return trial
 
-    def _apply(self, scan: Scan, start_niter: int, trial: Trial, count) -> Reconstruction:
+    def _apply(self, scan: Scan, start_niter: int, trial: Trial, count, fit: Fit | None) -> Reconstruction:
         """The chosen setting on all views."""
+        if trial.name == FROM_CLOUD:
+            assert fit is not None  # which has made the trial
+            start = self._cloud(scan, trial.finer, fit, count)
+            return refine(scan, start, trial.niter, trial.finer, False, self.seed, count)
         plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
         if trial.name == PLAIN:
             return plain
@@ -198,18 +231,25 @@ def refine(
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> Reconstruction:
-    """The passes of `Refined` over measured views, from a volume [x, y, z] on the scan's own voxels.
+    """The passes of `Refined` over measured views.
 
+    start    volume [x, y, z], on the scan's own voxels or on the smaller ones
     finer    parts along each side of a voxel; the volume that is returned has the smaller voxels
     smooth   whether to take more total variation
     """
     fine = replace(scan, geometry=Refined(finer=finer).grid(scan.geometry))
-    start = _parts(start, finer)
+    if start.shape == tuple(scan.geometry.nVoxel):
+        start = _parts(start, finer)
     algorithm = replace(Refined(niter=niter, seed=seed).on_measured(), lmbda=LMBDA, lmbda_red=LMBDA_RED)
     if smooth:
         algorithm = replace(algorithm, alpha=SMOOTH)
     weights, blur = structure(start), excess_width(fine.geometry)
     return algorithm.run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
+
+
+def _best(refinements: Sequence[Trial]) -> Trial:
+    """The one with the lowest score; the scan's own voxels must be better than smaller ones by `MARGIN`."""
+    return min(refinements, key=lambda trial: trial.score * (MARGIN if trial.finer == 1 else 1))
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
-from lingo_mi.reconstruction.best import error_map
+from lingo_mi.reconstruction.best import FROM_CLOUD, Trial, _best, error_map
 from lingo_mi.reconstruction.held_out import Score, split
 from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.system import System
@@ -85,6 +85,40 @@ def test_finer_voxels_for_finer_objects_only():
         assert found.plan[found.taken].finer == parts
         assert found.volume.shape == truth.shape
         assert psnr_3d(found.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+
+
+@pytest.mark.parametrize('score, taken', [(1.01, 2), (1.03, 1)])
+def test_smaller_voxels_where_the_scores_are_nearly_the_same(score, taken):
+    assert _best([Trial('refined', 1, [1.0]), Trial('refined', 2, [score])]).finer == taken
+
+
+@pytest.mark.parametrize('right', [True, False])
+def test_a_cloud_is_taken_where_it_predicts_the_views_better(right):
+    scan, truth = scanned(1)
+    fitted, done = [], []
+
+    def fit(part, progress):
+        fitted.append(len(part))
+        for k in range(1, 101):
+            progress(k, 100)
+        return lambda geometry: truth if right else np.full_like(truth, truth.mean())
+
+    found = Best(niter=2, finer=1, cloud=True).run(scan, fit=fit, progress=lambda k, *_: done.append(k))
+    assert found.plan[-1].name == FROM_CLOUD and (found.plan[found.taken].name == FROM_CLOUD) == right
+    assert fitted == [16, 20][: 1 + right]  # the views that are kept; all of them, where it is taken
+    assert done[:-1] == list(range(1, len(done)))
+
+
+def test_a_cloud_needs_a_fit():
+    with pytest.raises(InputError, match='use lm.reconstruct'):
+        Best(cloud=True).run(scanned(1)[0])
+
+
+def test_the_cloud_is_fitted():
+    scan, truth = scanned(2)
+    found = lm.reconstruct(scan, Best(niter=3, cloud=True), progress=False)
+    assert found.plan[-1].name == FROM_CLOUD and found.plan[-1].score < found.plan[0].score
+    assert psnr_3d(found.volume, truth) > 30
 
 
 def test_noise_stops_it_early():
