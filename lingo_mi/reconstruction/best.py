@@ -163,7 +163,7 @@ class Best(Algorithm):
 
     def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
         plain = Trial(PLAIN, 1)
-        ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain))
+        ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain, slow=True))
         assert plain.volume is not None  # of its best pass
         start, plan = plain.volume, [plain]
         own = self._try(kept, held_out, start, REFINED, 1, count, by=TRIAL)
@@ -176,7 +176,10 @@ class Best(Algorithm):
         best = _best(plan[1:])
         if best.niter < self.niter // 2:
             plan.append(self._try(kept, held_out, start, SMOOTHED, best.finer, count))
+            best = _best(plan[1:])
         if fit is not None:
+            for trial in plan[1:]:
+                trial.volume = trial.volume if trial is best else None  # room for the fit
             start = self._cloud(kept, best.finer, fit, count)
             plan.append(self._try(kept, held_out, start, FROM_CLOUD, best.finer, count))
         return plan

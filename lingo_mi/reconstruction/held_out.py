@@ -26,6 +26,7 @@ from lingo_mi.scan import Scan
 LEAST_VIEWS = 4
 NEAR = 1.03  # times another trial's score, which may still be beaten in the passes that follow
 PATIENCE = 3  # passes without a better score, after which a trial ends
+GAIN = 0.005  # part by which they must lower the score of a `slow` trial: with noise it sinks on while the volume gets worse
 
 
 def split(scan: Scan, every: int) -> tuple[Scan, Scan]:
@@ -120,10 +121,11 @@ class Watch:
 
     score    of the held-out views, on the trial's voxels
     beat     score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on
+    slow     whether the trial ends, too, when `PATIENCE` passes lower its score by less than `GAIN`
     """
 
-    def __init__(self, score: Score, trial: Trial, beat: float | None = None, by: int = 0):
-        self.score, self.trial, self.beat, self.by = score, trial, beat, by
+    def __init__(self, score: Score, trial: Trial, beat: float | None = None, by: int = 0, slow: bool = False):
+        self.score, self.trial, self.beat, self.by, self.slow = score, trial, beat, by, slow
 
     def __call__(self, done: int, x: mi.Float) -> bool:
         trial = self.trial
@@ -131,5 +133,7 @@ class Watch:
         if trial.niter == done:
             trial.volume = x.numpy().reshape(self.score.size)
         if self.beat is not None and done == self.by and trial.score >= NEAR * self.beat:
+            return True
+        if self.slow and done > PATIENCE and trial.score > (1 - GAIN) * min(trial.scores[:-PATIENCE]):
             return True
         return done - trial.niter >= PATIENCE

@@ -105,6 +105,12 @@ def test_best(scene, dataset, tmp_path):
     assert code == 2 and 'v-plan.json: exists already' in err and not out.exists()
 
 
+def test_best_with_a_cloud(scene, tmp_path):
+    command = ('--algorithm', 'best', '--out', tmp_path / 'v.nii', '-D', 'niter=2', '-D', 'finer=1', '-D', 'cloud=true')
+    code, text, err = run(RECONSTRUCT, scene, *command)
+    assert code == 0 and 'refined, cloud' in text and '(100%)' in err, err
+
+
 @pytest.mark.parametrize('option', ['--complete', '--start'])
 def test_an_unset_variable_of_the_shell(scene, tmp_path, option):
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', option, '', '--out', tmp_path / 'v.nii')

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -16,7 +17,7 @@ from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
 from lingo_mi.reconstruction.best import FROM_CLOUD, Trial, _best, error_map
-from lingo_mi.reconstruction.held_out import Score, split
+from lingo_mi.reconstruction.held_out import Score, Watch, split
 from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
@@ -107,6 +108,20 @@ def test_a_cloud_is_taken_where_it_predicts_the_views_better(right):
     assert found.plan[-1].name == FROM_CLOUD and (found.plan[found.taken].name == FROM_CLOUD) == right
     assert fitted == [16, 20][: 1 + right]  # the views that are kept; all of them, where it is taken
     assert done[:-1] == list(range(1, len(done)))
+
+
+@pytest.mark.parametrize('slow, passes', [(False, 50), (True, 5)])
+def test_a_slow_trial_ends_where_passes_gain_little(slow, passes):
+    falling = iter([0.5, 0.4, *(0.4 - 1e-4 * k for k in range(1, 60))])
+
+    class Falling:
+        size = 1, 1, 1
+
+        def __call__(self, x):
+            return next(falling)
+
+    watch = Watch(Falling(), Trial('asd-pocs', 1), slow=slow)
+    assert next(k for k in range(1, 51) if watch(k, mi.Float(0)) or k == 50) == passes
 
 
 def test_a_cloud_needs_a_fit():
