@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import replace
 from os import PathLike
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,7 +61,7 @@ def reconstruct(
         )
     if not isinstance(algorithm, Algorithm):
         raise InputError(f'algorithm must be an object such as lm.SART(niter=20), not {algorithm!r}')
-    inputs = {}
+    inputs: dict[str, Any] = {}
     if isinstance(start, Result):
         cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)
         if views is not None:

@@ -34,6 +34,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from math import prod
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -248,7 +249,8 @@ def reconstruct_into(
         if not slab:
             check_room(scene.scanner.geometry, algorithm, views)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, slab)
-    scan, inputs = dataset.train, {}
+    scan = dataset.train
+    inputs: dict[str, Any] = {}
     require_rays(scan.geometry)
     if not (slab and isinstance(algorithm, Sweeps | FDK)):  # whose `slabs` knows better
         grid = thinned(scan.geometry, slab)
