@@ -24,6 +24,9 @@ from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 
 START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+AHEAD = (
+    0.95  # part of the score of the scan's own voxels, below which smaller ones are clearly ahead after `TRIAL` passes
+)
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
@@ -170,7 +173,7 @@ class Best(Algorithm):
         plan.append(own)
         if self.finer > 1:
             plan.append(self._try(kept, held_out, start, REFINED, self.finer, count, beat=own.score, by=TRIAL))
-        ahead = any(min(trial.scores[:TRIAL]) < own.score for trial in plan[2:])
+        ahead = any(min(trial.scores[:TRIAL]) < AHEAD * own.score for trial in plan[2:])
         if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
             plan[1] = self._try(kept, held_out, start, REFINED, 1, count)
         best = _best(plan[1:])
