@@ -41,7 +41,8 @@ def reconstruct(
                 two stages of the paper), and the algorithm starts from nothing. The scan must be one on a circle
     progress    whether to show a progress bar on standard error
 
-    `Best` chooses its settings by measured views that it holds out, and takes neither `start` nor `views`.
+    `Best` chooses its settings by measured views that it holds out, and takes neither `start` nor `views`; with
+    `cloud` it fits a cloud by itself.
     `Refined` meets the completed views first where `views` is given, and the measured ones alone where it is not.
 
     Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|; `seconds`. It can be

@@ -16,7 +16,8 @@ measured ones then; for objects finer than the voxels add -D finer=2. With --sta
 cloud was fitted to, by refined or an iterative algorithm, from the cloud's own volume; any scan will do. Poses that the fit
 has corrected are used as it has left them, but not by fdk. Where the true volume is known, PSNR and SSIM are printed, with
 its largest density for full scale, then with 1.
-best chooses its settings by measured views that it holds out, and needs no cloud. What it tried is printed, and written beside
+best chooses its settings by measured views that it holds out, and needs no cloud; with
+-D cloud=true it also fits one, and tries to start from it. What it tried is printed, and written beside
 the volume V.nii.gz as V-plan.json; V-error.nii.gz shows where the volume is least certain, and is a layer of the page that
 --report writes.
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is

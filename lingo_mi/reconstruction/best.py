@@ -24,9 +24,7 @@ from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 
 START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
-AHEAD = (
-    0.95  # part of the score of the scan's own voxels, below which smaller ones are clearly ahead after `TRIAL` passes
-)
+AHEAD = 0.95  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
@@ -182,7 +180,8 @@ class Best(Algorithm):
             best = _best(plan[1:])
         if fit is not None:
             for trial in plan[1:]:
-                trial.volume = trial.volume if trial is best else None  # room for the fit
+                if trial is not best:
+                    trial.volume = None  # room for the fit
             start = self._cloud(kept, best.finer, fit, count)
             plan.append(self._try(kept, held_out, start, FROM_CLOUD, best.finer, count))
         return plan
