@@ -45,6 +45,17 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1
 
 
+def use_threads(number: int) -> None:
+    """Let Dr.Jit run its kernels on the CPU in so many threads.
+
+    `dr.set_thread_count` alone crashes the process while a kernel runs that adds to a copy of its result for every thread.
+    """
+    import drjit as dr
+
+    dr.sync_thread()
+    dr.set_thread_count(number)
+
+
 def find_libllvm() -> str | None:
     """Point DRJIT_LIBLLVM_PATH at the libLLVM that the environment carries, unless the user has set it.
 

@@ -1,8 +1,12 @@
-"""Where Dr.Jit finds LLVM."""
+"""Where Dr.Jit finds LLVM, and its threads."""
 
 import sys
 
-from lingo_mi.runtime import find_libllvm
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.runtime import find_libllvm, use_threads
 
 
 def test_folders_of_packages_with_few_folders_above(monkeypatch):
@@ -10,3 +14,19 @@ def test_folders_of_packages_with_few_folders_above(monkeypatch):
     monkeypatch.setattr(sys, 'prefix', '/there_is_no_such_folder')
     monkeypatch.setattr(sys, 'path', ['site-packages', '/site-packages', '/there/site-packages'])
     assert find_libllvm() is None
+
+
+def test_threads_change_while_a_kernel_runs():
+    """A kernel that adds to a copy of its result for every thread; without waiting for it, one in a hundred crashes."""
+    before, size, count = dr.thread_count(), 1 << 20, 1 << 21
+    index = mi.UInt(np.random.default_rng(0).integers(0, size, count).astype(np.uint32))
+    try:
+        for threads in (1, 2) * 150:
+            use_threads(threads)
+            sums = dr.zeros(mi.Float, size)
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.Float(1), index, mode=dr.ReduceMode.Expand)
+            dr.eval(sums)
+            use_threads(3 - threads)
+            assert dr.sum(sums)[0] == count
+    finally:
+        use_threads(before)

@@ -75,7 +75,7 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
 def _prepare(threads: int, variant: str | None) -> None:
     import mitsuba as mi
 
-    from lingo_mi.runtime import ensure_variant, use_variant
+    from lingo_mi.runtime import ensure_variant, use_threads, use_variant
 
     if variant is None:
         ensure_variant()
@@ -84,4 +84,4 @@ def _prepare(threads: int, variant: str | None) -> None:
     import drjit as dr
 
     if threads and dr.thread_count() != threads:
-        dr.set_thread_count(threads)
+        use_threads(threads)

@@ -45,7 +45,7 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
     say       called with a line for each package that is not installed
     """
     cores = runtime.cores()
-    dr.set_thread_count(cores)
+    runtime.use_threads(cores)
     volume = phantoms.make('shepp_logan', size).data
     geometry = Geometry.cone(
         DSO=1000, DSD=1500, nDetector=size, dDetector=512 / size, nVoxel=size, dVoxel=256 / size, angles=circular(views)

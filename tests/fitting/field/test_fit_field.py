@@ -20,15 +20,16 @@ from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.runtime import use_threads
 
 
 @pytest.fixture
 def one_thread(sums_in_order):
     """Sums of derivatives take the order in which threads come to their parts."""
     before = dr.thread_count()
-    dr.set_thread_count(1)
+    use_threads(1)
     yield
-    dr.set_thread_count(before)
+    use_threads(before)
 
 
 def fit(scan, settings=SMALL, **options):
