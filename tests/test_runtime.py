@@ -17,7 +17,7 @@ def test_folders_of_packages_with_few_folders_above(monkeypatch):
 
 
 def test_threads_change_while_a_kernel_runs():
-    """A kernel that adds to a copy of its result for every thread; without waiting for it, one in a hundred crashes."""
+    """A kernel that adds to a copy of its result for every thread; without waiting for it, one change in a hundred crashes."""
     before, size, count = dr.thread_count(), 1 << 20, 1 << 21
     rounds = 1 if mi.variant().startswith('cuda') else 150  # its kernels need no threads of the CPU
     index = mi.UInt(np.random.default_rng(0).integers(0, size, count).astype(np.uint32))

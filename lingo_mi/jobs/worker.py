@@ -81,7 +81,5 @@ def _prepare(threads: int, variant: str | None) -> None:
         ensure_variant()
     elif mi.variant() != variant:
         use_variant(variant)
-    import drjit as dr
-
-    if threads and dr.thread_count() != threads:
+    if threads:
         use_threads(threads)
