@@ -51,8 +51,8 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the recipe's)")
     p.add_argument(
         '--init',
-        choices=('lingo', 'r2', 'random', 'cuboid', 'network'),
-        help='initial cloud: Otsu masks (lingo) or an FDK '
+        choices=('edges', 'lingo', 'r2', 'random', 'cuboid', 'network'),
+        help='initial cloud: edges of a volume of SART (edges), Otsu masks (lingo) or an FDK '
         'volume (r2); of 3dgs and xgaussian: random points or a regular grid (cuboid); of naf: network',
     )
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')

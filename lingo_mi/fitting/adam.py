@@ -1,4 +1,5 @@
-"""Adam, with a learning rate a parameter (Kingma and Ba, "Adam: a method for stochastic optimization", 2015)."""
+"""Adam, with a learning rate a parameter (Kingma and Ba, "Adam: a method for stochastic optimization", 2015), with Nesterov's
+momentum if asked for (Dozat, "Incorporating Nesterov momentum into Adam", 2016)."""
 
 from __future__ import annotations
 
@@ -19,11 +20,17 @@ def adam_step(state: DeviceState, gradients: dict[str, Any], settings: Settings,
     """
     b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
     # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
-    c1, c2 = dr.opaque(mi.Float, 1 / (1 - b1**step)), dr.opaque(mi.Float, 1 / (1 - b2**step))
+    # The first moment without its bias, now or as expected after the next step.
+    of_m, of_g = 1 / (1 - b1**step), 0.0
+    if settings.adam.nesterov:
+        of_m, of_g = b1 / (1 - b1 ** (step + 1)), (1 - b1) / (1 - b1**step)
+    c1, cg, c2 = (dr.opaque(mi.Float, c) for c in (of_m, of_g, 1 / (1 - b2**step)))
     for name, g in gradients.items():
         m = b1 * state.first[name] + (1 - b1) * g
         v = b2 * state.second[name] + (1 - b2) * g * g
         rate = dr.opaque(mi.Float, settings.rate(name, iteration))
-        state.values[name] = dr.detach(state.values[name]) - rate * (m * c1) / (dr.sqrt(v * c2) + settings.adam.epsilon)
+        state.values[name] = dr.detach(state.values[name]) - rate * (m * c1 + g * cg) / (
+            dr.sqrt(v * c2) + settings.adam.epsilon
+        )
         state.first[name], state.second[name] = m, v
     dr.eval(state.values, state.first, state.second, state.gradient, state.visits)

@@ -10,6 +10,7 @@ import numpy as np
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.edge_start import edge_start
 from lingo_mi.fitting.measured import density_unit, linearised
 from lingo_mi.fitting.r2_start import r2_initialise
 from lingo_mi.fitting.settings import Settings
@@ -25,10 +26,10 @@ from lingo_mi.scan import Scan
 
 @one_at_a_time()
 def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud:
-    """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, or points in the volume; of a
-    neural field a cloud of no points.
+    """The start of a fit of `scan`: LINGO's cloud (paper, section III-A and B), R2-Gaussian's, points on edges or in
+    the volume; of a neural field a cloud of no points.
 
-    `info['seconds']` is the whole time, including an FDK reconstruction or renderings. Raises InputError if the scan
+    `info['seconds']` is the whole time, including reconstructions and renderings. Raises InputError if the scan
     gives no cloud.
     """
     begun = time.perf_counter()
@@ -53,9 +54,12 @@ def initial_cloud(scan: Scan, settings: Settings, seed: int = 0) -> InitialCloud
             state = DeviceState(initial_state(points, spacing, density / unit, settings))
             return CloudModel(settings, g, unit).render(state, g.subset(views)) * g.scale
 
-        if start.init_density == 'fdk' and not can_rectify(scan):
-            start = replace(start, init_density='lsq')
-        volume = FDK().run(scan).volume if start.init_density == 'fdk' else None
-        cloud = lingo.initialise(scan, start, rng, render, volume)
+        if start.init == 'edges':
+            cloud = edge_start(scan, render, start.n_points, rng)
+        else:
+            if start.init_density == 'fdk' and not can_rectify(scan):
+                start = replace(start, init_density='lsq')
+            volume = FDK().run(scan).volume if start.init_density == 'fdk' else None
+            cloud = lingo.initialise(scan, start, rng, render, volume)
     cloud.info['seconds'] = time.perf_counter() - begun
     return cloud

@@ -16,7 +16,11 @@ from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
 
-INITS = {'integral': ('lingo', 'r2'), 'alpha': ('random', 'cuboid'), 'field': ('network',)}  # by the setting `render`
+INITS = {
+    'integral': ('edges', 'lingo', 'r2'),
+    'alpha': ('random', 'cuboid'),
+    'field': ('network',),
+}  # by the setting `render`
 # Ranges end where float32 or the time of a fit does, far beyond what is of use.
 HELD_OUT = 5  # one view in so many, of the search for the step to stop at
 MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
@@ -26,9 +30,9 @@ MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
 class StartSettings(LingoSettings):
     """The start of a fit: `LingoSettings` (all starts use its `n_points`), and
 
-    init               'lingo' (paper, section III-A and B) or 'r2' (an FDK volume); for alpha compositing 'random' (points in
-                       the volume; 3DGS without given points) or 'cuboid' (X-Gaussian's regular grid); for a neural field
-                       'network' (random parameters)
+    init               'lingo' (paper, section III-A and B), 'r2' (an FDK volume), or 'edges' (own; a volume of SART, see
+                       `lingo_mi.fitting.edge_start`); for alpha compositing 'random' (points in the volume; 3DGS without given
+                       points) or 'cuboid' (X-Gaussian's regular grid); for a neural field 'network' (random parameters)
     cuboid_step        for `cuboid`: voxels between points (X-Gaussian: 8)
     fdk_threshold, fdk_rescale
                        for `r2`: see `lingo_mi.fitting.r2_start` (R2: 0.05 and 0.15)
@@ -137,6 +141,8 @@ class AdamSettings:
     rate_pose          for corrections of the views' poses (own): radians, and units of half the volume's longest side;
                        0, 0: no corrections (see `lingo_mi.fitting.poses`)
     beta1, beta2       decay of the moments (R2: Adam's usual 0.9 and 0.999)
+    nesterov           whether a step goes where the first moment will point after the next one (own; Dozat, "Incorporating
+                       Nesterov momentum into Adam", 2016)
     epsilon            added to the root of the second moment (R2: 1e-15)
     average            decay of the running mean of the parameters, which is the result (own); 0: parameters of the last step
     """
@@ -153,6 +159,7 @@ class AdamSettings:
     rate_pose: tuple[float, float] = (0.0, 0.0)
     beta1: float = 0.9
     beta2: float = 0.999
+    nesterov: bool = False
     epsilon: float = 1e-15
     average: float = 0.0
 

@@ -12,6 +12,8 @@ chosen here:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
@@ -19,9 +21,11 @@ from scipy import ndimage
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.lingo.voxel_filter import pixels
+from lingo_mi.scan import Scan
 
 FACTORS = {'paper': 0.15, 'raw': 1.0}
 MODES = (*FACTORS, 'lsq', 'fdk')
+LSQ_VIEWS = 8  # evenly spaced views for the factor of 'lsq' and 'fdk' (own choice: a few determine one number)
 # Least initial density, relative to the FDK volume's largest: the volume's noise must not start Gaussians at zero.
 FAINTEST = 0.02
 
@@ -61,6 +65,21 @@ def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.nda
 def sampled(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """`trilinear` values of a volume of densities, raised to at least FAINTEST times its largest value."""
     return np.maximum(trilinear(volume, points, half), FAINTEST * volume.max())
+
+
+def fitted_factor(
+    scan: Scan, render: Callable[..., np.ndarray], points: np.ndarray, density: np.ndarray, spacing: np.ndarray
+) -> float:
+    """The factor on the densities of a cloud that fits `LSQ_VIEWS` evenly spaced views best, see `least_squares_factor`.
+
+    render                     as of `lingo.initialise`
+    points, density, spacing   of the cloud, [N, 3], [N] and [N]
+    """
+    n = len(scan)
+    views = np.unique(np.arange(min(n, LSQ_VIEWS)) * n // min(n, LSQ_VIEWS))
+    rendered = render(points, density, spacing, views)
+    trusted = ... if scan.valid is None else scan.valid[views]
+    return least_squares_factor(scan.normalised[views][trusted], rendered[trusted])
 
 
 def least_squares_factor(measured: np.ndarray, rendered: np.ndarray) -> float:

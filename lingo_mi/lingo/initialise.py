@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.lingo.density import FACTORS, MODES, least_squares_factor, mean_pixel, sampled
+from lingo_mi.lingo.density import FACTORS, MODES, fitted_factor, mean_pixel, sampled
 from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
@@ -41,9 +41,6 @@ class InitialCloud:
     def denser(self, factor: float) -> InitialCloud:
         """The same cloud with densities times `factor`, where it knows any."""
         return replace(self, density=None if self.density is None else self.density * factor)
-
-
-LSQ_VIEWS = 8  # evenly spaced views for the factor of 'lsq' and 'fdk' (own choice: a few determine one number)
 
 
 @dataclass(frozen=True)
@@ -177,11 +174,7 @@ def initialise(
         density = mean_pixel(rays, projections, voxel_centres(grid, half, unique), valid)[inverse]
     spacing = neighbour_distance(points, fallback=size.min())
     if render is not None and settings.init_density in ('lsq', 'fdk'):
-        n = len(rays)
-        views = np.unique(np.arange(min(n, LSQ_VIEWS)) * n // min(n, LSQ_VIEWS))
-        rendered = render(points, density, spacing, views)
-        trusted = ... if valid is None else valid[views]
-        factor = least_squares_factor(projections[views][trusted], rendered[trusted])
+        factor = fitted_factor(scan, render, points, density, spacing)
     else:
         factor = FACTORS[settings.init_density]
     return InitialCloud(

@@ -13,7 +13,7 @@ from lingo_mi.fitting.recipes import METHODS
     'method, changes, waited',
     [
         ('r2', dict(n_points=50), 7),
-        ('fast', dict(n_points=50), 7),
+        ('lingo', dict(n_points=50, init_density='fdk'), 7),
         ('3dgs', dict(n_points=50), 0),
         ('xgaussian', dict(cuboid_step=16), 0),
     ],

@@ -143,14 +143,15 @@ def test_density_has_a_derivative_at_zero():
     np.testing.assert_allclose(dr.grad(device.values['density']).numpy(), 0.5, rtol=1e-6)
 
 
-def test_adam_against_numpy():
+@pytest.mark.parametrize('nesterov', [False, True])
+def test_adam_against_numpy(nesterov):
     rng = np.random.default_rng(7)
     state = random_state(rng, 6)
     for columns in (state.first, state.second):
         for v in columns.values():
             v[:] = 0
     device, rates = DeviceState(state), dict(centre=1e-2, scale=2e-2, rotation=3e-3, density=5e-2)
-    settings = R2.changed(**{f'rate_{k}': (rate, rate) for k, rate in rates.items()})
+    settings = R2.changed(nesterov=nesterov, **{f'rate_{k}': (rate, rate) for k, rate in rates.items()})
     expected = {k: v.astype(float) for k, v in state.values.items()}
     m, s = ({k: np.zeros_like(v) for k, v in expected.items()} for _ in range(2))
     types = dict(centre=mi.Point3f, scale=mi.Vector3f, rotation=mi.Vector4f, density=mi.Float)
@@ -161,7 +162,10 @@ def test_adam_against_numpy():
         for k, g in gradients.items():
             g = g.astype(float)
             m[k], s[k] = 0.9 * m[k] + 0.1 * g, 0.999 * s[k] + 0.001 * g * g
-            expected[k] -= rates[k] * (m[k] / (1 - 0.9**step)) / (np.sqrt(s[k] / (1 - 0.999**step)) + 1e-15)
+            mean = m[k] / (1 - 0.9**step)
+            if nesterov:  # Dozat's
+                mean = 0.9 * m[k] / (1 - 0.9 ** (step + 1)) + 0.1 * g / (1 - 0.9**step)
+            expected[k] -= rates[k] * mean / (np.sqrt(s[k] / (1 - 0.999**step)) + 1e-15)
     found = device.host()
     for k in PARAMETERS:
         np.testing.assert_allclose(found.values[k], expected[k], atol=1e-5 * rates[k] * 5 + 2e-6)

@@ -7,7 +7,7 @@ from lingo_mi.errors import InputError
 from lingo_mi.fitting.r2_start import r2_initialise
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo import initialise as initialisation
+from lingo_mi.lingo import density as densities
 from lingo_mi.lingo.density import FAINTEST, least_squares_factor, mean_pixel
 from lingo_mi.lingo.initialise import LingoSettings, draw, initialise
 from lingo_mi.lingo.ipsd import ipsd, neighbour_distance, reverse_distance
@@ -166,7 +166,7 @@ def test_density_modes(monkeypatch):
             Scan(geometry, projections), LingoSettings(n_points=300, **settings), np.random.default_rng(0), render
         )
 
-    monkeypatch.setattr(initialisation, 'LSQ_VIEWS', 3)
+    monkeypatch.setattr(densities, 'LSQ_VIEWS', 3)
     raw, paper, lsq = cloud(init_density='raw'), cloud(init_density='paper'), cloud(init_density='lsq')
     np.testing.assert_allclose(paper.density, 0.15 * raw.density)
     np.testing.assert_allclose(lsq.density, 0.25 * raw.density)
