@@ -44,6 +44,8 @@ COLUMNS = dict(
     seconds_fit=('fit, s', '{:.0f}'),
 )
 
+LONGEST = 200  # characters of a folder's name before it is cut; file systems allow 255
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -109,7 +111,10 @@ class Comparison:
         if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
             changes.append(f'iterations={self.iterations}')
         parts = [Path(scene).stem, str(self.views), name, *changes]
-        folder = self.folder / quote('_'.join(parts), safe='=,:+ ')  # a value may be a path
+        title = quote('_'.join(parts), safe='=,:+ ')  # a value may be a path
+        if len(title) > LONGEST:
+            title = title[:LONGEST] + '_' + hashlib.sha256(title.encode()).hexdigest()[:12]
+        folder = self.folder / title
         program = [sys.executable, '-m', 'lingo_mi', 'fit', str(scene)]
         options = ['--recipe', name, '--views', str(self.views), '--out', str(folder)]
         return folder, program + options + [word for change in changes for word in ('-D', change)]

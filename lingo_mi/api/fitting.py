@@ -56,7 +56,7 @@ def fit(
     unknown recipe or setting, a scan without signal or larger than memory, a checkpoint of another fit or that cannot be
     written, and a fit that diverges.
 
-        result = lm.fit(data, 'fast', iterations=800, checkpoint='out/foot.npz')
+        result = lm.fit(data, 'fast', checkpoint='out/foot.npz')
     """
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))

@@ -29,7 +29,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--settings', nargs='+', metavar='NAME', help='some of equal, stopped, noise (default: all)')
     p.add_argument('--size', type=int, default=64, help='voxels along the longest side (default: 64)')
     p.add_argument('--pixels', type=int, default=64, help='of the panel, a side (default: 64)')
-    p.add_argument('--iterations', type=int, default=1400, metavar='N', help='steps of a fit, at most (default: 1400)')
+    p.add_argument('--iterations', type=int, metavar='N', help="steps of a fit, at most (default: the recipe's)")
     p.add_argument('--out', type=Path, default=Path('out/noise'), help='folder of the results')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
@@ -43,12 +43,13 @@ def main() -> None:
         ('--views', [args.views], 4, 5000),
         ('--size', [args.size], 12, 512),
         ('--pixels', [args.pixels], 12, 2048),
-        ('--iterations', [args.iterations], 50, 1_000_000),
+        ('--iterations', [] if args.iterations is None else [args.iterations], 50, 1_000_000),
     )
     for name, values, low, high in ranges:
         if not all(low <= value <= high for value in values):
             raise InputError(f'{name} must be from {low} to {high:g}, not {" ".join(map(str, values))}')
     use_variant(args.variant)
+    from lingo_mi.fitting.recipes import FAST
     from lingo_mi.studies.noise import SETTINGS, Case, Study
     from lingo_mi.studies.tables.objects import available
 
@@ -58,7 +59,7 @@ def main() -> None:
             raise InputError(f'--settings {name}: is unknown; use some of {", ".join(SETTINGS)}')
     names = available(args.objects, print)
     require_writable(args.out, args.out, 'choose another --out')
-    study = Study(args.out, args.size, args.pixels, args.iterations)
+    study = Study(args.out, args.size, args.pixels, args.iterations or FAST.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
     with renewed_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
         study.compute_missing(cases, settings, renew)

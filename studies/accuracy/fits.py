@@ -47,6 +47,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
     data = dataset(side, side, sizes.views)
     rows = []
     kinds = {
+        'edges': dict(init='edges'),
         'lingo': dict(init='lingo'),
         'lingo, paper density': dict(init='lingo', init_density='paper'),
         'r2': dict(init='r2'),

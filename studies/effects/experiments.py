@@ -33,7 +33,6 @@ class Experiment:
 
     title   in tables and pictures
     model   settings of the fit that models it, besides those of the others
-    ignore  the same of the fit that ignores it
     scene   parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have
     turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
                   not told
@@ -41,7 +40,6 @@ class Experiment:
 
     title: str
     model: dict = field(default_factory=dict)
-    ignore: dict = field(default_factory=dict)
     scene: dict = field(default_factory=dict)
     turn: float = 0.0
     shift: float = 0.0
@@ -62,10 +60,7 @@ EXPERIMENTS = dict(
     scatter=Experiment('scatter and hardening of a chest, 120 kVp'),
     noise=Experiment('noise of 3000 photons a pixel', dict(weights='noise')),
     truncation=Experiment(
-        'panel of half the width',
-        dict(outside='ignore'),
-        dict(outside='invalid'),
-        dict(clean=dict(across='64', columns='96'), model=dict(across='64')),
+        'panel of half the width', scene=dict(clean=dict(across='64', columns='96'), model=dict(across='64'))
     ),
 )
 
@@ -89,9 +84,7 @@ def measure(name: str, parameters: dict | None = None, settings: Any = SETTINGS,
     """
     experiment = experiment_of(name)
     scenes, found = {}, {}
-    for kind, changes in dict(
-        clean={}, ignore=dict(effects='ignore') | experiment.ignore, model=experiment.model
-    ).items():
+    for kind, changes in dict(clean={}, ignore=dict(effects='ignore'), model=experiment.model).items():
         given = (parameters or {}) | experiment.scene.get(kind, {})
         key = tuple(sorted(given.items()))
         if key not in scenes:

@@ -111,6 +111,14 @@ def test_a_value_that_is_a_path_makes_no_folders(tmp_path):
     assert command[-1] == 'projections=/data/x.npy'
 
 
+def test_many_settings_make_a_name_that_a_folder_may_have(tmp_path):
+    many = [','.join(f'rate_{name}=1e-{i},1e-3' for name in ('centre', 'density', 'scale') * 5) for i in (2, 4)]
+    folders = {study.Comparison(tmp_path).plan('a.xml', f'fast:{changes}')[0] for changes in many}
+    assert len(folders) == 2
+    for folder in folders:
+        folder.mkdir()
+
+
 @pytest.mark.parametrize('name', ['metrics.json', 'scenes.json'])
 def test_damaged_results(tmp_path, name):
     scene, comparison = tmp_path / 'a.xml', study.Comparison(tmp_path)
