@@ -198,14 +198,14 @@ def test_truncated_scans_keep_what_the_panel_misses():
     g = narrow.geometry
 
     def cloud(outside):
-        settings = METHODS['fast'].changed(outside=outside, n_points=400)
+        settings = METHODS['lingo'].changed(outside=outside, n_points=400)
         return initial_cloud(narrow, settings)
 
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         automatic = cloud('auto')
         literal = cloud('ignore')
-        whole = initial_cloud(wide, METHODS['fast'].changed(n_points=400))
+        whole = initial_cloud(wide, METHODS['lingo'].changed(outside='auto', n_points=400))
     with pytest.warns(UserWarning, match='edge of the panel in 6 of 6 views'):
         strict = cloud('invalid')
     assert automatic.info['outside'] == 'ignore' and whole.info['outside'] == 'invalid'

@@ -75,7 +75,7 @@ def fitted_factor(
     render                     as of `lingo.initialise`
     points, density, spacing   of the cloud, [N, 3], [N] and [N]
     """
-    n = len(scan)
+    n = len(scan.geometry)
     views = np.unique(np.arange(min(n, LSQ_VIEWS)) * n // min(n, LSQ_VIEWS))
     rendered = render(points, density, spacing, views)
     trusted = ... if scan.valid is None else scan.valid[views]

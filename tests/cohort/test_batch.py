@@ -336,7 +336,7 @@ def test_a_damaged_result(home):
     assert stored(home / 'out', row)['views'] == 5
     metrics = home / 'out' / 'a' / METRICS
     values = json.loads(metrics.read_text())
-    del values['request']['settings']['lambda_gradient']  # of a version without this setting
+    del values['request']['settings']['fit_air']  # of a version without this setting
     metrics.write_text(json.dumps(values))
     assert stored(home / 'out', row)['views'] == 5
     del values['request']['settings']
