@@ -26,7 +26,7 @@ LOW, HIGH = '#f2b705', '#d1495b'
 
 def main():
     data = lm.simulate('x3d_foot', views=VIEWS, parameters=dict(pixels=256, pixel_size=2))
-    result = lm.fit(data, 'fast:init=lingo', iterations=ITERATIONS)
+    result = lm.fit(data, 'fast:init=lingo,init_density=fdk', iterations=ITERATIONS)
     lingo_steps(data, result)
     two_stages(data, result)
 

@@ -19,11 +19,11 @@ def adam_step(state: DeviceState, gradients: dict[str, Any], settings: Settings,
     iteration   counts from 0
     """
     b1, b2, step = settings.adam.beta1, settings.adam.beta2, iteration + 1
-    # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
     # The first moment without its bias, now or as expected after the next step.
     of_m, of_g = 1 / (1 - b1**step), 0.0
     if settings.adam.nesterov:
         of_m, of_g = b1 / (1 - b1 ** (step + 1)), (1 - b1) / (1 - b1**step)
+    # Numbers that change from step to step must be opaque: as literals they would cause a new kernel every time.
     c1, cg, c2 = (dr.opaque(mi.Float, c) for c in (of_m, of_g, 1 / (1 - b2**step)))
     for name, g in gradients.items():
         m = b1 * state.first[name] + (1 - b1) * g

@@ -32,12 +32,12 @@ def edge_start(scan: Scan, render: Callable[..., np.ndarray], n_points: int, rng
     rng        numpy Generator
 
     Gaussians are needed where density changes: even regions take few large ones. Densities are those of the volume at the points,
-    times the factor that fits the projections best. Raises InputError for a volume without edges.
+    times the factor that fits the projections best. Raises InputError for an empty volume.
     """
     volume, half = SART(niter=PASSES).run(_coarse(scan)).volume, scan.geometry.half
     weight = ndimage.gaussian_gradient_magnitude(volume, BLUR, mode='nearest') + INSIDE * volume.clip(0)
-    weight[volume < EMPTY * volume.max()] = 0
-    total = weight.sum(dtype=float)
+    weight = np.where(volume < EMPTY * volume.max(), 0, weight.astype(float))
+    total = weight.sum()
     if not total > 0:
         raise InputError("the projections give an empty volume: check the geometry and the volume's size")
     count = min(n_points, np.count_nonzero(weight))

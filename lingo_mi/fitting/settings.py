@@ -16,11 +16,8 @@ from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
 
-INITS = {
-    'integral': ('edges', 'lingo', 'r2'),
-    'alpha': ('random', 'cuboid'),
-    'field': ('network',),
-}  # by the setting `render`
+# By the setting `render`:
+INITS = {'integral': ('edges', 'lingo', 'r2'), 'alpha': ('random', 'cuboid'), 'field': ('network',)}
 # Ranges end where float32 or the time of a fit does, far beyond what is of use.
 HELD_OUT = 5  # one view in so many, of the search for the step to stop at
 MOST_STEPS, RATES, SCALES = 1e9, (1e-12, 1e3), (1e-9, 1e3)
