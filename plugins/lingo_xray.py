@@ -34,7 +34,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
          =============  =======  ========  =================  ======  ==============
          `draft`        3        6e-03     5e-02              0.6     0.6
          `default`      5        2e-06     4e-05              1.0     1.0
-         `reference`    7        1e-07     2e-07              1.6     1.6
+         `reference`    7        1e-07     2e-07              1.6     1.5
          =============  =======  ========  =================  ======  ==============
 
          (Default: `default`)

@@ -142,7 +142,7 @@ def seconds(function: Callable) -> float:
     return time.perf_counter() - begun
 
 
-def kernel_ms(function: Callable, repeats: int = 3) -> float:
+def kernel_ms(function: Callable, repeats: int = 5) -> float:
     """Milliseconds that the device computes in a call, without Python and tracing: of `repeats` calls the median."""
     totals = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

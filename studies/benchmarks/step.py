@@ -1,8 +1,8 @@
 """Where the time of a step of a fit goes.
 
 Steps from the end of a fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
-saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns. A
-renewal of the cloud (densification) counts with its share of a step.
+saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns, of
+differences within a turn. A renewal of the cloud (densification) counts with its share of a step.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     scan = Scan(geometry, rng.uniform(1, 2, (views, *geometry.nDetector)).astype(np.float32))
     without = {
         'whole': settings,
+        'no gradient': replace(settings, loss=replace(settings.loss, lambda_gradient=0.0)),
         'no SSIM': replace(settings, loss=replace(settings.loss, lambda_ssim=0.0)),
         'no TV': replace(settings, loss=replace(settings.loss, lambda_tv=0.0)),
     }
@@ -69,16 +70,21 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
             do(turn)
             dr.sync_thread()
             times[name].append(time.perf_counter() - began)
-    median = {name: float(np.median(taken[WARM:])) for name, taken in times.items()}
-    found = {
-        'integrator, forward': median['image'],
-        'integrator, backward': median['image and derivatives'] - median['image'],
-        'SSIM': median['whole'] - median['no SSIM'],
-        'total variation': median['whole'] - median['no TV'],
-        'Adam': median['Adam'],
+    taken = {name: np.array(seconds[WARM:]) for name, seconds in times.items()}
+    whole = taken['whole']
+    parts = {
+        'integrator, forward': taken['image'],
+        'integrator, backward': taken['image and derivatives'] - taken['image'],
+        'gradient of the difference': whole - taken['no gradient'],
+        'SSIM': whole - taken['no SSIM'],
+        'total variation': whole - taken['no TV'],
+        'Adam': taken['Adam'],
+        'a step': whole,
     }
-    found['the rest'] = median['whole'] - sum(found.values())
-    return found | {'a step': median['whole'], 'densification': _renewal(steppers['whole'], state, rng)}
+    found = {name: float(np.median(seconds)) for name, seconds in parts.items()}
+    step = found.pop('a step')
+    found['the rest'] = step - sum(found.values())
+    return found | {'a step': step, 'densification': _renewal(steppers['whole'], state, rng)}
 
 
 def _renewal(stepper, state, rng):
