@@ -22,8 +22,8 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
     """The settings, limited by a scan.
 
     The largest scale is lowered so that no Gaussian in the volume can reach the source: in a cone beam such a Gaussian has
-    no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians. `stop` is decided. The other
-    settings of a neural field stay as they are.
+    no footprint (see `projectors.footprint`). `values_per_gaussian` limits the number of Gaussians, `tv_views` the total
+    variation. `stop` is decided. The other settings of a neural field stay as they are.
 
     Raises InputError if the source is inside the volume, for stop=on where views cannot be held out, for a step of more views
     than the scan has, and for more Gaussians at the start, or a larger field, than this process has memory for.
@@ -43,7 +43,9 @@ def bounded(settings: Settings, scan: Scan) -> Settings:
                 f'{has / 2**30:,.1f} GiB: lower field_entries'
             )
         return settings
-    control, bounds = settings.densification, settings.bounds
+    loss, control, bounds = settings.loss, settings.densification, settings.bounds
+    if 0 < loss.tv_views < len(scan):
+        settings = settings.changed(lambda_tv=loss.lambda_tv * loss.tv_views / len(scan), tv_views=0)
     if control.values_per_gaussian > 0:
         measured = scan.projections.size if valid is None else int(valid.sum())
         most = min(max(int(measured / control.values_per_gaussian), 1), control.max_gaussians)

@@ -15,7 +15,7 @@ LINGO = R2.changed(init='lingo', loss_scale='dynamic')
 # factor on the loss, and the gradient of the difference beside L1, which restores fine detail sooner; rates 5 to 30 times higher
 # that fall over the run; Nesterov's momentum, a shorter memory of the second moment, and a mean of the last steps; more weight on
 # SSIM; total variation of eight times the volume (with a short memory, each Gaussian must be smoothed more often than once in 64
-# steps); early densification, limited by the scan's size; an early stop where the noise is known.
+# steps), less for more views; early densification, limited by the scan's size; an early stop where the noise is known.
 FAST = R2.changed(
     init='edges',
     normalise=True,
@@ -25,6 +25,7 @@ FAST = R2.changed(
     lambda_gradient=2.0,
     lambda_tv=0.3,
     tv_stride=2,
+    tv_views=25,
     rate_centre=(1e-3, 5e-5),
     rate_density=(1e-1, 6e-3),
     rate_scale=(1.5e-1, 5e-3),

@@ -96,6 +96,8 @@ class LossSettings:
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
+    tv_views           number of views up to which `lambda_tv` holds (own): of n more views it is lambda_tv tv_views / n, so that
+                       n steps, one a view, have no more total variation beside more data; 0: the same for any number
     weights            'equal'; or 'noise' (own): rendered and measured pixels are divided by the standard deviation of their
                        noise (from the scan's `ct_detector`) before comparison
     loss_scale         'none'; 'dynamic': the paper's factor T_g + 1 / (4 T_g) on the whole loss; 'statistic': the same
@@ -108,12 +110,13 @@ class LossSettings:
     lambda_tv: float = 0.05
     tv_size: int = 32
     tv_stride: int = 1
+    tv_views: int = 0
     weights: str = 'equal'
     loss_scale: str = 'none'
 
     def __post_init__(self):
         weights = dict.fromkeys(('lambda_l1', 'lambda_ssim', 'lambda_gradient', 'lambda_tv'), (0, 1e6))
-        require_ranges(self, **weights, tv_size=(1, 1e6), tv_stride=(1, 1e6))
+        require_ranges(self, **weights, tv_size=(1, 1e6), tv_stride=(1, 1e6), tv_views=(0, 1e6))
         _require(
             self.lambda_l1 + self.lambda_ssim + self.lambda_gradient > 0,
             'one of lambda_l1, lambda_ssim and lambda_gradient must be above 0: nothing else compares with the projections',

@@ -78,6 +78,7 @@ ENDS = RATES | dict(
     rate_pose=((1e-12, 1e-12), (1.0, 1.0)),
     tv_stride=(1, 1e6),
     tv_size=(1, 1e6),
+    tv_views=(0, 1e6),
     V_S=(0, 1e6),
     occupancy_voxels=(1, 1e6),
     misses=(0, 1e6),
@@ -512,6 +513,16 @@ def test_values_of_invalid_pixels_do_not_count(scan):
     valid[:, :4] = True
     few = limits.bounded(SHORT.changed(values_per_gaussian=5), replace(scan, valid=valid))
     assert few.densification.max_gaussians == valid.sum() // 5
+
+
+def test_total_variation_beside_more_views(scan):
+    """No more of it in n steps, one a view, from `tv_views` on; once only, when limits meet limits."""
+    settings = SHORT.changed(lambda_tv=0.3, tv_views=2)
+    found = limits.bounded(settings, scan)
+    assert len(scan) == 3 and found.loss.lambda_tv == pytest.approx(0.2)
+    assert limits.bounded(found, scan) == found
+    for other in (settings.changed(tv_views=3), settings.changed(tv_views=0)):
+        assert limits.bounded(other, scan).loss.lambda_tv == 0.3
 
 
 def test_rates_in_lists(scan):
