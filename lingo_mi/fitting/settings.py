@@ -96,8 +96,8 @@ class LossSettings:
     lambda_tv          weight of the total variation of a random cube (0.05)
     tv_size            samples along its sides (32)
     tv_stride          voxels between samples (published: 1; own: 2 smooths eight times the volume at the same cost)
-    tv_views           number of views up to which `lambda_tv` holds (own): of n more views it is lambda_tv tv_views / n, so that
-                       n steps, one a view, have no more total variation beside more data; 0: the same for any number
+    tv_views           views up to which `lambda_tv` holds (own): with n views, if these are more, it is lambda_tv tv_views / n,
+                       so that more data have no more total variation beside them; 0: it holds for any number
     weights            'equal'; or 'noise' (own): rendered and measured pixels are divided by the standard deviation of their
                        noise (from the scan's `ct_detector`) before comparison
     loss_scale         'none'; 'dynamic': the paper's factor T_g + 1 / (4 T_g) on the whole loss; 'statistic': the same
