@@ -18,6 +18,7 @@ import numpy as np
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.settings import LossSettings
 from lingo_mi.fitting.step import Stepper
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
@@ -26,6 +27,11 @@ from lingo_mi.studies.markdown import table
 
 WARM = 3  # turns that are not counted
 VIEWS = 4  # at most
+LOSS = {  # parts of the loss by the settings of their weights
+    'gradient of the difference': 'lambda_gradient',
+    'SSIM': 'lambda_ssim',
+    'total variation': 'lambda_tv',
+}
 
 
 def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
@@ -35,13 +41,9 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     every = len(fitted.geometry) // views
     geometry, rng = fitted.geometry.subset(slice(0, views * every, every)), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (views, *geometry.nDetector)).astype(np.float32))
-    without = {
-        'whole': settings,
-        'no gradient': replace(settings, loss=replace(settings.loss, lambda_gradient=0.0)),
-        'no SSIM': replace(settings, loss=replace(settings.loss, lambda_ssim=0.0)),
-        'no TV': replace(settings, loss=replace(settings.loss, lambda_tv=0.0)),
-    }
-    steppers = {name: Stepper(scan, s) for name, s in without.items()}
+    steppers = {'whole': Stepper(scan, settings)}
+    for part in _parts_of_the_loss(settings.loss):
+        steppers[part] = Stepper(scan, replace(settings, loss=replace(settings.loss, **{LOSS[part]: 0.0})))
     late, upstream = settings.iterations - 1, dr.opaque(mi.Float, 1, int(np.prod(geometry.nDetector)))
     gradients = {name: dr.zeros(type(x), dr.width(x)) for name, x in state.values.items()}
     dr.eval(gradients)
@@ -76,9 +78,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     parts = {
         'integrator, forward': taken['image'],
         'integrator, backward': taken['image and derivatives'] - taken['image'],
-        'gradient of the difference': whole - taken['no gradient'],
-        'SSIM': whole - taken['no SSIM'],
-        'total variation': whole - taken['no TV'],
+        **{part: whole - taken[part] for part in LOSS if part in taken},
         'Adam': taken['Adam'],
         'a step': whole,
     }
@@ -86,6 +86,13 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     step = found.pop('a step')
     found['the rest'] = step - sum(found.values())
     return found | {'a step': step, 'densification': _renewal(steppers['whole'], state, rng)}
+
+
+def _parts_of_the_loss(loss: LossSettings) -> list[str]:
+    """Those of LOSS that it has and can do without: something else must compare with the projections."""
+    compared = loss.lambda_l1 + loss.lambda_ssim + loss.lambda_gradient
+    weights = {part: getattr(loss, name) for part, name in LOSS.items()}
+    return [part for part, weight in weights.items() if weight > 0 and (weight < compared or LOSS[part] == 'lambda_tv')]
 
 
 def _renewal(stepper, state, rng):

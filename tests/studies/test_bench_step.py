@@ -27,6 +27,13 @@ def test_parts_of_a_step(tmp_path):
     )
 
 
+def test_a_loss_of_one_part(tmp_path):
+    """It cannot be left out: a step would compare nothing."""
+    alone = dict(lambda_l1=0, lambda_ssim=0, lambda_gradient=1, lambda_tv=0)
+    found = measured(Fitted.from_checkpoint(checkpoint(tmp_path, 'fast', n_points=200, iterations=4, **alone)), 1)
+    assert set(found) == {'integrator, forward', 'integrator, backward', 'Adam', 'the rest', 'a step', 'densification'}
+
+
 def test_another_kind_of_fit(tmp_path):
     path = checkpoint(tmp_path, '3dgs', n_points=50, iterations=2)
     code, _, err = run(FIT.with_name('bench_step.py'), path)
