@@ -20,6 +20,7 @@ from lingo_mi.fitting.measured import modelled_effects
 from lingo_mi.fitting.resume import moments, require_same_fit, traits
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.stopping import Search
+from lingo_mi.fitting.view_order import view_order
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.metrics import current_names
 from lingo_mi.runtime import one_at_a_time
@@ -132,7 +133,7 @@ def run(
             average.restart()
         batch = stepper.settings.batch
         while len(order) < batch:  # every view once before any view twice
-            order += rng.permutation(len(stepper.geometry)).tolist()
+            order += view_order(stepper.geometry, settings.view_order, rng)
         views, rest = order[:batch], order[batch:]
         loss = stepper.step(state, views, iteration, rng)
         order, iteration = rest, iteration + 1

@@ -12,30 +12,32 @@ from lingo_mi.fitting.settings import Settings
 R2 = Settings()
 LINGO = R2.changed(init='lingo', loss_scale='dynamic')
 # Tuned on the foot and chest phantoms and the engine. Differences from R2: a start on the edges of a quick reconstruction; no
-# factor on the loss, and the gradient of the difference beside L1, which restores fine detail sooner; rates 5 to 30 times higher
-# that fall over the run; Nesterov's momentum, a shorter memory of the second moment, and a mean of the last steps; more weight on
-# SSIM; total variation of eight times the volume (with a short memory, each Gaussian must be smoothed more often than once in 64
-# steps), less for more views; early densification, limited by the scan's size; an early stop where the noise is known.
+# factor on the loss, and the gradient of the difference beside L1, which restores fine detail sooner; rates 3 to 40 times higher
+# that fall over the run; views in a row that lie well apart; Nesterov's momentum, a shorter memory of the second moment, and a
+# mean of the last steps; more weight on SSIM; total variation of eight times the volume (with a short memory, each Gaussian must
+# be smoothed more often than once in 64 steps), less for more views; early densification, limited by the scan's size; an early
+# stop where the noise is known.
 FAST = R2.changed(
     init='edges',
     normalise=True,
-    iterations=800,
+    iterations=600,
     decay_steps=0,
+    view_order='golden',
     lambda_ssim=1.0,
-    lambda_gradient=2.0,
-    lambda_tv=0.3,
+    lambda_gradient=3.0,
+    lambda_tv=0.4,
     tv_stride=2,
     tv_views=25,
-    rate_centre=(1e-3, 5e-5),
-    rate_density=(1e-1, 6e-3),
-    rate_scale=(1.5e-1, 5e-3),
+    rate_centre=(2e-3, 7e-5),
+    rate_density=(2e-1, 6e-3),
+    rate_scale=(2e-1, 5e-3),
     rate_rotation=(2e-2, 1e-3),
-    beta1=0.95,
-    beta2=0.98,
+    beta1=0.96,
+    beta2=0.97,
     nesterov=True,
     average=0.97,
     densify_from=50,
-    densify_until=400,
+    densify_until=300,
     densify_every=25,
     densify_threshold=1e-4,
     birth='halve',

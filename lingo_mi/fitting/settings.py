@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from lingo_mi.calibration.response.part import VARIES
 from lingo_mi.errors import InputError, shown
 from lingo_mi.fitting.field.settings import FieldSettings
+from lingo_mi.fitting.view_order import ORDERS
 from lingo_mi.lingo.initialise import LingoSettings
 from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
@@ -306,6 +307,7 @@ class Settings:
     iterations         Adam steps
     decay_steps        iterations over which the rates fall from first to last; 0: `iterations`
     batch              views per step
+    view_order         'random'; or 'golden', in which any few views in a row lie well apart (own; see `lingo_mi.fitting.view_order`)
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
     start, model, neural, loss, adam, calibration, stopping, densification, bounds
@@ -317,6 +319,7 @@ class Settings:
     iterations: int = 30_000
     decay_steps: int = 30_000
     batch: int = 1
+    view_order: str = 'random'
     coarse_share: float = 0.0
     checkpoint_seconds: float = 30.0
     start: StartSettings = field(default_factory=StartSettings)
@@ -337,6 +340,9 @@ class Settings:
             batch=(1, 1e6),
             coarse_share=(0, 1),
             checkpoint_seconds=(0, 1e9),
+        )
+        _require(
+            self.view_order in ORDERS, f'view_order is one of {", ".join(ORDERS)}, not {shown(self.view_order)}'
         )
         inits, init = INITS[self.model.render], self.start.init
         _require(
