@@ -307,7 +307,7 @@ class Settings:
     iterations         Adam steps
     decay_steps        iterations over which the rates fall from first to last; 0: `iterations`
     batch              views per step
-    view_order         'random'; or 'golden', in which any few views in a row lie well apart (own; see `lingo_mi.fitting.view_order`)
+    view_order         'random'; or 'golden': any few views in a row lie well apart (own; see `lingo_mi.fitting.view_order`)
     coarse_share       share of the iterations, at the start, that use views binned 2 x 2 (own): a quarter of the pixels
     checkpoint_seconds time between checkpoints
     start, model, neural, loss, adam, calibration, stopping, densification, bounds
@@ -341,9 +341,7 @@ class Settings:
             coarse_share=(0, 1),
             checkpoint_seconds=(0, 1e9),
         )
-        _require(
-            self.view_order in ORDERS, f'view_order is one of {", ".join(ORDERS)}, not {shown(self.view_order)}'
-        )
+        _require(self.view_order in ORDERS, f'view_order is one of {", ".join(ORDERS)}, not {shown(self.view_order)}')
         inits, init = INITS[self.model.render], self.start.init
         _require(
             init in inits, f'init is {" or ".join(map(repr, inits))} with render={self.model.render}, not {init!r}'
