@@ -23,7 +23,7 @@ data
 # %%
 # The fit
 # -------
-# 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 800 steps are usual; 250 are enough here.
+# 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 600 steps are usual; 250 are enough here.
 
 result = lm.fit(data, 'fast', iterations=250, n_points=4000)
 result
