@@ -61,7 +61,7 @@ def make_table(numbers: dict) -> str:
         *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
         ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
         ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
-        ('extra, s', lambda r: f'{r["model"]["seconds"] - r["ignore"]["seconds"]:+.0f}'),
+        ('extra, s', lambda r: f'{round(r["model"]["seconds"] - r["ignore"]["seconds"]):+d}'),
     ]
     return table(columns, numbers.values())
 
