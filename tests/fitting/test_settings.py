@@ -167,7 +167,7 @@ def test_changed_keeps_the_rest():
     before = METHODS['fast']
     after = before.changed(lambda_tv=0.1, iterations=900)
     assert after.flat() == before.flat() | dict(lambda_tv=0.1, iterations=900)
-    assert after.adam is before.adam and before.loss.lambda_tv == 0.3
+    assert after.adam is before.adam and before.loss.lambda_tv == 0.4
 
 
 @pytest.mark.parametrize(
