@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lingo_mi.calibration.response.response import Response
-from lingo_mi.calibration.search import SURE, Found, search
+from lingo_mi.calibration.search import Found, search
 from lingo_mi.errors import InputError, require_type
 from lingo_mi.geometry import Geometry
 from lingo_mi.parsing import whole
@@ -77,7 +77,7 @@ class Calibration:
         f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
         told = []
         for name, value in f.measured.items():
-            error, kept = f.errors[name], self._kept(name)
+            error, why = f.errors[name], f.refused.get(name)
             if name == 'yaw':
                 text = f'panel turned in its plane by {np.degrees(value):+.3f} degrees +- {np.degrees(error):.3f}'
             elif name[0] not in 'uv':
@@ -86,21 +86,11 @@ class Calibration:
                 what = 'shift' if len(name) == 1 else f'drift of order {name[1:]}'
                 pixels = value / pixel[name[0]]
                 text = f'{what} of the panel along {name[0]}: {value:+.4g} mm +- {error:.2g} ({pixels:+.3f} pixels)'
-            told.append(text + ('' if kept else ', not taken, as it is less than three standard errors'))
+            told.append(text + (f', not taken: {why}' if why else ''))
         told.append(
             f'views predict each other to {f.after:.4g} rms instead of {f.before:.4g} (line integrals, smoothed)'
         )
         return told
-
-    def _kept(self, name):
-        drift, response = self.found.drift, self.found.response
-        if response is not None and name in response.names():
-            return abs(self.found.measured[name]) > SURE * self.found.errors[name] and self.needed
-        if name == 'yaw':
-            return bool(drift.yaw)
-        values = getattr(drift, name[0])
-        k = int(name[1:] or 0)
-        return k < len(values) and bool(values[k])
 
 
 @one_at_a_time()
@@ -130,7 +120,8 @@ def calibrate(
     can hardly be told from an object that lies higher, and is not sought.
 
     Returns a `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less
-    than three standard errors from zero is left as it was. Raises InputError for fewer than 8 views, and a scan without signal.
+    than three standard errors from zero is left as it was, as is scattered light that would be negative in places. Raises
+    InputError for fewer than 8 views, and a scan without signal.
 
         calibration = lm.calibrate(data, drift=3)
         data = calibration.corrected(data)

@@ -20,6 +20,7 @@ import numpy as np
 
 from lingo_mi.calibration.cross_prediction import coarse, cross_predicted, folds_of
 from lingo_mi.calibration.drift import Drift
+from lingo_mi.calibration.response.part import SURE
 from lingo_mi.calibration.response.response import Response
 from lingo_mi.errors import InputError
 from lingo_mi.reconstruction.preconditions import require_signal
@@ -30,17 +31,17 @@ MOST_VIEWS = 60
 REACH = 0.06  # of the panel's width: how far off an axis is looked for
 SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
 LONGEST = 4.0  # steps for differences that a number may change by at a time
-SURE = 3.0  # standard errors from which a number is taken for real
 
 
 @dataclass(frozen=True)
 class Found:
     """What the search has found.
 
-    drift       the panel's place over the scan; a number that is less than three standard errors is 0 in it
+    drift       the panel's place over the scan; a number that is not taken is 0 in it
     response    of the detector, likewise; None if none was sought
     measured    all numbers as measured, by name, as `Drift.of` (mm, radians) and `Response.changed` have them
     errors      their standard errors
+    refused     why a number is not taken, by name
     before, after   root mean square difference between predicted and measured views, as given and with `drift`
     """
 
@@ -48,6 +49,7 @@ class Found:
     response: Response | None
     measured: dict[str, float]
     errors: dict[str, float]
+    refused: dict[str, str]
     before: float
     after: float
 
@@ -142,18 +144,23 @@ def search(
         here, r = level.stepped(here, r, D)
     errors = dict(zip(names, map(float, _standard_errors(r, D))))
     given, best = level.differences(zero), r
-    sure = [name for name in names if abs(here[name]) > SURE * errors[name]]
+    small = (name for name in names if not abs(here[name]) > SURE * errors[name])
+    refused = dict.fromkeys(small, 'it is less than three standard errors')
+    refused |= response.doubts(here, errors) if response else {}
+    sure = [name for name in names if name not in refused]
     chosen = zero | {name: here[name] for name in sure}
     if sure and len(sure) < len(names):  # the others once more, with the doubtful ones as given
         level.names, kept = sure, D[[names.index(name) for name in sure]]
         chosen, best = level.stepped(chosen, level.differences(chosen), kept)
     if not sure or np.square(best).sum() >= np.square(given).sum():
         chosen, best = zero, given
+        refused = dict.fromkeys(sure, 'views do not predict each other better') | refused
     return Found(
         Drift.of(whole.geometry, {name: value for name, value in chosen.items() if name in _determined(scan, degree)}),
         response and response.changed(chosen),
         here,
         errors,
+        refused,
         float(np.sqrt(np.square(given).mean())),
         float(np.sqrt(np.square(best).mean())),
     )

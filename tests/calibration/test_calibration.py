@@ -151,6 +151,24 @@ def test_curve_of_the_detector():
     assert np.std(found.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
 
 
+def test_gain_over_time():
+    """A gain that falls and rises by 4 %: its polynomials to 0.01."""
+    true = dict(gain1=-0.02, gain2=0.02, gain3=0.0)
+    scan, p = responding(true, gain='smooth')
+    found = lm.calibrate(scan, gain=True, progress=False)
+    assert {name: found.found.measured[name] for name in true} == pytest.approx(true, abs=0.01)
+    assert np.std(found.corrected(scan).projections - p) < 0.5 * np.std(scan.projections - p)
+
+
+def test_scattered_light_is_not_negative():
+    """Light that is missing, most of it in the panel's middle, is no scatter: the scan stays as it is, and the lines say why."""
+    scan, _ = responding({'scatter0_0': -0.02, 'scatter0_3': 0.01}, scatter='one')
+    found = lm.calibrate(scan, scatter=True, progress=False)
+    assert found.found.measured['scatter0_0'] < -0.01 and not found.found.response.parts[0].values.any()
+    told = [line for line in found.lines() if 'scatter' in line]
+    assert len(told) == 6 and all('not taken: it would be negative in places' in line for line in told)
+
+
 @pytest.mark.slow
 def test_air_and_scatter():
     """Air to 0.01, scatter to a hundredth of the open beam."""
@@ -158,9 +176,9 @@ def test_air_and_scatter():
     found = lm.calibrate(scan, air=True, progress=False).found.measured
     assert (found['air0'], found['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
     scan, _ = responding({'scatter0_0': 0.03}, scatter='one')
-    assert lm.calibrate(scan, scatter=True, progress=False).found.measured['scatter0_0'] == pytest.approx(
-        0.03, abs=0.01
-    )
+    found = lm.calibrate(scan, scatter=True, progress=False).found
+    assert found.measured['scatter0_0'] == pytest.approx(0.03, abs=0.01)
+    assert 'scatter0_0' not in found.refused and found.response.parts[0].values[0, 0] > 0.02
 
 
 @pytest.mark.slow
@@ -244,7 +262,7 @@ def test_a_response_that_was_not_found_leaves_the_effects():
     scan = lm.Scan(geometry, grid.project(data, geometry), effects=effects)
     response = Response.of(geometry, air='smooth')
     drift = Drift(geometry, u=(0.5,), v=(0.3,))
-    found = Found(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), 1.0, 0.5)
+    found = Found(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)
     calibration = Calibration(geometry, found)
     moved = calibration.corrected(scan)
     assert moved.effects is effects and moved.geometry != geometry

@@ -66,6 +66,16 @@ def test_derivatives_by_differences():
         np.testing.assert_allclose(by_p[inside], found[inside], atol=1e-4)
 
 
+def test_negative_light_is_doubted_beyond_three_standard_errors():
+    response = Response.of(GEOMETRY, air='view', curve=1, scatter='one')
+    errors = dict.fromkeys(response.names(), np.inf) | {f'scatter0_{k}': 1e-3 for k in range(6)}
+    light = {'scatter0_0': 0.02, 'scatter0_1': 0.015, 'scatter0_5': 0.004}
+    assert response.doubts(light, errors) == {}
+    assert response.doubts(light | {'scatter0_1': 0.021}, errors) == {}  # -0.003 +- 0.002 at an edge
+    assert list(response.doubts(light | {'scatter0_1': 0.03}, errors)) == [f'scatter0_{k}' for k in range(6)]
+    assert response.doubts({'air0': -1.0, 'curve0': -5.0}, errors) == {}
+
+
 @pytest.mark.parametrize(
     ('parts', 'within'),
     [

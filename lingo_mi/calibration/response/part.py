@@ -10,6 +10,7 @@ import numpy as np
 
 VARIES = ('off', 'smooth', 'view')  # how air and gain change from view to view
 SMOOTH = 3  # degree in time of what is smooth
+SURE = 3.0  # standard errors from which a number is taken for real
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,10 @@ class Part(ABC):
     @abstractmethod
     def report(self, c: np.ndarray) -> dict[str, list[float]]:
         """Physical quantities by name, each [n], of the numbers c [n, K] of n views."""
+
+    def doubt(self, errors: np.ndarray) -> str:
+        """Why `values` cannot be true, given their standard errors [T, K], in words; '' if they can."""
+        return ''
 
     def hold(self) -> None:  # noqa: B027 - most models need none
         """Take out of `values` what no scan tells."""

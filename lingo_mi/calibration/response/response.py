@@ -112,17 +112,19 @@ class Response:
 
     def changed(self, numbers: dict[str, float]) -> Response:
         """A copy with other numbers, by name. Those that are missing are 0, and names of no part are passed over."""
-        parts = []
-        for part in self.parts:
-            own = copy(part)
-            own.values = np.zeros_like(part.values)
-            for name, value in numbers.items():
-                row, _, k = name.removeprefix(part.name).partition('_')
-                if name.startswith(part.name) and row.isdigit():
-                    own.values[int(row), int(k or 0)] = value
-            own.hold()
-            parts.append(own)
+        parts = [copy(part) for part in self.parts]
+        for part in parts:
+            part.values = _values(part, numbers)
+            part.hold()
         return Response(self.geometry, parts)
+
+    def doubts(self, numbers: dict[str, float], errors: dict[str, float]) -> dict[str, str]:
+        """Which numbers, by name, cannot be true, given their standard errors, and why."""
+        found = {}
+        for part in self.changed(numbers).parts:
+            if why := part.doubt(_values(part, errors)):
+                found |= {name: why for name in self.names() if name.rstrip('0123456789_') == part.name}
+        return found
 
     def report(self) -> dict[str, list[float]]:
         """What was found, in physical units, of every view (of a curve: once)."""
@@ -199,6 +201,16 @@ class Response:
             else:  # between neighbours
                 found.append(np.maximum(0, 1 - np.abs(np.asarray(index, float)[:, None] - np.arange(n))))
         return found
+
+
+def _values(part, numbers):
+    """The values [T, K] of a part, of numbers by name as `Response.names` has them; 0 for those that are missing."""
+    values = np.zeros_like(part.values)
+    for name, value in numbers.items():
+        row, _, k = name.removeprefix(part.name).partition('_')
+        if name.startswith(part.name) and row.isdigit():
+            values[int(row), int(k or 0)] = value
+    return values
 
 
 def _place(shape):

@@ -11,11 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.calibration.response.part import Part
+from lingo_mi.calibration.response.part import SURE, Part, Place
 
 DEGREE = 2
 ORDERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 LEAST_LIGHT = 0.1  # of what is measured is not scatter
+EVERYWHERE = Place(*np.meshgrid(*2 * [np.linspace(-1, 1, 41)], indexing='ij'))
 
 
 @dataclass
@@ -44,8 +45,13 @@ class Scatter(Part):
     def report(self, c):
         return {'scatter_percent_of_open_beam': (100 * c[:, 0]).tolist()}  # the mean over the panel
 
-    def _image(self, c, place):
-        return sum(x * basis for x, basis in zip(c, _bases(place)))
+    def doubt(self, errors):
+        lowest = self._image(self.values[0], EVERYWHERE)
+        error = np.sqrt(self._image(errors[0] ** 2, EVERYWHERE, 2))
+        return 'it would be negative in places' if (lowest < -SURE * error).any() else ''
+
+    def _image(self, c, place, power=1):
+        return sum(x * basis**power for x, basis in zip(c, _bases(place)))
 
 
 def _bases(place):
