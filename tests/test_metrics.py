@@ -1,5 +1,7 @@
 """The quality measures against scikit-image, by hand, and at their edges."""
 
+import time
+
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -186,6 +188,26 @@ def test_float32_input_is_accumulated_in_float64():
     error = float(volume[0, 0, 0]) - 0.5
     assert psnr_3d_r2(volume, truth) == pytest.approx(-20 * np.log10(error), rel=1e-9)
     assert metrics.WINDOW.sum() == pytest.approx(1)
+
+
+def test_views_on_threads_keep_their_order_and_few_are_taken_in_advance():
+    taken, most = [], 0
+
+    def items():
+        for i in range(20):
+            taken.append(i)
+            yield i, 100
+
+    def slow_first(i, j):
+        time.sleep(0.02 * (i == 0))
+        return i + j
+
+    for done, found in enumerate(metrics._each(slow_first, items(), threads=3)):
+        assert found == done + 100
+        most = max(most, len(taken) - done)
+    assert most <= 4 and len(taken) == 20
+    with pytest.raises(ZeroDivisionError):
+        list(metrics._each(lambda i: 1 // i, ((0,),)))
 
 
 def test_names_of_earlier_results_become_todays():
