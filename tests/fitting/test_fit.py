@@ -426,8 +426,9 @@ def test_an_unfinished_fit_is_its_mean_so_far(scan, tmp_path):
             settings,
             some_points(scan.geometry),
             measure=lambda model, state: measured.append(state.host()) or {},
-            progress=stop_at(8),  # one of the iterations that are measured
+            progress=stop_at(8),
             path=path,
+            at=[8],
         )
     for name, values in Fitted.from_checkpoint(path).state.values.items():
         np.testing.assert_array_equal(values, measured[-1].values[name])
