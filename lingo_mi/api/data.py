@@ -21,7 +21,8 @@ from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
 from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
 from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
-from lingo_mi.raw.importing import Options, import_raw
+from lingo_mi.raw.importing import import_raw
+from lingo_mi.raw.options import Options
 from lingo_mi.runtime import ensure_variant, one_at_a_time
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory, require_densities, warn_if_truncated
@@ -148,7 +149,7 @@ def load_raw(
     progress   whether to show a progress bar on standard error
     options    flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
                saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file;
-               pixel, mm. `lingo_mi.raw.importing.Options` describes them, and `lingo-mi import` writes a file
+               pixel, mm. `lingo_mi.raw.options.Options` describes them, and `lingo-mi import` writes a file
 
     Returns a `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts. Raises InputError where
     something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.

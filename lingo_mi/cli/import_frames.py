@@ -74,8 +74,9 @@ def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
 def main() -> None:
     args = arguments()
     from lingo_mi.files.scans import named_files, write_scan
-    from lingo_mi.raw.importing import Options, import_raw
+    from lingo_mi.raw.importing import import_raw
     from lingo_mi.raw.nikon import read_numbers
+    from lingo_mi.raw.options import Options
 
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')

@@ -6,26 +6,17 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import checkpoint
-from lingo_mi.fitting.average import Average
-from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.kinds import Model, stepper_of
-from lingo_mi.fitting.measured import modelled_effects
-from lingo_mi.fitting.resume import moments, require_same_fit, traits
+from lingo_mi.fitting.kinds import Model
+from lingo_mi.fitting.running import Running
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.fitting.stopping import Search
-from lingo_mi.fitting.view_order import view_order
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.metrics import current_names
 from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
-from lingo_mi.scene.description import describe
 
 
 @one_at_a_time()
@@ -60,116 +51,22 @@ def run(
     begin = path if initial is None else initial
     if begin is None:
         raise InputError('a fit needs an initial cloud to start from, or the path of a checkpoint to go on from')
-    given, settings = settings, bounded(settings, scan)
-    search = Search(scan, given) if settings.stopping.stop == 'on' else None
-    rng = np.random.default_rng(seed)
-    average = Average(settings.adam.average)
-    scanned = dict(
-        views=len(scan),
-        scanner=describe(scan.geometry),
-        signal=float(scan.projections.mean(dtype=float)),
-        moments=moments(scan.projections),
-        traits=traits(scan),
-    )
-    if isinstance(begin, Path):
-        host, extra, arrays = checkpoint.load(begin)
-        modelled = modelled_effects(scan, settings)
-        require_same_fit(extra, settings, scanned, seed, begin, bool(modelled and modelled.scatter))
-        rng.bit_generator.state = extra['rng']
-        points, order = arrays['initial'], [int(i) for i in arrays['order']]
-        iteration, seconds, info = (extra[k] for k in ('iteration', 'seconds', 'info'))
-        history = [current_names(entry) for entry in extra['history']]
-        state = DeviceState(host)
-        if search is not None:
-            search.restore(arrays)
-        stepper = search.stepper() if search and search.on else stepper_of(scan, settings)
-        stepper.restore(arrays)
-        average.restore(arrays)
-    else:
-        points, order = begin.points.astype(np.float32), []
-        iteration, seconds, history, info = 0, 0.0, [], dict(begin.info)
-        stepper = stepper_of(scan, settings)
-        host = stepper.start(begin, rng.spawn(1)[0])  # takes nothing from the steps, which may begin anew
-        if search is not None:
-            stepper, host = search.begin(host, seed)
-        state = DeviceState(host)
-    last = search.kept if search and not search.on else settings.iterations
-    marks = {*(measure_at(settings.iterations) if at is None else at), last}
-    clock = saved = time.perf_counter()
-
-    def store():
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            checkpoint.save(
-                path,
-                state.host(),
-                dict(
-                    seed=seed,
-                    rng=rng.bit_generator.state,
-                    iteration=iteration,
-                    seconds=seconds + time.perf_counter() - clock,
-                    history=history,
-                    info=info,
-                    settings=settings.flat(),
-                    unit=stepper.model.unit,
-                    effects=stepper.model.effects is not None,
-                    **scanned,
-                ),
-                dict(initial=points, order=np.array(order, int))
-                | stepper.arrays()
-                | average.arrays()
-                | (search.arrays() if search else {}),
-            )
-
-    while iteration < last or search and search.on:
-        if search and search.on and search.over:  # begin anew, with all views
-            stepper, state = stepper_of(scan, settings), DeviceState(search.end())
-            rng, order, iteration, last = np.random.default_rng(seed), [], 0, search.kept
-            marks.add(last)
-            average.restart()
-        # Before a step, so never after the last one. A longer fit that continues from there does it first.
-        if renewed := stepper.renewed(state, iteration, rng):
-            state = renewed
-            average.restart()
-        batch = stepper.settings.batch
-        while len(order) < batch:  # every view once before any view twice
-            order += view_order(stepper.geometry, settings.view_order, rng)
-        views, rest = order[:batch], order[batch:]
-        loss = stepper.step(state, views, iteration, rng)
-        order, iteration = rest, iteration + 1
-        average.add(state)
-        if search and search.on:
-            if search.due(iteration):
-                search.look(iteration, stepper, average.of(state))
-        elif iteration in marks:
-            dr.sync_thread()
-            value = float(loss[0])
-            if not (np.isfinite(value) and state.finite()):  # a Gaussian that is not finite would silently vanish
-                raise InputError(
-                    f'the fit is no longer finite at iteration {iteration}: lower the rates, or check the projections'
-                )
-            seconds += time.perf_counter() - clock
-            entry = dict(iteration=iteration, seconds=seconds, loss=value, gaussians=len(state))
-            history.append(entry | (measure(stepper.model, average.of(state)) if measure else {}))
-            clock = time.perf_counter()  # excludes the time of `measure`
+    fit = Running(scan, settings, seed, begin)
+    marks = set(measure_at(fit.settings.iterations) if at is None else at)
+    saved = time.perf_counter()
+    while not fit.over:
+        loss = fit.step()
+        fit.look(loss, marks, measure)
         if progress is not None:
-            measured = history[-1].items() if history else ()
-            shown = {k: v for k, v in measured if k.startswith('psnr') and not k.endswith('_r2')}
-            shown |= search.shown if search else {}
             try:
-                progress(iteration, loss=lambda: float(loss[0]), gaussians=len(state) or None, **shown)
+                progress(fit.iteration, loss=lambda value=loss: float(value[0]), **fit.shown)
             except KeyboardInterrupt:
-                store()
+                fit.store(path)
                 raise
-        if time.perf_counter() - saved > settings.checkpoint_seconds:
-            store()
+        if time.perf_counter() - saved > fit.settings.checkpoint_seconds:
+            fit.store(path)
             saved = time.perf_counter()
-    state = average.of(state)
-    dr.sync_thread()
-    store()
-    seconds += time.perf_counter() - clock
-    found = search.record() if search else None
-    return Fitted(stepper.model, state.host(), points, stepper.poses, seed, history, seconds, info, found, iteration)
+    return fit.end(path)
 
 
 def measure_at(iterations: int) -> list[int]:

@@ -7,7 +7,8 @@ Without flats, the air level of each view stands for the flat field: its mean in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -35,6 +36,11 @@ class Fields:
     flat: np.ndarray | None
     good: np.ndarray
     photons: float | None
+
+    def part(self, kept: Callable[[np.ndarray], np.ndarray]) -> Fields:
+        """What `kept` keeps of each image."""
+        flat = None if self.flat is None else kept(self.flat)
+        return replace(self, dark=kept(self.dark), flat=flat, good=kept(self.good))
 
 
 def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, saturation: float = np.inf) -> Fields:

@@ -34,7 +34,8 @@ class Reconstruction:
         found.save('out/foot.nii.gz')
 
     volume      float32 [x, y, z], density per mm
-    residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|); none for FDK
+    residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN where it was not computed; none for
+                FDK
     seconds     wall-clock time
     geometry    of the scan; its voxels are those of the volume
     """

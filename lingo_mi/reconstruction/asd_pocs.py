@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
@@ -102,7 +103,8 @@ class ASDPOCS(Algorithm):
     seed            of the random order, at least 0
 
     It stops when the data are matched and both parts of a pass cancel (cosine below -0.99), or when lmbda falls below 0.005.
-    The volume is that after descent, as in TIGRE; the residuals are those before it.
+    The volume is that after descent, as in TIGRE; the residuals are those before it, of the passes where they decide anything
+    and of the last one.
 
     Use it for few views of objects with large uniform regions. For noisy projections, maxl2err sets how closely to match them.
 
@@ -164,32 +166,38 @@ class ASDPOCS(Algorithm):
         system = System(scan, weights, blur)
         x = system.start(start)
         maxl2err = self._maxl2err(system, scan)
-        residuals, lmbda, step = [system.residual(x)[1]], self.lmbda, 0.0
+        residuals = [system.relative(system.b) if start is None else system.residual(x)[1]]
+        projected, lmbda, step = x, self.lmbda, 0.0
+
+        def error() -> float:
+            """|A x - b| before the descent of this pass. Computed when it decides, since it takes half as long as P."""
+            if np.isnan(residuals[-1]):
+                residuals[-1] = system.residual(projected)[1]
+            return residuals[-1] * system.size_b
+
         for k in range(self.niter):
             if self.exact_every and k % self.exact_every == 0:
                 system.correct(x)
-            before = x
-            x = sweep(system, x, lmbda, next(order), self.noneg)
-            residuals.append(system.residual(x)[1])
-            error = residuals[-1] * system.size_b
-            data_change = evaluated(x - before)
+            projected = sweep(system, x, lmbda, next(order), self.noneg)
+            residuals.append(np.nan)
+            data_change = evaluated(projected - x)
             data_length = norm(data_change)
             if k == 0:
                 step = self.alpha * data_length
-            before = x
-            x = minimise_tv(x, scan.geometry.nVoxel, step, self.tviter)
-            tv_change = evaluated(x - before)
+            x = minimise_tv(projected, scan.geometry.nVoxel, step, self.tviter)
+            tv_change = evaluated(x - projected)
             tv_length = norm(tv_change)
-            if tv_length > self.rmax * data_length and error > maxl2err:
+            if tv_length > self.rmax * data_length and error() > maxl2err:
                 step *= self.alpha_red
             lmbda *= self.lmbda_red
             if progress:
-                progress(k + 1, self.niter, residuals[-1])
+                progress(k + 1, self.niter, None if np.isnan(residuals[-1]) else residuals[-1])
             cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
-            if (cosine < -0.99 and error <= maxl2err) or lmbda < LMBDA_MIN:
+            if (cosine < -0.99 and error() <= maxl2err) or lmbda < LMBDA_MIN:
                 break
             if watch is not None and watch(k + 1, x):
                 break
+        error()  # of the last pass in any case
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
 
     def _maxl2err(self, system: System, scan: Scan) -> float:

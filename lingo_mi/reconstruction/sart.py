@@ -116,7 +116,8 @@ class Sweeps(Algorithm):
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`.
+        """Reconstruct the volume of a scan, see `Algorithm.run`. Without tol, the residual is computed at the end alone, since it
+        takes half as long as a pass.
 
         weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
         blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
@@ -125,14 +126,16 @@ class Sweeps(Algorithm):
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
         system = System(scan, weights, blur)
         x = system.start(start)
-        residuals = [system.residual(x)[1]]
+        residuals = [system.relative(system.b) if start is None else system.residual(x)[1]]
         for k in range(how.niter):
-            if residuals[-1] <= how.tol:
+            if how.tol and residuals[-1] <= how.tol:
                 break
             x = sweep(system, x, how.lmbda * how.lmbda_red**k, next(order), how.noneg)
-            residuals.append(system.residual(x)[1])
+            known = how.tol or k + 1 == how.niter
+            residuals.append(system.residual(x)[1] if known else np.nan)
             if progress:
-                progress(k + 1, how.niter, residuals[-1])
+                dr.sync_thread()
+                progress(k + 1, how.niter, residuals[-1] if known else None)
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
 
     def slabs(

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from lingo_mi.errors import InputError
-from lingo_mi.fitting import loop
+from lingo_mi.fitting import loop, running
 from lingo_mi.fitting.models.integral import PARAMETERS
 from lingo_mi.fitting.settings import AdamSettings
 
@@ -19,13 +19,13 @@ def centres_of(settings, scan, **more):
     """The fit, and the centres after every one of its steps."""
     seen = []
 
-    class Spy(loop.Average):
+    class Spy(running.Average):
         def add(self, state):
             seen.append(state.host().values)
             super().add(state)
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(loop, 'Average', Spy)
+    patch.setattr(running, 'Average', Spy)
     try:
         return loop.run(scan, settings, some_points(scan.geometry), seed=3, **more), seen
     finally:
@@ -78,7 +78,7 @@ def test_bad_decay(average):
 @pytest.mark.parametrize('decay', [0.0, 0.5])
 def test_a_measured_state_stays_as_it_was(decay):
     """A page that is opened later shows the fit of its moment."""
-    state, average = SimpleNamespace(values=dict(density=mi.Float([1.0, 2.0]))), loop.Average(decay)
+    state, average = SimpleNamespace(values=dict(density=mi.Float([1.0, 2.0]))), running.Average(decay)
     average.add(state)
     seen = average.of(state)
     before = seen.values['density'].numpy().copy()

@@ -16,8 +16,9 @@ from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import rtk
 from lingo_mi.raw.frames import open_recording
-from lingo_mi.raw.importing import Options, import_raw
+from lingo_mi.raw.importing import import_raw
 from lingo_mi.raw.line_integrals import photons_of_images
+from lingo_mi.raw.options import Options
 
 tifffile = pytest.importorskip('tifffile')
 

@@ -1,0 +1,96 @@
+"""What is asked of an import: `Options`, and its values that depend on the frames."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.errors import InputError
+from lingo_mi.parsing import checked, whole
+
+
+@dataclass(frozen=True)
+class Options:
+    """How frames become line integrals.
+
+    flats, darks   files or folders of their own; None: those of the recording, if it has any
+    air            (v0, v1, u0, u1), pixels of the whole frame where no view has an object: their mean is the air level of a view
+    percentile     instead: that percentile of a view is its air level
+    i0             instead: counts of the unattenuated beam
+    exposure       [n] or one number: exposure of every view over that of the flats
+    saturation     counts from here on are not valid; None: the largest value of an integer type
+    crop           (v0, v1, u0, u1), pixels of the whole frame to keep
+    binning        pixels (v and u) that become one
+    views          (first, end, step) of the views to keep; the end may be None
+    angles         [n] degrees or the file that lists them, where the geometry does not
+    pixel          size of a raw pixel, mm; for a geometry of RTK
+    """
+
+    flats: PathLike | str | None = None
+    darks: PathLike | str | None = None
+    air: tuple[int, int, int, int] | None = None
+    percentile: float | None = None
+    i0: float | None = None
+    exposure: Any = 1.0
+    saturation: float | None = None
+    crop: tuple[int, int, int, int] | None = None
+    binning: int = 1
+    views: tuple[int, int | None, int] | None = None
+    angles: Any = None
+    pixel: float | None = None
+
+    def __post_init__(self):
+        """Raises InputError for values of another kind; those that depend on the frames are checked with them."""
+        for name in 'percentile', 'i0', 'saturation', 'pixel':
+            if getattr(self, name) is not None:
+                checked(name, getattr(self, name), 0.0)
+        whole('binning', self.binning, 1)
+        try:
+            first, end, step = (0, None, 1) if self.views is None else self.views
+            for value in (first, 0 if end is None else end, step):
+                operator.index(value)
+        except (TypeError, ValueError):
+            raise InputError(
+                f'views must be (first, end, step), the end a number or None, not {self.views!r}'
+            ) from None
+
+
+def region_of(name: str, region: Any, shape: tuple[int, int]) -> tuple[int, int, int, int] | None:
+    """A region (v0, v1, u0, u1), which must lie in a frame; None for None."""
+    if region is None:
+        return None
+    try:
+        v0, v1, u0, u1 = (int(x) for x in region)
+    except (TypeError, ValueError):
+        raise InputError(f'{name} must be four whole numbers, (v0, v1, u0, u1), not {region!r}') from None
+    if not (0 <= v0 < v1 <= shape[0] and 0 <= u0 < u1 <= shape[1]):
+        raise InputError(
+            f'{name} = {(v0, v1, u0, u1)} does not lie in a frame of {shape} pixels; it is (v0, v1, u0, u1)'
+        )
+    return v0, v1, u0, u1
+
+
+def chosen_views(views: tuple[int, int | None, int] | None, n: int) -> np.ndarray:
+    """The numbers of the views to keep, of n."""
+    index = np.arange(n)
+    if views is not None:
+        first, end, step = views
+        index = index[first:end:step] if step > 0 else index[:0]
+    if not len(index):
+        raise InputError(f'no view is left of {n}; views are (first, end, step)')
+    return index
+
+
+def exposures(exposure: Any, n: int) -> np.ndarray:
+    """The exposure of each of n views."""
+    try:
+        values = np.asarray(exposure, float)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
+    if values.shape not in ((), (1,), (n,)) or not np.all(values > 0):
+        raise InputError(f'exposure must be one positive number, or one for each of {n} views')
+    return np.broadcast_to(values, (n,))
