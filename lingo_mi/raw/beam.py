@@ -80,7 +80,9 @@ class Beam:
         reference = np.full(frame.shape, exposure) if self.panel.flat is None else self.panel.flat * exposure
         if self.air is not None:
             v0, v1, u0, u1 = self.air
-            good, counts, reference = (x[v0:v1, u0:u1] for x in (good, counts, reference))
+            inside = np.zeros(frame.shape, bool)
+            inside[v0:v1, u0:u1] = True
+            good &= inside
         if not good.any():
             return np.nan
         counts, reference = counts[good], reference[good]

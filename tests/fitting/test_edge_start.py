@@ -11,7 +11,6 @@ from lingo_mi.fitting import edge_start as edges
 from lingo_mi.fitting.edge_start import edge_start
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.reconstruction.sart import SART
 from lingo_mi.scan import Scan
 
 CENTRE, (RADIUS, *_), DENSITY = BALL
@@ -50,11 +49,6 @@ def test_densities_are_those_of_the_volume_times_the_factor_of_the_projections(b
     deep = distances(cloud, ball) < 0.7
     assert deep.sum() > 10 and np.median(cloud.density[deep]) == pytest.approx(4 * DENSITY, rel=0.05)
     np.testing.assert_allclose(start(ball).density, cloud.density / 4, rtol=1e-6)
-
-
-def test_its_volume_is_that_of_sart(ball):
-    of = edges._coarse(ball)
-    np.testing.assert_array_equal(edges._quick_volume(of), SART(niter=edges.PASSES).run(of).volume)
 
 
 def test_the_seed_alone_decides(ball):
