@@ -1,4 +1,4 @@
-"""Image quality in 2D (projections) and 3D (volumes). Pure NumPy and SciPy, in float64, a view or a slab at a time.
+"""Image quality in 2D (projections) and 3D (volumes). Pure NumPy and SciPy, in float64, a few views or slabs at a time.
 
 Each measure comes in two forms. The plain name is the absolute one, and `_r2` is R2-Gaussian's:
 
@@ -21,7 +21,6 @@ from error visibility to structural similarity", IEEE TIP 2004 (SSIM).
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,13 +30,14 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
 from lingo_mi.errors import InputError
+from lingo_mi.runtime import cores
 
 WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
 # Values that are made float64 at once: the whole of a large volume, with its temporaries, takes ten times itself.
-SLAB = 2**22
-THREADS = min(os.cpu_count() or 1, 8)
+SLAB = 2**23
+THREADS = 8  # at most, and fewer for large views
 
 
 def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
@@ -47,7 +47,7 @@ def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     positive pixel is compared undivided.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
-    return _mean(_each(lambda a, b: _psnr(a, b, 1.0), _own_maximum(images, truth)))
+    return _mean(_each(lambda a, b: _psnr(a, b, 1.0), _own_maximum(images, truth), images[0].size))
 
 
 def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
@@ -58,7 +58,7 @@ def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     peak = _peak(truth, peak)
-    return _mean(_each(lambda a, b: _psnr(a, b, peak), zip(images, truth))) if peak > 0 else np.nan
+    return _mean(_each(lambda a, b: _psnr(a, b, peak), zip(images, truth), images[0].size)) if peak > 0 else np.nan
 
 
 def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
@@ -67,7 +67,7 @@ def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     images, truth : [view, v, u]. Views whose truth has no positive pixel are left out.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
-    return _mean(_each(_ssim, _own_maximum(images, truth)))
+    return _mean(_each(_ssim, _own_maximum(images, truth), images[0].size))
 
 
 def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
@@ -78,7 +78,7 @@ def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     peak = _peak(truth, peak)
-    return _mean(_each(lambda a, b: _ssim(a, b, peak), zip(images, truth))) if peak > 0 else np.nan
+    return _mean(_each(lambda a, b: _ssim(a, b, peak), zip(images, truth), images[0].size)) if peak > 0 else np.nan
 
 
 def psnr_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
@@ -101,7 +101,7 @@ def ssim_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
         a, b = np.moveaxis(volume, axis, 0), np.moveaxis(truth, axis, 0)
         if min(a.shape[1:]) > 1 or max(a.shape) == 1:
             # One slice at a time: its few temporaries stay in the cache.
-            means.append(_mean(_each(_ssim, ((x, y) for x, y in zip(a, b) if y.max() > 0))))
+            means.append(_mean(_each(_ssim, ((x, y) for x, y in zip(a, b) if y.max() > 0), a[0].size)))
     return _mean(means)
 
 
@@ -135,8 +135,8 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
         found = ssim_map(volume[near].astype(float) / peak, truth[near].astype(float) / peak, axes)
         return found[slab.start - low : slab.stop - low].sum()
 
-    slabs = ((slab,) for slab in _slabs(truth))
-    return float(sum(_each(of, slabs, threads=2)) / truth.size)  # two: each takes ten times its slab
+    size = (_thickness(truth) + 2 * reach) * truth[0].size
+    return float(sum(_each(of, ((slab,) for slab in _slabs(truth)), size)) / truth.size)
 
 
 def compared(volume: ArrayLike, truth: ArrayLike) -> dict[str, float | None]:
@@ -198,9 +198,13 @@ def _pair(a, b, what, axes):
 
 def _slabs(array: np.ndarray) -> Iterator[slice]:
     """Slices of the first axis, of at most `SLAB` values each, or one long."""
-    thickness = max(1, SLAB // max(1, array[0].size))
+    thickness = _thickness(array)
     for start in range(0, len(array), thickness):
         yield slice(start, min(start + thickness, len(array)))
+
+
+def _thickness(array):
+    return max(1, SLAB // max(1, array[0].size))
 
 
 def _peak(truth, peak):
@@ -218,10 +222,13 @@ def _own_maximum(images, truth):
             yield a / (a.max() if a.max() > 0 else 1.0), b / b.max()
 
 
-def _each(function, items, threads=THREADS):
+def _each(function, items, size):
     """The function of each of the items, which are tuples of arguments, in their order, on threads: NumPy and SciPy work without
-    Python's lock. Only so many items are taken in advance, because a view or a slab with its temporaries is large.
+    Python's lock. Only so many items are taken in advance as there are threads, with three slabs of values together, or one item.
+
+    size   of an item, values
     """
+    threads = max(1, min(cores(), THREADS, 3 * SLAB // size))
     with ThreadPoolExecutor(threads) as pool:
         running: deque = deque()
         for item in items:

@@ -202,12 +202,12 @@ def test_views_on_threads_keep_their_order_and_few_are_taken_in_advance():
         time.sleep(0.02 * (i == 0))
         return i + j
 
-    for done, found in enumerate(metrics._each(slow_first, items(), threads=3)):
+    for done, found in enumerate(metrics._each(slow_first, items(), metrics.SLAB)):
         assert found == done + 100
         most = max(most, len(taken) - done)
-    assert most <= 4 and len(taken) == 20
+    assert most <= 4 and len(taken) == 20  # three slabs at a time
     with pytest.raises(ZeroDivisionError):
-        list(metrics._each(lambda i: 1 // i, ((0,),)))
+        list(metrics._each(lambda i: 1 // i, ((0,),), 1))
 
 
 def test_names_of_earlier_results_become_todays():

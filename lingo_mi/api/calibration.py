@@ -38,7 +38,7 @@ class Calibration:
 
     @property
     def needed(self) -> bool:
-        """Whether anything is more than three standard errors from zero."""
+        """Whether anything was found that is taken."""
         drift = self.found.drift
         return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._response is not None
 

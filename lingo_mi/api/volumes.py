@@ -45,8 +45,9 @@ def reconstruct(
     `cloud` it fits a cloud by itself.
     `Refined` meets the completed views first where `views` is given, and the measured ones alone where it is not.
 
-    Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|; `seconds`. It can be
-    used as an array. Raises InputError for a scan or a start that the algorithm cannot use, and where memory does not suffice.
+    Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|, NaN for passes where it
+    was not computed; `seconds`. It can be used as an array. Raises InputError for a scan or a start that the algorithm cannot
+    use, and where memory does not suffice.
 
         found = lm.reconstruct(data.train, lm.SART(niter=20), start=result)
         found.volume, found.residuals[-1]

@@ -143,15 +143,20 @@ def search(
         D = level.derivatives(here)
         here, r = level.stepped(here, r, D)
     errors = dict(zip(names, map(float, _standard_errors(r, D))))
-    given, best = level.differences(zero), r
-    small = (name for name in names if not abs(here[name]) > SURE * errors[name])
+    given = level.differences(zero)
+    small = [name for name in names if not abs(here[name]) > SURE * errors[name]]
     refused = dict.fromkeys(small, 'it is less than three standard errors')
-    refused |= response.doubts(here, errors) if response else {}
-    sure = [name for name in names if name not in refused]
-    chosen = zero | {name: here[name] for name in sure}
-    if sure and len(sure) < len(names):  # the others once more, with the doubtful ones as given
-        level.names, kept = sure, D[[names.index(name) for name in sure]]
-        chosen, best = level.stepped(chosen, level.differences(chosen), kept)
+    chosen, best = here, r
+    while True:
+        sure = [name for name in names if name not in refused]
+        if sure and len(sure) < len(names):  # once more, with the others as given
+            level.names, kept = sure, D[[names.index(name) for name in sure]]
+            chosen = zero | {name: here[name] for name in sure}
+            chosen, best = level.stepped(chosen, level.differences(chosen), kept)
+        doubted = response.doubts(chosen, {name: errors[name] for name in sure}) if response and sure else {}
+        if not doubted:
+            break
+        refused = doubted | refused
     if not sure or np.square(best).sum() >= np.square(given).sum():
         chosen, best = zero, given
         refused = dict.fromkeys(sure, 'views do not predict each other better') | refused

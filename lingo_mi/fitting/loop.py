@@ -70,6 +70,6 @@ def run(
 
 
 def measure_at(iterations: int) -> list[int]:
-    """Iterations to measure at: one in a hundred, but four to twelve, denser at the start, including the last."""
+    """Iterations to measure at: a hundredth as many, but four to twelve, denser at the start, including the last."""
     count = min(max(iterations // 100, 4), 12)
     return sorted({max(1, round(iterations * share**1.5)) for share in np.linspace(0, 1, count + 1)[1:]})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,8 @@ class Running:
     iteration    steps done; during a search, of the search
     last         steps to do
     history      measurements over time
-    seconds      spent in steps up to `clock`
+    seconds      spent in steps up to the time `clock`
+    scanned      what a checkpoint says of the scan
     points, info   centres that the fit started from, and data on them
     """
 
@@ -55,6 +55,13 @@ class Running:
         self.iteration, self.last = 0, self.settings.iterations
         self.history: list[dict] = []
         self.seconds = 0.0
+        self.scanned = dict(
+            views=len(scan),
+            scanner=describe(scan.geometry),
+            signal=float(scan.projections.mean(dtype=float)),
+            moments=moments(scan.projections),
+            traits=traits(scan),
+        )
         self._resume(begin) if isinstance(begin, Path) else self._start(begin)
         self.clock = time.perf_counter()
 
@@ -70,7 +77,7 @@ class Running:
     def _resume(self, path):
         state, extra, arrays = checkpoint.load(path)
         modelled = modelled_effects(self.scan, self.settings)
-        require_same_fit(extra, self.settings, self._scanned, self.seed, path, bool(modelled and modelled.scatter))
+        require_same_fit(extra, self.settings, self.scanned, self.seed, path, bool(modelled and modelled.scatter))
         self.rng.bit_generator.state = extra['rng']
         self.points, self.order = arrays['initial'], [int(i) for i in arrays['order']]
         self.iteration, self.seconds, self.info = (extra[k] for k in ('iteration', 'seconds', 'info'))
@@ -91,8 +98,11 @@ class Running:
 
     def step(self) -> Any:
         """Densify if it is due, and make a step. Returns the loss, Float [1], not yet evaluated."""
-        if self.search and self.search.on and self.search.over:
-            self._begin_anew(self.search)
+        if self.search and self.search.on and self.search.over:  # begin anew with all views, for as long as was best
+            self.stepper, self.state = stepper_of(self.scan, self.settings), DeviceState(self.search.end())
+            self.rng, self.order = np.random.default_rng(self.seed), []
+            self.iteration, self.last = 0, self.search.kept
+            self.average.restart()
         # Before a step, so never after the last one. A longer fit that continues from there does it first.
         if renewed := self.stepper.renewed(self.state, self.iteration, self.rng):
             self.state = renewed
@@ -105,13 +115,6 @@ class Running:
         self.iteration += 1
         self.average.add(self.state)
         return loss
-
-    def _begin_anew(self, search: Search) -> None:
-        """With all views, for as many steps as the search has found best."""
-        self.stepper, self.state = stepper_of(self.scan, self.settings), DeviceState(search.end())
-        self.rng, self.order = np.random.default_rng(self.seed), []
-        self.iteration, self.last = 0, search.kept
-        self.average.restart()
 
     def look(self, loss: Any, marks: set[int], measure: Callable[[Model, DeviceState], dict] | None) -> None:
         """After a step: let the search judge the state, if it is due; after a search, measure it, at the marks and at the end.
@@ -160,7 +163,7 @@ class Running:
             settings=self.settings.flat(),
             unit=model.unit,
             effects=model.effects is not None,
-            **self._scanned,
+            **self.scanned,
         )
         arrays = dict(initial=self.points, order=np.array(self.order, int))
         arrays |= self.stepper.arrays() | self.average.arrays() | (self.search.arrays() if self.search else {})
@@ -187,14 +190,3 @@ class Running:
     def _seconds(self):
         """Spent in steps, including those before an interruption."""
         return self.seconds + time.perf_counter() - self.clock
-
-    @cached_property
-    def _scanned(self):
-        """What a checkpoint says of the scan."""
-        return dict(
-            views=len(self.scan),
-            scanner=describe(self.scan.geometry),
-            signal=float(self.scan.projections.mean(dtype=float)),
-            moments=moments(self.scan.projections),
-            traits=traits(self.scan),
-        )

@@ -61,6 +61,7 @@ class Beam:
             raise InputError(f'the percentile of air must be above 0 and at most 100, not {options.percentile:g}')
         if flats is not None and i0 is not None:
             raise InputError('flats and i0 both say the unattenuated beam; give one of them')
+        air = region_of('air', options.air, views.shape)
         limit = options.saturation
         if limit is None:
             limit = np.iinfo(views.dtype).max if views.dtype.kind in 'ui' else np.inf
@@ -68,7 +69,7 @@ class Beam:
         if flats is None and i0 is not None:
             # Nikon's white level is a count, with the dark signal in it.
             panel = replace(panel, flat=np.full(views.shape, float(i0)) if white is None else i0 - panel.dark)
-        return cls(panel, i0, region_of('air', options.air, views.shape), options.percentile, limit)
+        return cls(panel, i0, air, options.percentile, limit)
 
     def level(self, frame: np.ndarray, exposure: float) -> float:
         """The air level of a whole frame, over what the panel shows at this exposure; 1 where the beam is known otherwise, and

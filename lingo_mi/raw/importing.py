@@ -40,9 +40,9 @@ def import_raw(
     flats = recording.flats if options.flats is None else open_recording(options.flats).views
     darks = recording.darks if options.darks is None else open_recording(options.darks).views
     given, white, steps = geometry_of(geometry, options, recording.angles, views)
-    beam = Beam.of(path, options, views, flats, darks, white)
     v0, v1, u0, u1 = crop = region_of('crop', options.crop, views.shape) or (0, views.shape[0], 0, views.shape[1])
     chosen, exposure = chosen_views(options.views, n), exposures(options.exposure, n)
+    beam = Beam.of(path, options, views, flats, darks, white)
 
     (nv, nu), (down, across) = views.shape, steps
     rows, columns = (v0, v1) if down > 0 else (nv - v1, nv - v0), (u0, u1) if across > 0 else (nu - u1, nu - u0)

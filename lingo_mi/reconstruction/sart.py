@@ -116,8 +116,8 @@ class Sweeps(Algorithm):
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. Without tol, the residual is computed at the end alone, since it
-        takes half as long as a pass.
+        """Reconstruct the volume of a scan, see `Algorithm.run`. Without tol, the residual is not computed after every pass, of
+        which it takes a third of the time, but at the end.
 
         weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
         blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
@@ -133,8 +133,8 @@ class Sweeps(Algorithm):
             x = sweep(system, x, how.lmbda * how.lmbda_red**k, next(order), how.noneg)
             known = how.tol or k + 1 == how.niter
             residuals.append(system.residual(x)[1] if known else np.nan)
+            dr.sync_thread()  # Ctrl-C comes through between passes
             if progress:
-                dr.sync_thread()
                 progress(k + 1, how.niter, residuals[-1] if known else None)
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
 
@@ -184,7 +184,7 @@ class OSSART(Sweeps):
     lmbda_red       0 < lmbda_red <= 1
     noneg           whether negative densities are set to zero after every update
     OrderStrategy   of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
-    tol             stop when |A x - b| / |b| is no larger, from 0 on
+    tol             stop when |A x - b| / |b| is no larger; 0: never
     seed            of the random order, from 0 on
 
     Use it instead of `SART` for many views: a pass has fewer updates, and each averages the noise of its views.
@@ -235,7 +235,7 @@ class SART(Sweeps):
     lmbda_red       0 < lmbda_red <= 1
     noneg           whether negative densities are set to zero after every update
     OrderStrategy   of the views: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
-    tol             stop when |A x - b| / |b| is no larger, from 0 on
+    tol             stop when |A x - b| / |b| is no larger; 0: never
     seed            of the random order, from 0 on
 
     Use it for few clean views, which few passes match closely. With noise, use fewer passes or a smaller lmbda.
@@ -280,7 +280,7 @@ class SIRT(Sweeps):
     lmbda       relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every update
     lmbda_red   0 < lmbda_red <= 1
     noneg       whether negative densities are set to zero after every update
-    tol         stop when |A x - b| / |b| is no larger, from 0 on
+    tol         stop when |A x - b| / |b| is no larger; 0: never
 
     Use it for noisy views: it approaches a least-squares solution smoothly, with many times the passes of `SART`.
     lmbda=1.9 with lmbda_red=1 is fastest.

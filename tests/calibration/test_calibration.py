@@ -166,7 +166,17 @@ def test_scattered_light_is_not_negative():
     found = lm.calibrate(scan, scatter=True, progress=False)
     assert found.found.measured['scatter0_0'] < -0.01 and not found.found.response.parts[0].values.any()
     told = [line for line in found.lines() if 'scatter' in line]
-    assert len(told) == 6 and all('not taken: it would be negative in places' in line for line in told)
+    assert len(told) == 6 and all(', not taken: it ' in line for line in told)
+    assert 'negative in places' in told[0] and 'negative in places' in told[3]
+
+
+def test_a_slope_of_scattered_light_alone_is_not_taken():
+    """Its mean is not told, so it is taken for 0; half of what is left would be negative."""
+    scan, _ = responding({'scatter0_1': 0.02}, scatter='one')
+    found = lm.calibrate(scan, scatter=True, progress=False).found
+    assert (
+        abs(found.measured['scatter0_1']) > 5 * found.errors['scatter0_1'] and not found.response.parts[0].values.any()
+    )
 
 
 @pytest.mark.slow

@@ -46,9 +46,9 @@ class Scatter(Part):
         return {'scatter_percent_of_open_beam': (100 * c[:, 0]).tolist()}  # the mean over the panel
 
     def doubt(self, errors):
-        lowest = self._image(self.values[0], EVERYWHERE)
-        error = np.sqrt(self._image(errors[0] ** 2, EVERYWHERE, 2))
-        return 'it would be negative in places' if (lowest < -SURE * error).any() else ''
+        image = self._image(self.values[0], EVERYWHERE)
+        error = np.sqrt(self._image(errors[0] ** 2, EVERYWHERE, 2))  # as of independent numbers
+        return 'it would be negative in places' if (image < -SURE * error).any() else ''
 
     def _image(self, c, place, power=1):
         return sum(x * basis**power for x, basis in zip(c, _bases(place)))
