@@ -62,7 +62,10 @@ class Running:
             moments=moments(scan.projections),
             traits=traits(scan),
         )
-        self._resume(begin) if isinstance(begin, Path) else self._start(begin)
+        if isinstance(begin, Path):
+            self._resume(begin)
+        else:
+            self._start(begin)
         self.clock = time.perf_counter()
 
     def _start(self, initial):

@@ -65,8 +65,8 @@ def import_raw(
             levels[k] = beam.level(frame, float(exposure[i]))  # of the whole frame: air may lie outside the crop
             p[k], valid[k] = line_integrals(kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit)
             bar.update(k + 1)
-    _look(path, chosen, p, valid)
-    scan = Scan(out, p, valid)
+    _check_views(path, chosen, p, valid)
+    scan, photons = Scan(out, p, valid), beam.panel.photons
     history: dict[str, Any] = dict(
         frames=str(path),
         geometry=str(geometry) if not isinstance(geometry, Geometry) else 'given in Python',
@@ -80,15 +80,13 @@ def import_raw(
         i0=None if beam.i0 is None else float(beam.i0),
         air_level=[float(f'{np.nanmin(levels):.6g}'), float(f'{np.nanmax(levels):.6g}')],
         bad_pixels=int((~beam.panel.good).sum()),
-        photons_from_flats=None
-        if beam.panel.photons is None
-        else float(f'{beam.panel.photons * bins[0] * bins[1]:.4g}'),
+        photons_from_flats=None if photons is None else float(f'{photons * bins[0] * bins[1]:.4g}'),
         photons_from_views=float(f'{photons_of_images(scan.projections, scan.valid):.4g}'),
     )
     return scan, {name: value for name, value in history.items() if value is not None}
 
 
-def _look(path, chosen, p, valid):
+def _check_views(path, chosen, p, valid):
     """Warn of views that are black or brighter than the flat field. Raises InputError if all are black."""
     black = [i for i, inside in zip(chosen, valid) if not inside.any()]
     above = [i for i, view, inside in zip(chosen, p, valid) if (view[inside] < BELOW).sum() > OFTEN * inside.sum()]

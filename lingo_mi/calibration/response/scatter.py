@@ -3,6 +3,7 @@
     m = -ln(exp(-p) + S),    S = sum over i + j <= 2 of s_ij P_i(y) P_j(x)
 
 with Legendre's polynomials P over the panel. S is relative to the open beam. It is told by the object's most absorbing parts.
+Where it would be negative it is not light, and a calibration does not take it (`Scatter.doubt`).
 """
 
 from __future__ import annotations
