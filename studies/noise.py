@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
@@ -27,7 +26,7 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.scan import Scan
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
-from lingo_mi.studies.regret import simulated
+from lingo_mi.studies.simulated import counting, noisy, simulated
 
 EVERY = 50  # steps between two looks at the volume
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -111,9 +110,8 @@ class Study:
 
     def _dataset(self, case: Case) -> tuple[Scan, np.ndarray]:
         geometry, views, truth = simulated(case.object, self.size, self.pixels, case.views, case.finer)
-        detector = Detector.of(**(Detector.DEFAULTS | dict(photons=case.photons)))
-        counted = [detector.measure(np.exp(-view.astype(float)), i) for i, view in enumerate(views)]
-        return Scan(geometry, np.stack(counted), effects=Effects(detector=detector)), truth
+        detector = counting(case.photons)
+        return Scan(geometry, noisy(views, detector), effects=Effects(detector=detector)), truth
 
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB of the volume (after so many steps)."""

@@ -26,9 +26,7 @@ from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
-from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.metrics import psnr_3d
-from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
 from lingo_mi.reconstruction.best import SPREAD, START, refine
 from lingo_mi.reconstruction.refined import means
@@ -38,9 +36,8 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance
-from lingo_mi.studies.tables.objects import averaged, load_object
+from lingo_mi.studies.simulated import counting, noisy, simulated
 
-LARGEST = 4.0  # line integral of every simulated scan: 1.8 % of the photons arrive
 COMPLETED = 100  # views
 MEASURED = 'walnut', 'htc2022'  # scenes of measured views; their reference is the FDK of all of them
 BEST = 'best'
@@ -144,7 +141,9 @@ class Study:
         if case.object in MEASURED:
             return self._measured(case)
         geometry, views, truth = simulated(case.object, self.size, 5 * self.size // 3, case.views, case.finer)
-        return Dataset(Scan(geometry, noisy(views, case.photons) if case.photons else views), None, truth)
+        if case.photons:
+            views = noisy(views, counting(case.photons))
+        return Dataset(Scan(geometry, views), None, truth)
 
     @staticmethod
     def check(case: Case) -> None:
@@ -192,34 +191,3 @@ class Study:
 
 def _cell(found: dict | None) -> str:
     return f'{found["psnr_3d"]:.2f} ({found["seconds"]:.0f} s)' if found else '–'
-
-
-def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tuple[Geometry, np.ndarray, np.ndarray]:
-    """A cone-beam scan over a full turn of one of `studies.tables.objects`: geometry, line integrals [view, v, u] up to LARGEST,
-    and true volume.
-
-    size     voxels along the longest side
-    pixels   along the sides of the panel, which is twice as wide as the object
-    finer    how many times as many voxels are scanned along each side
-    """
-    thing = load_object(name, size * finer)
-    truth = averaged(thing, size)
-    pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
-    geometry = CircularGeometry(
-        DSO=1000.0,
-        DSD=1500.0,
-        nDetector=(pixels, pixels),
-        dDetector=(pixel, pixel),
-        nVoxel=thing.data.shape,
-        dVoxel=thing.spacing,
-        angles=2 * np.pi * np.arange(views) / views,
-    )
-    line_integrals = grid.project(thing.data, geometry)
-    unit = np.float32(LARGEST / line_integrals.max())
-    return geometry.with_volume(truth.data.shape, truth.spacing), line_integrals * unit, truth.data * unit
-
-
-def noisy(views: np.ndarray, photons: float, seed: int = 0) -> np.ndarray:
-    """Line integrals as counted with so many photons a pixel in the open beam; no count is taken for half of one."""
-    counts = np.random.default_rng(seed).poisson(photons * np.exp(-views.astype(float)))
-    return -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)

@@ -38,11 +38,12 @@ from lingo_mi.interrupts import between_steps
 from lingo_mi.output_folder import CHECKPOINT
 from lingo_mi.phantoms.x3d_scan import scan
 from lingo_mi.progress import Progress
-from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Refined, progress_bar
+from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Refined, progress_bar
 from lingo_mi.results.measure import measure
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.studies.provenance import provenance
+from lingo_mi.studies.simulated import LARGEST, counting, noisy
 from lingo_mi.studies.tables.objects import PHANTOMS, VOLUMES, averaged, load_object
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
@@ -55,6 +56,7 @@ ALGORITHMS = {
     'asd-pocs': ASDPOCS(niter=10),
     'refined': Refined(),
     'finer': Refined(finer=2, completed_niter=0, niter=4),
+    'best': Best(),
 }
 
 
@@ -69,6 +71,9 @@ class Scale:
     objects      where the user names none
     finer        how many times as many voxels are scanned along each side, where the object has them: the projections then
                  hold structure that the reconstructed voxels cannot
+    photons      a pixel in the open beam, by which the views to fit are measured; 0: without noise
+    electronic_noise   of the detector, standard deviation in photons
+    longest      line integral of a scan, to which its density is scaled when photons are counted
     """
 
     size: int
@@ -77,6 +82,9 @@ class Scale:
     iterations: tuple[int, ...]
     objects: tuple[str, ...]
     finer: int = 1
+    photons: float = 0.0
+    electronic_noise: float = 0.0
+    longest: float = LARGEST
 
 
 # An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
@@ -139,6 +147,8 @@ class Cells:
         of_scan = dict(
             size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed
         )
+        if self.scale.photons:
+            of_scan |= {name: getattr(self.scale, name) for name in ('photons', 'electronic_noise', 'longest')}
         where = self.folder / fit.object / f'{fit.views}_views'
         if isinstance(cell, Volume):
             options = dict(algorithm=ALGORITHMS[cell.algorithm].options, completed=COMPLETED)
@@ -217,7 +227,15 @@ class Cells:
         def of_truth(views):
             return replace(views, geometry=replace(views.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
 
-        return Dataset(of_truth(found.train), of_truth(found.test), truth.data)
+        return Dataset(self._counted(of_truth(found.train)), of_truth(found.test), truth.data)
+
+    def _counted(self, scan: Scan) -> Scan:
+        """The views as the scale's detector measures them."""
+        if not self.scale.photons:
+            return scan
+        unit = self.scale.longest / scan.projections.max()
+        detector = counting(self.scale.photons, self.scale.electronic_noise)
+        return replace(scan, projections=noisy(scan.projections * unit, detector, self.seed) / unit)
 
     def _measured(self, fit: Fit) -> Dataset:
         return choose_views(self.dataset(fit.object), fit.views)

@@ -38,7 +38,7 @@ NOTES = dict(
     ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
     f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts there, with a pass over all views '
     f'and then passes over the measured ones (`finer`: the latter alone, on voxels of half the size, whose means it gives); all '
-    f'need densities, which `3dgs` and `xgaussian` do not have. {_PAPER_IS}',
+    f'need densities, which `3dgs` and `xgaussian` do not have. `best` is of the measured views alone. {_PAPER_IS}',
     ablation=f"Dynamic gradient scaling, latent initialisation (else R2-Gaussian's) and voxel scaling, with (+) and without "
     f'(-). New views as in Table 1, volumes by ASD-POCS as in Table 2. {_PAPER_IS}',
 )
@@ -136,6 +136,8 @@ def _volume(views, method, iterations, algorithm):
         return lambda name: None  # neither measured views nor opacities are a volume to begin with
     if method == 'none':
         return lambda name: Volume(Fit(name, views, 'none'), algorithm)
+    if algorithm == 'best':
+        return lambda name: None  # it holds out measured views, which a cloud has seen
     fit = _fit(views, method, iterations)
     return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 
@@ -222,10 +224,16 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], cells: 
     done = sum(cells.get(cell) is not None for cell in planned)
     scale = cells.scale
     finer = f' (scanned on {scale.finer} times as many)' if scale.finer > 1 else ''
+    noise = (
+        f'{scale.photons:g} photons a pixel in the open beam, electronic noise of {scale.electronic_noise:g}, '
+        f'line integrals up to {scale.longest:g}; '
+        if scale.photons
+        else ''
+    )
     text = (
         f'# {TITLES[table]}\n\n{NOTES[table]}\n\nScale `{name}`: at most {scale.size} voxels a side{finer}, '
         f'{scale.pixels} x {scale.pixels} pixels, {scale.n_points:,} Gaussians to start with '
-        f'(`xgaussian`: one on every eighth voxel a side); seed {cells.seed}; {done} of '
+        f'(`xgaussian`: one on every eighth voxel a side); {noise}seed {cells.seed}; {done} of '
         f'{len(planned)} cells.\n\n{markdown(table, table_groups, rows)}\n'
     )
     cells.folder.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from helpers.script import FIT
-from lingo_mi.studies.regret import BEST, CLOUDS, VOXELS, Case, Study, noisy
+from lingo_mi.studies.regret import BEST, CLOUDS, VOXELS, Case, Study
+from lingo_mi.studies.simulated import counting, noisy
 
 
 def regret(monkeypatch, capsys, *args):
@@ -62,9 +63,9 @@ def test_the_measured_walnut(data, tmp_path):
 
 def test_noise_is_that_of_photons():
     views = np.full((40, 40, 40), 2.0, np.float32)
-    found = noisy(views, 1000.0)
+    found = noisy(views, counting(1000.0))
     assert abs(found.std() / np.sqrt(np.exp(2.0) / 1000) - 1) < 0.05 and abs(found.mean() - 2) < 0.01
-    assert np.isfinite(noisy(views + 20, 1000.0)).all()
+    assert np.isfinite(noisy(views + 20, counting(1000.0))).all()
 
 
 @pytest.mark.parametrize(

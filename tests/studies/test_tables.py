@@ -149,6 +149,8 @@ def test_opacities_have_no_row_of_means(tmp_path):
     assert rows == [(a, name) for a in ('fdk', 'sart', 'asd-pocs') for name in ('foot', 'mean of 1')] + [
         ('refined', 'foot'),
         ('finer', 'foot'),
+        ('best', 'foot'),
+        ('best', 'mean of 1'),
         ('voxelize', 'foot'),
     ]
     code, _, err = script('ct', tmp_path / 'a', '--methods', 'xgaussian', '--algorithms', 'refined')
@@ -174,9 +176,10 @@ def test_paper_beside_ours():
 
 def test_the_order_of_cells():
     cells = plan(groups('ct', [25], [30], ['r2']), ['a', 'b'])
-    assert [c.object if isinstance(c, Fit) else c.fit.object for c in cells] == ['a'] * 9 + ['b'] * 9
-    fit = Fit('a', 25, 'r2', 30)
-    assert cells[cells.index(fit) :][:6] == [fit, *(Volume(fit, a) for a in tables.ALGORITHMS)]
+    assert [c.object if isinstance(c, Fit) else c.fit.object for c in cells] == ['a'] * 10 + ['b'] * 10
+    fit, measured = Fit('a', 25, 'r2', 30), Fit('a', 25, 'none')
+    assert cells[cells.index(fit) :][:6] == [fit, *(Volume(fit, a) for a in tables.ALGORITHMS if a != 'best')]
+    assert cells[:4] == [Volume(measured, a) for a in ('fdk', 'sart', 'asd-pocs', 'best')]  # the others need a cloud
 
 
 # ---- interruptions ---------------------------------------------------------------------------------------------------
@@ -324,6 +327,26 @@ def test_objects_finer_than_the_voxels(tmp_path):
     assert '| 4 | finer | foot | – | – |' in text
 
 
+def test_scans_with_noise(tmp_path):
+    """The fitted views are counted, on a scale of the density that lets so many photons through; the held-out ones are not."""
+    scale = replace(TINY, photons=1e4, electronic_noise=10.0, longest=1.0)
+    clean, noisy = Cells(tmp_path, TINY).dataset('foot'), Cells(tmp_path, scale).dataset('foot')
+    np.testing.assert_array_equal(noisy.test.projections, clean.test.projections)
+    np.testing.assert_array_equal(noisy.volume, clean.volume)
+    unit = 1 / clean.train.projections.max()
+    p = clean.train.projections * unit
+    sigma = np.sqrt(np.exp(p) / 1e4 + (10 / 1e4 * np.exp(p)) ** 2)
+    standard = (noisy.train.projections * unit - p) / sigma
+    assert abs(standard.std() - 1) < 0.03 and abs(standard.mean()) < 0.03
+    assert Cells(tmp_path, scale).path(Fit('foot', 4, 'r2')) != Cells(tmp_path, TINY).path(Fit('foot', 4, 'r2'))
+    options = '--photons', '1e4', '--electronic-noise', '10', '--longest', '1'
+    code, text, err = script('ct', tmp_path, *options, '--views', '5', '--algorithms', 'best', '--methods', 'r2')
+    assert (
+        code == 0 and '10000 photons a pixel in the open beam, electronic noise of 10, line integrals up to 1' in text
+    ), err
+    assert '| 5 | best | foot |' in text and '1 of 1 cells' in text
+
+
 def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setenv('LINGO_MI_DATA', '')
     (tmp_path / 'views.md').write_text('kept')
@@ -358,6 +381,9 @@ def test_recipes():
         (['views', '--methods', 'nerf'], 'no such recipe'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
         (['ct', '--finer', '0'], 'at least 1'),
+        (['ct', '--photons', '-1'], 'photons'),
+        (['ct', '--electronic-noise', '10'], 'needs photons'),
+        (['ct', '--photons', '1000', '--longest', 'nan'], '--longest must be above 0'),
     ],
 )
 def test_bad_input(args, message, tmp_path):

@@ -1,0 +1,50 @@
+"""Scans that the studies simulate: one over a full turn, and the noise of photons."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.effects.detector import Detector
+from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.projectors import grid
+from lingo_mi.studies.tables.objects import averaged, load_object
+
+LARGEST = 4.0  # line integral of a scan: 1.8 % of the photons arrive
+
+
+def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tuple[Geometry, np.ndarray, np.ndarray]:
+    """A cone-beam scan over a full turn of one of `studies.tables.objects`: geometry, line integrals [view, v, u] up to LARGEST,
+    and true volume.
+
+    size     voxels along the longest side
+    pixels   along the sides of the panel, which is twice as wide as the object
+    finer    how many times as many voxels are scanned along each side
+    """
+    thing = load_object(name, size * finer)
+    truth = averaged(thing, size)
+    pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
+    geometry = CircularGeometry(
+        DSO=1000.0,
+        DSD=1500.0,
+        nDetector=(pixels, pixels),
+        dDetector=(pixel, pixel),
+        nVoxel=thing.data.shape,
+        dVoxel=thing.spacing,
+        angles=2 * np.pi * np.arange(views) / views,
+    )
+    line_integrals = grid.project(thing.data, geometry)
+    unit = np.float32(LARGEST / line_integrals.max())
+    return geometry.with_volume(truth.data.shape, truth.spacing), line_integrals * unit, truth.data * unit
+
+
+def counting(photons: float, electronic_noise: float = 0.0) -> Detector:
+    """A detector that counts so many photons a pixel in the open beam; its electronics' noise is in photons.
+
+    Raises InputError for values out of their ranges.
+    """
+    return Detector.of(**(Detector.DEFAULTS | dict(photons=photons, electronic_noise=electronic_noise)))
+
+
+def noisy(views: np.ndarray, detector: Detector, seed: int = 0) -> np.ndarray:
+    """Line integrals [view, v, u] as a detector reports them."""
+    return np.stack([detector.measure(np.exp(-view.astype(float)), i, seed) for i, view in enumerate(views)])
