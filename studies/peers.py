@@ -31,6 +31,7 @@ from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics import psnr_3d
+from lingo_mi.parsing import parse
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.held_out import split
@@ -44,7 +45,7 @@ from lingo_mi.studies.provenance import provenance
 REFERENCE = 'reference'
 ACROSS = 5  # slices side by side in the picture
 # None is good for every scan.
-RTK_BETAS = 10.0, 30.0, 100.0, 300.0
+RTK_WEIGHTS = 10.0, 30.0, 100.0, 300.0  # of the total variation
 SHARPNESS = 0.0, 1.0, 2.0, 3.0  # of MBIRJAX, whose default is 1
 
 
@@ -65,24 +66,17 @@ def _itk() -> Any:
     return itk
 
 
-def _rtk_tv(scan: Scan) -> np.ndarray:
-    """RTK's total variation, with the weight that is best for this scan."""
-    itk = _itk()
-    return _best_for(scan, RTK_BETAS, lambda part, beta: rtk_bridge.total_variation(part, itk, beta))
+def _rtk_tv(scan: Scan, weight: float) -> np.ndarray:
+    return rtk_bridge.total_variation(scan, _itk(), weight)
 
 
-def _qggmrf(scan: Scan) -> np.ndarray:
-    """MBIRJAX with the sharpness that is best for this scan, and densities that are not negative, as of SART and ASD-POCS."""
-    mbirjax = _mbirjax()
-
-    def run(part: Scan, sharpness: float) -> np.ndarray:
-        return mbirjax_bridge.reconstruct(part, mbirjax, sharpness=sharpness, positivity_flag=True)
-
-    return _best_for(scan, SHARPNESS, run)
+def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
+    """Densities are not negative, as of SART and ASD-POCS."""
+    return mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=sharpness, positivity_flag=True)
 
 
 def _best_for(scan: Scan, values: Sequence[float], reconstruct: Callable[[Scan, float], np.ndarray]) -> np.ndarray:
-    """The volume by the setting that predicts one view in five best from the others."""
+    """The volume by the value that predicts one view in five best from the others."""
     kept, held_out = split(scan, 5)
 
     def miss(value: float) -> float:
@@ -104,13 +98,18 @@ def _mbirjax() -> Any:
     return importlib.import_module('mbirjax')
 
 
+# By name: the setting that is chosen by held-out views, the values to choose from, and the volume [x, y, z] of a scan with one.
+TUNED: dict[str, tuple[str, Sequence[float], Callable[[Scan, float], np.ndarray]]] = {
+    'rtk-tv': ('weight', RTK_WEIGHTS, _rtk_tv),
+    'mbirjax': ('sharpness', SHARPNESS, _qggmrf),
+}
 # By name: what it is called in the table, and the volume [x, y, z] of a scan.
 METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
     'fdk': ('FDK', lambda scan: FDK().run(scan).volume),
     'sart': ('SART', lambda scan: SART().run(scan).volume),
     'asd-pocs': ('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
-    'rtk-tv': ('RTK, total variation', _rtk_tv),
-    'mbirjax': ('MBIRJAX', _qggmrf),
+    'rtk-tv': ('RTK, total variation', lambda scan: _best_for(scan, RTK_WEIGHTS, _rtk_tv)),
+    'mbirjax': ('MBIRJAX', lambda scan: _best_for(scan, SHARPNESS, _qggmrf)),
     'fast': ("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
     'refined': ('`fast`, then `refined`, `finer=2`', _refined),
     'best': ('`best`', lambda scan: Best().run(scan).volume),
@@ -121,11 +120,30 @@ NEEDS = {
 }
 
 
+def method_of(name: str) -> tuple[str, Callable[[Scan], np.ndarray]]:
+    """What a method is called in the table, and the volume [x, y, z] of a scan. `mbirjax:1` has that setting of TUNED.
+
+    Raises InputError for an unknown one.
+    """
+    kind, _, value = name.partition(':')
+    if kind not in METHODS or value and kind not in TUNED:
+        known = [*METHODS, *(f'{tuned}:{setting.upper()}' for tuned, (setting, _, _) in TUNED.items())]
+        raise InputError(f'--methods {name}: is unknown; use some of {", ".join(known)}')
+    label, run = METHODS[kind]
+    if not value:
+        return label, run
+    setting, _, reconstruct = TUNED[kind]
+    number = parse(f'--methods {name}', value, 0.0)
+    if not np.isfinite(number):
+        raise InputError(f'--methods {name}: the {setting} must be finite')
+    return f'{label}, {setting} {number:g}', lambda scan: reconstruct(scan, number)
+
+
 def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
     """The methods that can run here; `say` is called with a line for each that cannot. Raises InputError where none can."""
     found = []
     for name in names:
-        load, what = NEEDS.get(name, (None, ''))
+        load, what = NEEDS.get(name.partition(':')[0], (None, ''))
         try:
             if load:
                 load()
@@ -160,13 +178,13 @@ class Study:
         for count in views:
             chosen = choose_views(self.dataset, count)
             for method in methods:
-                if self.cells.get(_case(count), method) is None:
+                if self.get(count, method) is None:
                     try:
                         found = self._compute(chosen, method)
                     except InputError as error:
                         say(f'{count} views, {method}: left out: {error}')
                         continue
-                    self.cells.put(_case(count), method, found)
+                    self.cells.put(_case(count), _file(method), found)
                     say(
                         f'{count} views, {method}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
                         f'{found["seconds"]:.0f} s'
@@ -179,6 +197,10 @@ class Study:
             raise InputError(f'{self.folder}: has the volumes of another scan; choose another --out')
         self.folder.mkdir(parents=True, exist_ok=True)
         write_text(path, digest + '\n')
+
+    def get(self, views: int, method: str) -> dict | None:
+        """A stored cell, or None where there is none that can be read."""
+        return self.cells.get(_case(views), _file(method))
 
     def volume(self, views: int, method: str) -> np.ndarray:
         """The volume [x, y, z] of a stored cell."""
@@ -196,7 +218,7 @@ class Study:
     def _compute(self, chosen: Dataset, method: str) -> dict:
         assert chosen.test is not None  # the views that were not chosen
         began, processor = time.perf_counter(), time.process_time()
-        volume = METHODS[method][1](chosen.train)
+        volume = method_of(method)[1](chosen.train)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
         Reconstruction(volume, [], seconds, chosen.train.geometry).save(
             self._volume_path(_case(len(chosen.train)), method), force=True
@@ -212,18 +234,18 @@ class Study:
         )
 
     def _volume_path(self, case: str, method: str) -> Path:
-        return self.folder / case / f'{method}.nii.gz'
+        return self.folder / case / f'{_file(method)}.nii.gz'
 
     def table(self, methods: Sequence[str], views: Iterable[int]) -> str:
         """The Markdown table of the cells that are there, a row a method of every number of views."""
         lines = ['| views | method | held-out rms | volume, dB | s | processor s |', '|---:|---|---:|---:|---:|---:|']
         for count in views:
-            found = {method: cell for method in methods if (cell := self.cells.get(_case(count), method))}
+            found = {method: cell for method in methods if (cell := self.get(count, method))}
             least = min((cell['held_out_rms'] for cell in found.values()), default=0.0)
             for method, cell in found.items():
                 rms = f'{cell["held_out_rms"]:.4f}'
                 lines.append(
-                    f'| {count} | {METHODS[method][0]} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '
+                    f'| {count} | {method_of(method)[0]} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '
                     f'| {cell["psnr_3d"]:.2f} | {cell["seconds"]:.0f} | {cell["processor_seconds"]:.0f} |'
                 )
         return '\n'.join(lines)
@@ -244,8 +266,8 @@ class Study:
         for block, count in zip(np.split(axes, len(views)), views):
             shown = [('reference', reference)]
             for name in methods:
-                if self.cells.get(_case(count), name) is not None:
-                    shown.append((f'{METHODS[name][0].replace("`", "")}, {count} views', self.volume(count, name)))
+                if self.get(count, name) is not None:
+                    shown.append((f'{method_of(name)[0].replace("`", "")}, {count} views', self.volume(count, name)))
             for axis, (title, volume) in zip(block.flat, shown):
                 axis.imshow(volume[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
                 axis.set_title(title, fontsize=9)
@@ -256,3 +278,7 @@ class Study:
 
 def _case(views: int) -> str:
     return f'{views}_views'
+
+
+def _file(method: str) -> str:
+    return method.replace(':', '_')

@@ -164,30 +164,30 @@ class Study:
         return replace(choose_views(Dataset(train), case.views), volume=FDK().run(train).volume)
 
     def table(self, cases: Iterable[Case]) -> str:
-        """The Markdown table of the cells that are there, a row a case: dB and processor seconds, and the regret of `Best`."""
+        """The Markdown table of the cells that are there, a row a case: dB and processor seconds.
+
+        The regret of `Best` counts the fixed settings without a cloud; that of `Best(cloud=True)` counts all.
+        """
         names = VOXELS | CLOUDS
-        lines = [
-            '| object | scanned | views | photons | **best** | regret, dB | error map | with a cloud | '
-            + ' | '.join(names.values())
-            + ' |',
-            '|---|---:|---:|---:|' + '---:|' * (len(names) + 4),
-        ]
+        heads = 'object | scanned | views | photons | **best** | regret, dB | error map | with a cloud | regret, dB'
+        columns = heads.count('|') + len(names)  # after the first
+        lines = [f'| {heads} | {" | ".join(names.values())} |', '|---|' + '---:|' * columns]
         for case in cases:
-            chosen = self.get(case, BEST)
+            chosen, with_cloud = self.get(case, BEST), self.get(case, BEST_CLOUD)
             if chosen is None:
                 continue
             fixed = {name: found for name in names if (found := self.get(case, name))}
-            cells = [_cell(fixed.get(name)) for name in names]
-            with_cloud = self.get(case, BEST_CLOUD)
-            best = max((found['psnr_3d'] for found in fixed.values()), default=np.nan)
             photons = f'{case.photons:g}' if case.photons else 'measured' if case.object in MEASURED else 'no noise'
-            lines.append(
-                f'| {case.object} | x{case.finer} | {case.views} | {photons} '
-                f'| {_cell(chosen)} | {best - chosen["psnr_3d"]:+.2f} '
-                f'| {chosen["error_map"]:.2f} | {_cell(with_cloud)} | {" | ".join(cells)} |'
-            )
+            row = [case.object, f'x{case.finer}', str(case.views), photons]
+            row += [_cell(chosen), _regret(chosen, [fixed[name] for name in VOXELS if name in fixed])]
+            row += [f'{chosen["error_map"]:.2f}', _cell(with_cloud), _regret(with_cloud, fixed.values())]
+            lines.append(f'| {" | ".join([*row, *(_cell(fixed.get(name)) for name in names)])} |')
         return '\n'.join(lines)
 
 
 def _cell(found: dict | None) -> str:
     return f'{found["psnr_3d"]:.2f} ({found["seconds"]:.0f} s)' if found else '–'
+
+
+def _regret(found: dict | None, fixed: Iterable[dict]) -> str:
+    return f'{max((other["psnr_3d"] for other in fixed), default=np.nan) - found["psnr_3d"]:+.2f}' if found else '–'

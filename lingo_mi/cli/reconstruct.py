@@ -51,7 +51,7 @@ from lingo_mi.cli.common import (
     writable_file,
     writing_file,
 )
-from lingo_mi.completion.clouds import load_cloud
+from lingo_mi.completion.clouds import FittedCloud, load_cloud
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start, sampled
 from lingo_mi.errors import InputError
 from lingo_mi.file_access import optional, require_writable, write_text
@@ -70,9 +70,9 @@ from lingo_mi.report.data import ReportData
 from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
 from lingo_mi.runtime import use_variant
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import thinned
-from lingo_mi.scene.load import defaults, load_scene
+from lingo_mi.scene.load import LoadedScene, defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
 
 FROM_CLOUD = 'refined', 'voxelize'  # algorithms that nothing can be done by without a cloud
@@ -234,15 +234,47 @@ def reconstruct_into(
     effects      'model' or 'ignore'
     parameters   of the scene file
     """
-    slab: int = args.slab or 0
-    scene = load_scene(args.scene, parameters, slab)
-    cloud = load_cloud(args.complete or args.start) if args.complete or args.start else None
+    scene = load_scene(args.scene, parameters, args.slab or 0)
+    cloud = cloud_of(args)
+    dataset = read_dataset(args, scene, cloud, algorithm)
+    if algorithm is None:
+        assert cloud is not None  # as `check_arguments` has made sure
+        sample_cloud(out, cloud, dataset, args)
+        return
+    require_signal(dataset.train)
+    scan, inputs = prepared(dataset, cloud, algorithm, args, effects)
+    if args.slab:
+        make_in_slabs(out, scan, algorithm, args)
+        return
+    with progress_bar(algorithm, scan) as progress:
+        found = reconstruct(scan, algorithm, progress=progress, **inputs)
+    measured = len(cloud.geometry if cloud and args.complete else scan)
+    write_volume(out, found, f'{len(scan)}', measured, dataset.volume, args)
+    if isinstance(found, Chosen):
+        print(found.report())
+        plan, error = plan_and_error_map(out)
+        replace(found, volume=found.error).save(error, force=True)
+        write_text(plan, json.dumps(found.record(), indent=1) + '\n')  # last: it says whose the map is
+
+
+def cloud_of(args: argparse.Namespace) -> Fitted | FittedCloud | None:
+    """The fit that --complete or --start names. Raises InputError where it has no volume and the algorithm needs one."""
+    path = args.complete or args.start
+    cloud = load_cloud(path) if path else None
     opacities = isinstance(cloud, Fitted) and not cloud.settings.volumetric
     if (args.algorithm in FROM_CLOUD or args.start) and opacities:
         raise InputError(
-            f'{args.complete or args.start}: this recipe fits opacities, not densities, and has no volume; '
+            f'{path}: this recipe fits opacities, not densities, and has no volume; '
             + ('leave out --start' if args.start else 'take another --algorithm')
         )
+    return cloud
+
+
+def read_dataset(
+    args: argparse.Namespace, scene: LoadedScene, cloud: Fitted | FittedCloud | None, algorithm: Algorithm | None
+) -> Dataset:
+    """The projections, if there is room for what is made of them."""
+    slab: int = args.slab or 0
     seed = getattr(cloud, 'seed', None) if args.seed is None else args.seed
     views = args.views or (len(cloud.geometry) if cloud else None)
     if not (args.projections or args.volume):  # their geometry is not known before they are read
@@ -251,59 +283,61 @@ def reconstruct_into(
             check_room(scene.scanner.geometry, algorithm, views)
     dataset = read_input(args, scene, None if cloud else args.views, seed or 0, slab)
     scan = dataset.train
-    inputs: dict[str, Any] = {}
     require_rays(scan.geometry)
     if not (slab and isinstance(algorithm, Sweeps | FDK)):  # whose `slabs` knows better
         grid = thinned(scan.geometry, slab)
         both = args.start and dataset.volume is not None  # a start and the truth, of which the needs have one
         check_room(grid, algorithm, views, mask_images(scan) + (4 * prod(grid.nVoxel) if both else 0))
-    if algorithm is None:
-        assert cloud is not None  # as `check_arguments` has made sure
-        if slab:
-            sample, parts = sampled(cloud), scan.geometry.slabs(slab)
-            write_in_slabs(out, scan, (sample(scan.geometry.slab(*part)) for part in parts), args)
-            return
-        began = time.perf_counter()
-        volume = sampled(cloud)(scan.geometry)
-        found = Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
-        of = f'a cloud fitted to {len(cloud.geometry)}'
-    else:
-        require_signal(scan)
-        if cloud and args.complete:
-            scan, inputs = prepare_completed(dataset, cloud, args.views, algorithm)
-        elif cloud:
-            scan, inputs = prepare_start(dataset, cloud, algorithm)
-        elif scan.effects is not None and effects == 'model':
-            scan = linearised(scan, scan.effects)
-        if isinstance(algorithm, Best):
-            inputs = dict(fit=fit_cloud)
-        if slab:
-            make_in_slabs(out, scan, algorithm, args)
-            return
-        with progress_bar(algorithm, scan) as progress:
-            found = reconstruct(scan, algorithm, progress=progress, **inputs)
-        of = len(scan)
-    measured = len(cloud.geometry if cloud and (algorithm is None or args.complete) else scan)
+    return dataset
+
+
+def prepared(
+    dataset: Dataset, cloud: Fitted | FittedCloud | None, algorithm: Algorithm, args: argparse.Namespace, effects: str
+) -> tuple[Scan, dict[str, Any]]:
+    """The views that a volume is made of, and what else its algorithm is given."""
+    if cloud and args.complete:
+        return prepare_completed(dataset, cloud, args.views, algorithm)
+    if cloud:
+        return prepare_start(dataset, cloud, algorithm)
+    scan = dataset.train
+    if scan.effects is not None and effects == 'model':
+        scan = linearised(scan, scan.effects)
+    return scan, dict(fit=fit_cloud) if isinstance(algorithm, Best) else {}
+
+
+def sample_cloud(out: Path, cloud: Fitted | FittedCloud, dataset: Dataset, args: argparse.Namespace) -> None:
+    """Write the cloud's own volume."""
+    geometry, sample = dataset.train.geometry, sampled(cloud)
+    if args.slab:
+        slabs = (sample(geometry.slab(*part)) for part in geometry.slabs(args.slab))
+        write_in_slabs(out, dataset.train, slabs, args)
+        return
+    began = time.perf_counter()
+    volume = sample(geometry)
+    found = Reconstruction(volume, [], time.perf_counter() - began, geometry)
+    views = len(cloud.geometry)
+    write_volume(out, found, f'a cloud fitted to {views}', views, dataset.volume, args)
+
+
+def write_volume(
+    out: Path, found: Reconstruction, of: str, measured: int, truth: np.ndarray | None, args: argparse.Namespace
+) -> None:
+    """Write a volume, and its page if asked for, and say how it was made and how good it is.
+
+    of         how many views it was made of, in words
+    measured   how many of them were measured
+    """
     found.save(out, force=True)  # `output` has refused to replace a file without --force
-    print(
-        f'{args.algorithm} of {of} views: {found.seconds:.1f} s'
-        + (
-            f', |A x - b| / |b| = {found.residuals[-1]:.4g} after {len(found.residuals) - 1} iterations'
-            if found.residuals
-            else ''
-        )
-    )
-    if dataset.volume is not None:
-        print(volume_quality(found.metrics(dataset.volume)))
+    missed = ''
+    if found.residuals:
+        missed = f', |A x - b| / |b| = {found.residuals[-1]:.4g} after {len(found.residuals) - 1} iterations'
+    print(f'{args.algorithm} of {of} views: {found.seconds:.1f} s{missed}')
+    if truth is not None:
+        print(volume_quality(found.metrics(truth)))
     print(out)
     if args.report is not None:
-        write_page(args.report, found, measured, dataset.volume, args)
+        write_page(args.report, found, measured, truth, args)
         print(args.report)
-    if isinstance(found, Chosen):
-        print(found.report())
-        plan, error = plan_and_error_map(out)
-        replace(found, volume=found.error).save(error, force=True)
-        write_text(plan, json.dumps(found.record(), indent=1) + '\n')  # last: it says whose the map is
 
 
 def write_page(

@@ -82,7 +82,7 @@ def test_missing_peers_are_left_out(peers):
     assert code == 2 and err == 'error: none of the --methods is installed\n'
 
 
-@pytest.mark.parametrize('method, module', [('rtk-tv', 'itk'), ('mbirjax', 'mbirjax')])
+@pytest.mark.parametrize('method, module', [('rtk-tv', 'itk'), ('mbirjax', 'mbirjax'), ('mbirjax:1', 'mbirjax')])
 def test_peers(peers, tmp_path, method, module):
     found = pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[reference]'")
     if module == 'itk' and not hasattr(found, 'RTK'):
@@ -90,11 +90,23 @@ def test_peers(peers, tmp_path, method, module):
     code, text, err = peers('--views', 6, '--methods', 'sart', method)
     assert code == 0, err
     folder = tmp_path / 'out' / 'walnut_16_16_16' / '6_views'
-    ours, theirs = (json.loads((folder / f'{name}.json').read_text()) for name in ('sart', method))
+    ours, theirs = (json.loads((folder / f'{name}.json').read_text()) for name in ('sart', method.replace(':', '_')))
+    assert ('| MBIRJAX, sharpness 1 |' in text) == (method == 'mbirjax:1')
     assert theirs['held_out_rms'] < 2 * ours['held_out_rms'] and theirs['psnr_3d'] > ours['psnr_3d'] - 4
 
 
-@pytest.mark.parametrize('args', [('--views', 3), ('--views', 12), ('--methods', 'magic'), ('-D', 'voxels=none')])
+@pytest.mark.parametrize(
+    'args',
+    [
+        ('--views', 3),
+        ('--views', 12),
+        ('--methods', 'magic'),
+        ('--methods', 'sart:2'),
+        ('--methods', 'mbirjax:x'),
+        ('--methods', 'rtk-tv:nan'),
+        ('-D', 'voxels=none'),
+    ],
+)
 def test_bad_input(peers, tmp_path, args):
     code, _, err = peers(*args)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not (tmp_path / 'out').exists()
