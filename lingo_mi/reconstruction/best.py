@@ -26,6 +26,7 @@ from lingo_mi.scan import Scan, values_digest
 START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
 AHEAD = 0.95  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
+LITTLE = 0.95  # times the score after one pass of a refinement: where more passes bring no more, noise limits them
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
@@ -80,8 +81,8 @@ class Best(Algorithm):
     1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
        are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
     2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
-       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If the passes end early, noise limits
-       them, and more total variation is tried.
+       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If passes after the first one
+       gain little, noise limits them, and more total variation is tried.
     3. With `cloud`, a cloud of Gaussians is fitted to the same views, and the same steps are tried from its volume.
     4. The setting that predicts the views best, with its number of passes, is applied to all views.
 
@@ -175,7 +176,7 @@ class Best(Algorithm):
         if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
             plan[1] = self._try(kept, held_out, start, REFINED, 1, count)
         best = _best(plan[1:])
-        if best.niter < self.niter // 2:
+        if best.score > LITTLE * best.scores[0]:
             plan.append(self._try(kept, held_out, start, SMOOTHED, best.finer, count))
             best = _best(plan[1:])
         if fit is not None:
