@@ -9,9 +9,9 @@ array.order                   whole numbers [K], views that come next
 array.average.*               like values.*, where the fit averages
 array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], where the fit corrects poses
 array.response.*              float64 [rows, numbers], where the fit finds a response: air, gain
-array.search.*                where the fit searches for the step to stop at: float64 rows [any] and errors [looks], whole numbers
-                              iterations [looks], kept [1] and views [1]; start.*, like values.*, until the search has ended.
-                              Views then are those that the search sees
+array.search.*                where the fit searches for the step to stop at: float64 errors [looks], whole numbers iterations
+                              [looks], kept [1] and views [1]; start.*, like values.*, until the search has ended. Views then are
+                              those that the search sees. Earlier programs also wrote rows, float64 [any]
 array.share                   float32 [N], where the fit models two materials
 array.scattered               float64 [2, views, rows, columns], where it models scatter
 extra                         text: plain values as JSON, named in `_PLAIN`
@@ -35,11 +35,12 @@ from lingo_mi.scene.description import NAMES, read_scanner
 VERSION = 1  # of the checkpoints written now; those of earlier programs have neither a version nor a checksum
 _SEARCH = 'array.search.'
 _SEEN = _SEARCH + 'views'  # of the search; checkpoints of earlier programs lack it
+_ROWS = _SEARCH + 'rows'  # which only they have
 _NEVER_NEGATIVE = (
     'gradient',
     'seen',
     'array.poses.steps',
-    *(_SEARCH + name for name in ('rows', 'errors', 'iterations', 'kept', 'views')),
+    *(_SEARCH + name for name in ('errors', 'iterations', 'kept', 'views')),
 )
 _OF_EFFECTS = 'array.share', 'array.scattered'  # not every effect has both
 
@@ -70,7 +71,7 @@ def require_sound(arrays: dict[str, np.ndarray], extra: Any) -> None:
     allowed = dict(expected)
     if not extra.get('effects', True):
         allowed = {name: v for name, v in expected.items() if name not in _OF_EFFECTS}
-    for name in expected.keys() - {*_OF_EFFECTS, _SEEN} - arrays.keys():
+    for name in expected.keys() - {*_OF_EFFECTS, _SEEN, _ROWS} - arrays.keys():
         raise InputError(f'{name} is missing')
     for name in arrays.keys() - allowed.keys():
         raise InputError(f'{shown(name)} does not belong there')
@@ -112,7 +113,7 @@ def _expected(settings: Settings, views: int, count: int, searching: bool) -> di
     rows = dict(view=views, smooth=min(SMOOTH, views - 1) + 1)
     found |= {f'array.response.{k}': ('float64', (rows[x], 1)) for k, x in varies.items() if x != 'off'}
     if settings.stopping.stop == 'on':
-        found |= {f'{_SEARCH}{k}': ('float64', (None,)) for k in ('rows', 'errors')}
+        found |= dict.fromkeys((_SEARCH + 'errors', _ROWS), ('float64', (None,)))
         found |= {f'{_SEARCH}iterations': ('int', (None,)), f'{_SEARCH}kept': ('int', (1,)), _SEEN: ('int', (1,))}
         if searching:
             found |= {f'{_SEARCH}start.{k}': ('float32', (None, *shape[1:])) for k, shape in shapes.items()}
@@ -124,7 +125,6 @@ def _require_search(arrays: dict[str, np.ndarray], settings: Settings, iteration
     looks, kept = arrays[f'{_SEARCH}iterations'].tolist(), int(arrays[f'{_SEARCH}kept'][0])
     seen = looks == sorted(set(looks)) and len(arrays[f'{_SEARCH}errors']) == len(looks)
     seen = seen and (kept in looks and 0 < looks[0] if looks else searching and kept == 0)
-    seen = seen and (len(arrays[f'{_SEARCH}rows']) > 0) == bool(looks)
     if searching:
         start = {k: arrays[f'{_SEARCH}start.{k}'] for k in parameter_shapes(settings, 0)}
         shapes = parameter_shapes(settings, len(start['centre']) if settings.cloud else 0)

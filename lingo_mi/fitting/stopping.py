@@ -27,7 +27,6 @@ from lingo_mi.fitting.step import Stepper
 from lingo_mi.reconstruction.held_out import power, split
 from lingo_mi.scan import Scan
 
-CERTAIN = 1.0  # standard errors by which the error must have fallen: a smaller fall may be chance
 PREFIX = 'search.'  # of its names in a checkpoint
 
 
@@ -38,9 +37,6 @@ class Search:
     on                   whether it goes on; else the fit of all views has begun
     iterations, errors   of all looks: steps done; |A x - b| / |b| of the views held out, weighted by the root of the frequency
     kept                 steps done at the least error
-
-    An error counts as less where its square has fallen by more than `CERTAIN` standard errors of this fall, a mean over the rows
-    of the detector.
     """
 
     def __init__(self, scan: Scan, settings: Settings):
@@ -51,7 +47,6 @@ class Search:
         self.iterations: list[int] = []
         self.errors: list[float] = []
         self.kept = 0
-        self.rows = np.zeros(0)  # squared errors at the look that is kept
         self.start: dict[str, np.ndarray] = {}  # parameters that the fit of all views will start from
 
     def stepper(self) -> Stepper | FieldStepper:
@@ -77,12 +72,10 @@ class Search:
         wrong = stepper.model.expected(state, geometry) - self.held_out.projections
         if self.held_out.valid is not None:
             wrong[~self.held_out.valid] = 0
-        rows = power(wrong).mean(2).ravel() / self.all
         self.iterations.append(iteration)
-        self.errors.append(float(np.sqrt(rows.mean())))
-        fall = self.rows - rows if len(self.rows) else None
-        if fall is None or fall.mean() > CERTAIN * fall.std() / np.sqrt(fall.size):
-            self.kept, self.rows = iteration, rows
+        self.errors.append(float(np.sqrt(power(wrong).mean() / self.all)))
+        if self.errors[-1] < min(self.errors[:-1], default=np.inf):
+            self.kept = iteration
 
     @property
     def over(self) -> bool:
@@ -112,7 +105,6 @@ class Search:
     def arrays(self) -> dict:
         """All it knows, by name, for a checkpoint."""
         own = dict(
-            rows=self.rows,
             errors=np.array(self.errors),
             iterations=np.array(self.iterations, int),
             kept=np.array([self.kept]),
@@ -124,8 +116,8 @@ class Search:
     def restore(self, arrays: dict) -> None:
         """Restore the output of `arrays`."""
         own = {k.removeprefix(PREFIX): v for k, v in arrays.items() if k.startswith(PREFIX)}
-        self.rows, self.kept = own['rows'], int(own['kept'][0])
         self.errors, self.iterations = own['errors'].tolist(), own['iterations'].tolist()
+        self.kept = int(own['kept'][0])  # an earlier program's may not be of the least error
         self.start = {k.removeprefix('start.'): v for k, v in own.items() if k.startswith('start.')}
         self.on = bool(self.start)
 

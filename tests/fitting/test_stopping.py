@@ -43,7 +43,7 @@ def whole(scan):
 def test_it_stops_at_the_step_of_the_least_error(whole):
     errors, steps = whole.search['errors'], whole.search['iterations']
     assert steps == list(range(10, steps[-1] + 1, 10)) and steps[-1] == whole.steps + 30 < 160
-    assert errors[steps.index(whole.steps)] < 1.01 * min(errors) and errors[0] > 1.2 * min(errors)
+    assert errors[steps.index(whole.steps)] == min(errors) < errors[0] / 1.2
     assert whole.history[-1]['iteration'] == whole.steps
 
 
@@ -165,7 +165,9 @@ def test_altered_checkpoints(scan, tmp_path, where):
         run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path, progress=progress)
     content = contents(path)
     names = [name for name in content if name.startswith('array.search.')]
-    assert len(names) == (5 if where == 'fit' else 9)
+    assert len(names) == (4 if where == 'fit' else 8)
+    write_as_before(tmp_path / 'old.npz', content | {'array.search.rows': np.ones(7)})  # of earlier programs
+    checkpoint.load(tmp_path / 'old.npz')
     for name in names:
         old = content[name]
         gone = [] if name == 'array.search.views' else [None]  # which checkpoints of earlier programs lack
