@@ -249,7 +249,7 @@ def reconstruct_into(
     with progress_bar(algorithm, scan) as progress:
         found = reconstruct(scan, algorithm, progress=progress, **inputs)
     measured = len(cloud.geometry if cloud and args.complete else scan)
-    write_volume(out, found, f'{len(scan)}', measured, dataset.volume, args)
+    write_volume(out, found, str(len(scan)), measured, dataset.volume, args)
     if isinstance(found, Chosen):
         print(found.report())
         plan, error = plan_and_error_map(out)
