@@ -16,7 +16,7 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
-from lingo_mi.reconstruction.best import FROM_CLOUD, Trial, _best, error_map
+from lingo_mi.reconstruction.best import FROM_CLOUD, SMOOTHED, Trial, _best, error_map
 from lingo_mi.reconstruction.held_out import Score, Watch, split
 from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.system import System
@@ -139,6 +139,7 @@ def test_the_cloud_is_fitted():
 def test_noise_stops_it_early():
     clean, noisy = (Best(niter=8).run(scanned(1, photons)[0]) for photons in (0, 300.0))
     assert noisy.plan[0].niter < clean.plan[0].niter
+    assert [SMOOTHED in {trial.name for trial in found.plan} for found in (clean, noisy)] == [False, True]
     scan, truth = scanned(1, 300.0)
     assert psnr_3d(noisy.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
 
