@@ -24,7 +24,7 @@ from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 
 START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
-AHEAD = 0.95  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
+AHEAD = 0.9  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LITTLE = 0.95  # times the score after one pass of a refinement: where more passes bring no more, noise limits them
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
