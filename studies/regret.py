@@ -166,12 +166,15 @@ class Study:
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds.
 
-        The regret of `Best` counts the fixed settings without a cloud; that of `Best(cloud=True)` counts all.
+        The regret of `Best` counts the fixed settings without a cloud; that of `Best(cloud=True)` counts all. Clouds have
+        columns where there are cells of them.
         """
-        names = VOXELS | CLOUDS
-        heads = 'object | scanned | views | photons | **best** | regret, dB | error map | with a cloud | regret, dB'
-        columns = heads.count('|') + len(names)  # after the first
-        lines = [f'| {heads} | {" | ".join(names.values())} |', '|---|' + '---:|' * columns]
+        cases = list(cases)
+        clouds = any(self.get(case, name) for case in cases for name in (*CLOUDS, BEST_CLOUD))
+        names = VOXELS | (CLOUDS if clouds else {})
+        heads = ['object', 'scanned', 'views', 'photons', '**best**', 'regret, dB', 'error map']
+        heads += (['with a cloud', 'regret, dB'] if clouds else []) + list(names.values())
+        lines = [f'| {" | ".join(heads)} |', '|---|' + '---:|' * (len(heads) - 1)]
         for case in cases:
             chosen, with_cloud = self.get(case, BEST), self.get(case, BEST_CLOUD)
             if chosen is None:
@@ -180,7 +183,9 @@ class Study:
             photons = f'{case.photons:g}' if case.photons else 'measured' if case.object in MEASURED else 'no noise'
             row = [case.object, f'x{case.finer}', str(case.views), photons]
             row += [_cell(chosen), _regret(chosen, [fixed[name] for name in VOXELS if name in fixed])]
-            row += [f'{chosen["error_map"]:.2f}', _cell(with_cloud), _regret(with_cloud, fixed.values())]
+            row += [f'{chosen["error_map"]:.2f}']
+            if clouds:
+                row += [_cell(with_cloud), _regret(with_cloud, fixed.values())]
             lines.append(f'| {" | ".join([*row, *(_cell(fixed.get(name)) for name in names)])} |')
         return '\n'.join(lines)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.effects.detector import Detector
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.trajectories import circular
+from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors import grid
 from lingo_mi.studies.tables.objects import averaged, load_object
 
@@ -22,16 +24,7 @@ def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tupl
     """
     thing = load_object(name, size * finer)
     truth = averaged(thing, size)
-    pixel = 2 * max(n * d for n, d in zip(truth.data.shape, truth.spacing)) / pixels
-    geometry = CircularGeometry(
-        DSO=1000.0,
-        DSD=1500.0,
-        nDetector=(pixels, pixels),
-        dDetector=(pixel, pixel),
-        nVoxel=thing.data.shape,
-        dVoxel=thing.spacing,
-        angles=2 * np.pi * np.arange(views) / views,
-    )
+    geometry = default_geometry(thing, circular(views), pixels)
     line_integrals = grid.project(thing.data, geometry)
     unit = np.float32(LARGEST / line_integrals.max())
     return geometry.with_volume(truth.data.shape, truth.spacing), line_integrals * unit, truth.data * unit
