@@ -17,6 +17,7 @@ import importlib
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,6 @@ from lingo_mi.studies.provenance import provenance
 
 REFERENCE = 'reference'
 ACROSS = 5  # slices side by side in the picture
-# None is good for every scan.
-RTK_WEIGHTS = 10.0, 30.0, 100.0, 300.0  # of the total variation
-SHARPNESS = 0.0, 1.0, 2.0, 3.0  # of MBIRJAX, whose default is 1
 
 
 def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
@@ -75,16 +73,6 @@ def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
     return mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=sharpness, positivity_flag=True)
 
 
-def _best_for(scan: Scan, values: Sequence[float], reconstruct: Callable[[Scan, float], np.ndarray]) -> np.ndarray:
-    """The volume by the value that predicts one view in five best from the others."""
-    kept, held_out = split(scan, 5)
-
-    def miss(value: float) -> float:
-        return float(np.nan_to_num(_wrong(reconstruct(kept, value), held_out), nan=np.inf))
-
-    return reconstruct(scan, min(values, key=miss))
-
-
 def _wrong(volume: np.ndarray, held_out: Scan) -> float:
     """Root mean square error of a volume's projections over the valid pixels of views."""
     wrong = (grid.project(volume, held_out.geometry) - held_out.projections).astype(float)
@@ -98,21 +86,44 @@ def _mbirjax() -> Any:
     return importlib.import_module('mbirjax')
 
 
-# By name: the setting that is chosen by held-out views, the values to choose from, and the volume [x, y, z] of a scan with one.
-TUNED: dict[str, tuple[str, Sequence[float], Callable[[Scan, float], np.ndarray]]] = {
-    'rtk-tv': ('weight', RTK_WEIGHTS, _rtk_tv),
-    'mbirjax': ('sharpness', SHARPNESS, _qggmrf),
-}
-# By name: what it is called in the table, and the volume [x, y, z] of a scan.
-METHODS: dict[str, tuple[str, Callable[[Scan], np.ndarray]]] = {
-    'fdk': ('FDK', lambda scan: FDK().run(scan).volume),
-    'sart': ('SART', lambda scan: SART().run(scan).volume),
-    'asd-pocs': ('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
-    'rtk-tv': ('RTK, total variation', lambda scan: _best_for(scan, RTK_WEIGHTS, _rtk_tv)),
-    'mbirjax': ('MBIRJAX', lambda scan: _best_for(scan, SHARPNESS, _qggmrf)),
-    'fast': ("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
-    'refined': ('`fast`, then `refined`, `finer=2`', _refined),
-    'best': ('`best`', lambda scan: Best().run(scan).volume),
+@dataclass(frozen=True)
+class Method:
+    """A way to reconstruct a scan.
+
+    label     in the table
+    volume    the volume [x, y, z] of a scan, or of a scan and a value of the setting
+    setting   chosen by held-out views among `values`, where no value is good for every scan
+    """
+
+    label: str
+    volume: Callable[..., np.ndarray]
+    setting: str = ''
+    values: Sequence[float] = ()
+
+    def run(self, scan: Scan) -> tuple[np.ndarray, dict[str, float]]:
+        """The volume of a scan, and the setting by name with the value that predicts one view in five best from the others."""
+        if not self.setting:
+            return self.volume(scan), {}
+        value = self.values[0]
+        if len(self.values) > 1:
+            kept, held_out = split(scan, 5)
+            value = min(self.values, key=lambda value: self._miss(kept, value, held_out))
+        return self.volume(scan, value), {self.setting: value}
+
+    def _miss(self, kept: Scan, value: float, held_out: Scan) -> float:
+        volume = self.volume(kept, value)
+        return _wrong(volume, held_out) if np.isfinite(volume).all() else np.inf  # a peer may diverge
+
+
+METHODS = {
+    'fdk': Method('FDK', lambda scan: FDK().run(scan).volume),
+    'sart': Method('SART', lambda scan: SART().run(scan).volume),
+    'asd-pocs': Method('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
+    'rtk-tv': Method('RTK, total variation', _rtk_tv, 'weight', (10.0, 30.0, 100.0, 300.0)),
+    'mbirjax': Method('MBIRJAX', _qggmrf, 'sharpness', (0.0, 1.0, 2.0, 3.0)),
+    'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
+    'refined': Method('`fast`, then `refined`, `finer=2`', _refined),
+    'best': Method('`best`', lambda scan: Best().run(scan).volume),
 }
 NEEDS = {
     'rtk-tv': (_itk, "RTK: pip install -e '.[reference]'"),
@@ -120,23 +131,22 @@ NEEDS = {
 }
 
 
-def method_of(name: str) -> tuple[str, Callable[[Scan], np.ndarray]]:
-    """What a method is called in the table, and the volume [x, y, z] of a scan. `mbirjax:1` has that setting of TUNED.
+def method_of(name: str) -> Method:
+    """The method of a name; `mbirjax:1` has that value of its setting.
 
     Raises InputError for an unknown one.
     """
     kind, _, value = name.partition(':')
-    if kind not in METHODS or value and kind not in TUNED:
-        known = [*METHODS, *(f'{tuned}:{setting.upper()}' for tuned, (setting, _, _) in TUNED.items())]
+    method = METHODS.get(kind)
+    if method is None or value and not method.setting:
+        known = [*METHODS, *(f'{name}:{method.setting.upper()}' for name, method in METHODS.items() if method.setting)]
         raise InputError(f'--methods {name}: is unknown; use some of {", ".join(known)}')
-    label, run = METHODS[kind]
     if not value:
-        return label, run
-    setting, _, reconstruct = TUNED[kind]
+        return method
     number = parse(f'--methods {name}', value, 0.0)
     if not np.isfinite(number):
-        raise InputError(f'--methods {name}: the {setting} must be finite')
-    return f'{label}, {setting} {number:g}', lambda scan: reconstruct(scan, number)
+        raise InputError(f'--methods {name}: the {method.setting} must be finite')
+    return replace(method, label=f'{method.label}, {method.setting} {number:g}', values=(number,))
 
 
 def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
@@ -185,8 +195,9 @@ class Study:
                         say(f'{count} views, {method}: left out: {error}')
                         continue
                     self.cells.put(_case(count), _file(method), found)
+                    said = ', '.join([method, *(f'{name} {value:g}' for name, value in found['settings'].items())])
                     say(
-                        f'{count} views, {method}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
+                        f'{count} views, {said}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
                         f'{found["seconds"]:.0f} s'
                     )
 
@@ -218,7 +229,7 @@ class Study:
     def _compute(self, chosen: Dataset, method: str) -> dict:
         assert chosen.test is not None  # the views that were not chosen
         began, processor = time.perf_counter(), time.process_time()
-        volume = method_of(method)[1](chosen.train)
+        volume, settings = method_of(method).run(chosen.train)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
         Reconstruction(volume, [], seconds, chosen.train.geometry).save(
             self._volume_path(_case(len(chosen.train)), method), force=True
@@ -226,6 +237,7 @@ class Study:
         return dict(
             views=len(chosen.train),
             method=method,
+            settings=settings,
             held_out_rms=_wrong(volume, chosen.test),
             psnr_3d=psnr_3d(volume, self.reference()),
             seconds=seconds,
@@ -245,7 +257,7 @@ class Study:
             for method, cell in found.items():
                 rms = f'{cell["held_out_rms"]:.4f}'
                 lines.append(
-                    f'| {count} | {method_of(method)[0]} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '
+                    f'| {count} | {method_of(method).label} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '
                     f'| {cell["psnr_3d"]:.2f} | {cell["seconds"]:.0f} | {cell["processor_seconds"]:.0f} |'
                 )
         return '\n'.join(lines)
@@ -267,7 +279,7 @@ class Study:
             shown = [('reference', reference)]
             for name in methods:
                 if self.get(count, name) is not None:
-                    shown.append((f'{method_of(name)[0].replace("`", "")}, {count} views', self.volume(count, name)))
+                    shown.append((f'{method_of(name).label.replace("`", "")}, {count} views', self.volume(count, name)))
             for axis, (title, volume) in zip(block.flat, shown):
                 axis.imshow(volume[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
                 axis.set_title(title, fontsize=9)

@@ -30,7 +30,7 @@ LITTLE = 0.95  # times the score after one pass of a refinement: where more pass
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
-PLAIN, REFINED, SMOOTHED, FROM_CLOUD = 'asd-pocs', 'refined', 'refined, smooth', 'refined, cloud'
+PLAIN = 'asd-pocs'
 TICKS = 20  # steps of the progress for a fit
 
 # Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a geometry, which gives the
@@ -60,7 +60,7 @@ class Chosen(Reconstruction):
         for i, trial in enumerate(self.plan):
             size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.geometry.dVoxel)
             mark = '*' if i == self.taken else ' '
-            lines.append(f'{mark} {trial.name:16} voxels {size} mm, {trial.niter:2} passes: {trial.score:.5f}')
+            lines.append(f'{mark} {trial.name:22} voxels {size} mm, {trial.niter:2} passes: {trial.score:.5f}')
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Best(Algorithm):
     2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
        over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If passes after the first one
        gain little, noise limits them, and more total variation is tried.
-    3. With `cloud`, a cloud of Gaussians is fitted to the same views, and the same steps are tried from its volume.
+    3. With `cloud`, a cloud of Gaussians is fitted to the same views, and the best of these steps are tried from its volume.
     4. The setting that predicts the views best, with its number of passes, is applied to all views.
 
     Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks; the result is
@@ -168,23 +168,23 @@ class Best(Algorithm):
         ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain, slow=True))
         assert plain.volume is not None  # of its best pass
         start, plan = plain.volume, [plain]
-        own = self._try(kept, held_out, start, REFINED, 1, count, by=TRIAL)
+        own = self._try(kept, held_out, start, _refined(1), count, by=TRIAL)
         plan.append(own)
         if self.finer > 1:
-            plan.append(self._try(kept, held_out, start, REFINED, self.finer, count, beat=own.score, by=TRIAL))
+            plan.append(self._try(kept, held_out, start, _refined(self.finer), count, beat=own.score, by=TRIAL))
         ahead = any(min(trial.scores[:TRIAL]) < AHEAD * own.score for trial in plan[2:])
         if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
-            plan[1] = self._try(kept, held_out, start, REFINED, 1, count)
+            plan[1] = self._try(kept, held_out, start, _refined(1), count)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
-            plan.append(self._try(kept, held_out, start, SMOOTHED, best.finer, count))
+            plan.append(self._try(kept, held_out, start, _refined(best.finer, smooth=True), count))
             best = _best(plan[1:])
         if fit is not None:
             for trial in plan[1:]:
                 if trial is not best:
                     trial.volume = None  # room for the fit
             start = self._cloud(kept, best.finer, fit, count)
-            plan.append(self._try(kept, held_out, start, FROM_CLOUD, best.finer, count))
+            plan.append(self._try(kept, held_out, start, _refined(best.finer, best.smooth, cloud=True), count))
         return plan
 
     def _cloud(self, scan: Scan, finer: int, fit: Fit, count) -> np.ndarray:
@@ -196,23 +196,24 @@ class Best(Algorithm):
 
         return fit(scan, progress)(Refined(finer=finer).grid(scan.geometry))
 
-    def _try(self, kept, held_out, start: np.ndarray, name: str, finer: int, count, beat=None, by=0) -> Trial:
-        trial, grid = Trial(name, finer), Refined(finer=finer).grid
+    def _try(self, kept, held_out, start: np.ndarray, trial: Trial, count, beat=None, by=0) -> Trial:
+        grid = Refined(finer=trial.finer).grid
         score = Score(replace(held_out, geometry=grid(held_out.geometry)))
         niter = min(by, self.niter) if by and beat is None else self.niter
-        refine(kept, start, niter, finer, name == SMOOTHED, self.seed, count, Watch(score, trial, beat, by))
+        refine(kept, start, niter, trial.finer, trial.smooth, self.seed, count, Watch(score, trial, beat, by))
         return trial
 
     def _apply(self, scan: Scan, start_niter: int, trial: Trial, count, fit: Fit | None) -> Reconstruction:
         """The chosen setting on all views."""
-        if trial.name == FROM_CLOUD:
+        if trial.cloud:
             assert fit is not None  # which has made the trial
             start = self._cloud(scan, trial.finer, fit, count)
-            return refine(scan, start, trial.niter, trial.finer, False, self.seed, count)
-        plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
-        if trial.name == PLAIN:
-            return plain
-        return refine(scan, plain.volume, trial.niter, trial.finer, trial.name == SMOOTHED, self.seed, count)
+        else:
+            plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
+            if trial.name == PLAIN:
+                return plain
+            start = plain.volume
+        return refine(scan, start, trial.niter, trial.finer, trial.smooth, self.seed, count)
 
     @staticmethod
     def _counter(progress: Progress | None, steps: int):
@@ -251,6 +252,10 @@ def refine(
         algorithm = replace(algorithm, alpha=SMOOTH)
     weights, blur = structure(start), excess_width(fine.geometry)
     return algorithm.run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
+
+
+def _refined(finer: int, smooth: bool = False, cloud: bool = False) -> Trial:
+    return Trial('refined' + ', smooth' * smooth + ', cloud' * cloud, finer, smooth, cloud)
 
 
 def _best(refinements: Sequence[Trial]) -> Trial:

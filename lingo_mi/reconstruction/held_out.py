@@ -60,12 +60,16 @@ class Trial:
 
     name     of the setting
     finer    parts along each side of a voxel
+    smooth   whether with more total variation
+    cloud    whether from the volume of a cloud
     scores   `Score` of the held-out views after every pass
     volume   after the pass with the lowest score, on the setting's own voxels
     """
 
     name: str
     finer: int
+    smooth: bool = False
+    cloud: bool = False
     scores: list[float] = field(default_factory=list)
     volume: np.ndarray | None = None
 

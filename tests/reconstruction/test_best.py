@@ -16,7 +16,7 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
-from lingo_mi.reconstruction.best import FROM_CLOUD, SMOOTHED, Trial, _best, error_map
+from lingo_mi.reconstruction.best import Trial, _best, error_map
 from lingo_mi.reconstruction.held_out import Score, Watch, split
 from lingo_mi.reconstruction.run import check_room
 from lingo_mi.reconstruction.system import System
@@ -90,7 +90,7 @@ def test_finer_voxels_for_finer_objects_only():
 
 @pytest.mark.parametrize('score, taken', [(1.01, 2), (1.03, 1)])
 def test_smaller_voxels_where_the_scores_are_nearly_the_same(score, taken):
-    assert _best([Trial('refined', 1, [1.0]), Trial('refined', 2, [score])]).finer == taken
+    assert _best([Trial('refined', 1, scores=[1.0]), Trial('refined', 2, scores=[score])]).finer == taken
 
 
 @pytest.mark.parametrize('right', [True, False])
@@ -105,7 +105,7 @@ def test_a_cloud_is_taken_where_it_predicts_the_views_better(right):
         return lambda geometry: truth if right else np.full_like(truth, truth.mean())
 
     found = Best(niter=2, finer=1, cloud=True).run(scan, fit=fit, progress=lambda k, *_: done.append(k))
-    assert found.plan[-1].name == FROM_CLOUD and (found.plan[found.taken].name == FROM_CLOUD) == right
+    assert found.plan[-1].cloud and found.plan[found.taken].cloud == right
     assert fitted == [16, 20][: 1 + right]  # the views that are kept; all of them, where it is taken
     assert done[:-1] == list(range(1, len(done)))
 
@@ -132,16 +132,23 @@ def test_a_cloud_needs_a_fit():
 def test_the_cloud_is_fitted():
     scan, truth = scanned(2)
     found = lm.reconstruct(scan, Best(niter=3, cloud=True), progress=False)
-    assert found.plan[-1].name == FROM_CLOUD and found.plan[-1].score < found.plan[0].score
+    assert found.plan[-1].cloud and found.plan[-1].score < found.plan[0].score
     assert psnr_3d(found.volume, truth) > 30
 
 
 def test_noise_stops_it_early():
     clean, noisy = (Best(niter=8).run(scanned(1, photons)[0]) for photons in (0, 300.0))
     assert noisy.plan[0].niter < clean.plan[0].niter
-    assert [SMOOTHED in {trial.name for trial in found.plan} for found in (clean, noisy)] == [False, True]
+    assert [any(trial.smooth for trial in found.plan) for found in (clean, noisy)] == [False, True]
     scan, truth = scanned(1, 300.0)
     assert psnr_3d(noisy.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+
+
+def test_with_noise_a_cloud_gets_more_total_variation_too():
+    scan, truth = scanned(1, 300.0)
+    found = Best(niter=8, finer=1, cloud=True).run(scan, fit=lambda part, progress: lambda geometry: 0.9 * truth)
+    best = min(found.plan[1:-1], key=lambda trial: trial.score)
+    assert best.smooth and found.plan[-1].smooth and found.plan[-1].name == 'refined, smooth, cloud'
 
 
 def test_the_plan_is_told_and_can_be_kept():

@@ -3,6 +3,7 @@
 import json
 import runpy
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from lingo_mi.metrics import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
-from lingo_mi.studies.peers import Study
+from lingo_mi.studies.peers import Method, Study
 
 SIZES = dict(DSO=200.0, DSD=300.0, dDetector=3.0)
 
@@ -75,6 +76,22 @@ def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
     assert code == 2 and err.count('\n') == 1 and 'another scan' in err
 
 
+def test_a_setting_is_chosen_by_views_that_are_held_out():
+    truth = np.full((8, 8, 8), 0.02, np.float32)
+    geometry = Geometry.cone(nDetector=12, nVoxel=8, dVoxel=2.4, angles=circular(10), **SIZES)
+    views = []
+
+    def volume(scan, weight):
+        views.append(len(scan))
+        return truth * weight
+
+    method = Method('scaled', volume, 'weight', (0.5, 1.0, np.nan, 2.0))
+    found, settings = method.run(Scan(geometry, grid.project(truth, geometry)))
+    assert settings == {'weight': 1.0} and np.array_equal(found, truth) and views == [8, 8, 8, 8, 10]
+    assert replace(method, values=(2.0,)).run(Scan(geometry, grid.project(truth, geometry)))[1] == {'weight': 2.0}
+    assert views[5:] == [10]
+
+
 def test_missing_peers_are_left_out(peers):
     code, text, err = peers('--views', 4, '--methods', 'fdk', 'rtk-tv', 'mbirjax', missing=('itk', 'mbirjax'))
     assert code == 0 and 'rtk-tv: left out' in text and 'mbirjax: left out' in text and '| 4 | FDK |' in text, err
@@ -92,6 +109,8 @@ def test_peers(peers, tmp_path, method, module):
     folder = tmp_path / 'out' / 'walnut_16_16_16' / '6_views'
     ours, theirs = (json.loads((folder / f'{name}.json').read_text()) for name in ('sart', method.replace(':', '_')))
     assert ('| MBIRJAX, sharpness 1 |' in text) == (method == 'mbirjax:1')
+    assert ours['settings'] == {} and f'{method}, {"weight" if module == "itk" else "sharpness"} ' in text
+    assert method != 'mbirjax:1' or theirs['settings'] == {'sharpness': 1.0}
     assert theirs['held_out_rms'] < 2 * ours['held_out_rms'] and theirs['psnr_3d'] > ours['psnr_3d'] - 4
 
 
