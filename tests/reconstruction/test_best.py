@@ -145,7 +145,7 @@ def test_noise_stops_it_early():
 
 
 def test_with_noise_a_cloud_gets_more_total_variation_too():
-    scan, truth = scanned(1, 300.0)
+    scan, truth = scanned(1, 100.0)
     found = Best(niter=8, finer=1, cloud=True).run(scan, fit=lambda part, progress: lambda geometry: 0.9 * truth)
     best = min(found.plan[1:-1], key=lambda trial: trial.score)
     assert best.smooth and found.plan[-1].smooth and found.plan[-1].name == 'refined, smooth, cloud'
