@@ -64,8 +64,8 @@ def _itk() -> Any:
     return itk
 
 
-def _rtk_tv(scan: Scan, weight: float) -> np.ndarray:
-    return rtk_bridge.total_variation(scan, _itk(), weight)
+def _rtk_tv(scan: Scan, beta: float) -> np.ndarray:
+    return rtk_bridge.total_variation(scan, _itk(), beta)
 
 
 def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
@@ -119,7 +119,7 @@ METHODS = {
     'fdk': Method('FDK', lambda scan: FDK().run(scan).volume),
     'sart': Method('SART', lambda scan: SART().run(scan).volume),
     'asd-pocs': Method('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
-    'rtk-tv': Method('RTK, total variation', _rtk_tv, 'weight', (10.0, 30.0, 100.0, 300.0)),
+    'rtk-tv': Method('RTK, total variation', _rtk_tv, 'beta', (1.0, 3.0, 10.0, 30.0)),
     'mbirjax': Method('MBIRJAX', _qggmrf, 'sharpness', (0.0, 1.0, 2.0, 3.0)),
     'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
     'refined': Method('`fast`, then `refined`, `finer=2`', _refined),

@@ -10,8 +10,8 @@ to the true volume if it is known; and how long it took.
 Each volume is stored as NIfTI when it is done, and the same command goes on after an interruption. The table, as Markdown, is
 renewed after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but MBIRJAX's densities
 are kept from being negative, and refined has what is advised for measured objects: finer=2, niter=4 and no completed views.
-MBIRJAX's sharpness and the weight of RTK's total variation are each chosen among four values by views that are held out, which
-their times include; mbirjax:1 and rtk-tv:100 have the value that they name.
+MBIRJAX's sharpness and the beta of RTK's total variation are each chosen among four values by views that are held out, which
+their times include; mbirjax:1 and rtk-tv:10 have the value that they name.
 """
 
 import argparse

@@ -109,7 +109,7 @@ def test_peers(peers, tmp_path, method, module):
     folder = tmp_path / 'out' / 'walnut_16_16_16' / '6_views'
     ours, theirs = (json.loads((folder / f'{name}.json').read_text()) for name in ('sart', method.replace(':', '_')))
     assert ('| MBIRJAX, sharpness 1 |' in text) == (method == 'mbirjax:1')
-    assert ours['settings'] == {} and f'{method}, {"weight" if module == "itk" else "sharpness"} ' in text
+    assert ours['settings'] == {} and f'{method}, {"beta" if module == "itk" else "sharpness"} ' in text
     assert method != 'mbirjax:1' or theirs['settings'] == {'sharpness': 1.0}
     assert theirs['held_out_rms'] < 2 * ours['held_out_rms'] and theirs['psnr_3d'] > ours['psnr_3d'] - 4
 
