@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lingo_mi.calibration.order import order_faults
 from lingo_mi.calibration.response.response import Response
 from lingo_mi.calibration.search import Found, search
 from lingo_mi.errors import InputError, require_type
@@ -120,8 +122,9 @@ def calibrate(
     can hardly be told from an object that lies higher, and is not sought.
 
     Returns a `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less
-    than three standard errors from zero is left as it was, as is scattered light that would be negative in places. Raises
-    InputError for fewer than 8 views, and a scan without signal.
+    than three standard errors from zero is left as it was, as is scattered light that would be negative in places. Warns where
+    the views contradict their angles or their order: what is found then means nothing. Raises InputError for fewer than 8 views,
+    and a scan without signal.
 
         calibration = lm.calibrate(data, drift=3)
         data = calibration.corrected(data)
@@ -152,4 +155,7 @@ def calibrate(
             scatter='one' if scatter else 'off',
             highest=max(float(measured.projections.max()), 1e-6),
         )
-        return Calibration(train.geometry, search(measured, drift, response, report))
+        calibration = Calibration(train.geometry, search(measured, drift, response, report))
+    for fault in order_faults(calibration._moved(measured)):
+        warnings.warn(fault, stacklevel=2)
+    return calibration

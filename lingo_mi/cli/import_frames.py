@@ -101,5 +101,7 @@ def main() -> None:
     photons = history.get('photons_from_flats', history['photons_from_views'])
     print(f'{args.out}: {len(scan)} views of {scan.geometry.nDetector[0]} x {scan.geometry.nDetector[1]} pixels')
     print(f'  {history["bad_pixels"]} bad pixels of the panel, {left_out:.2%} of all pixels left out')
+    if 'darks' not in history:
+        print('  no dark frames: counts without beam are taken to be 0')
     source = 'flats' if 'photons_from_flats' in history else 'views'
     print(f'  about {photons:.3g} photons a pixel, from the scatter of the {source}')

@@ -1,10 +1,17 @@
 """Look at a scan before work: geometry, air, noise, truncation, order of the views, angles and axis; and what to correct."""
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lingo_mi.cli.common import Parser, writable_file
 from lingo_mi.errors import InputError
+
+if TYPE_CHECKING:
+    from lingo_mi.inspection.measure import Findings
+    from lingo_mi.scan import Scan
 
 EPILOG = """\
 examples:
@@ -29,6 +36,8 @@ def main() -> None:
 
     scan = read_scan(args.scan).train
     found = look(scan)
+    if not found.misplaced and not found.suspects:
+        _compare_views(scan, found)
     print('\n'.join(found.facts))
     print('\nto correct:' if found.advice else '\nnothing to correct was found')
     for line in found.advice:
@@ -36,3 +45,15 @@ def main() -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     draw(out, scan, found)
     print(f'\n{out}')
+
+
+def _compare_views(scan: Scan, found: Findings) -> None:
+    """Adds what quick reconstructions say of the views' order, where they can be made."""
+    from lingo_mi.calibration.order import order_faults
+    from lingo_mi.runtime import ensure_variant
+
+    try:
+        ensure_variant()
+        found.advice += order_faults(scan)
+    except InputError as error:
+        found.facts.append(f'order of the views: not measured ({error})')

@@ -17,6 +17,8 @@ VIEWS = 40  # of the plane: the time goes with its square
 CLEAR = 0.01  # a disagreement that is more than discretisation
 UNSTEADY = 0.5  # pixels of jitter that blur a volume
 UNEQUAL_AIR = 0.01  # relative to the highest line integral
+HALF_TURN = 175  # degrees: views of less do not tell the axis
+WIDE = 2  # half a panel over its distance from the source, which no panel has
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
 
 
@@ -29,6 +31,7 @@ class Findings:
     air        level beside the object, nan where none is seen
     mass       [n] mean line integral of every view, air subtracted
     suspects   views that are black, doubled or out of order
+    misplaced  whether advice says that angles or distances are wrong
     """
 
     facts: list[str] = field(default_factory=list)
@@ -36,6 +39,11 @@ class Findings:
     air: float = np.nan
     mass: np.ndarray = field(default_factory=lambda: np.zeros(0))
     suspects: list[int] = field(default_factory=list)
+    misplaced: bool = False
+
+    def misplace(self, advice: str) -> None:
+        self.advice.append(advice)
+        self.misplaced = True
 
 
 def look(scan: Scan) -> Findings:
@@ -218,20 +226,30 @@ def _bridged(values, known):
 def _angles(found, scan, air):
     """Unit and sense of the angles, the axis, and views out of order."""
     geometry, n = scan.geometry, len(scan)
-    if n >= 4 and isinstance(geometry, CircularGeometry):
+    turn = 0.0
+    if geometry.mode == 'cone' and max(geometry.sDetector) > 2 * WIDE * geometry.DSD:
+        found.misplace(
+            f'the panel of {max(geometry.sDetector):.4g} mm is {max(geometry.sDetector) / geometry.DSD:.2g} times as wide as its '
+            'distance from the source: give DSO, DSD and the size of the pixels in mm'
+        )
+    if n >= 2 and isinstance(geometry, CircularGeometry):
         span = np.ptp(geometry.angles)
         if span <= 2 * np.pi:  # those of poses jump from pi to -pi
             span = min(span, np.ptp(np.unwrap(geometry.angles)))
         turn = span * n / (n - 1)
+        if not turn:
+            found.misplace('all views have the same angle: give the angle of each')
+            return
+    if n >= 4 and isinstance(geometry, CircularGeometry):
         found.facts.append(f'angles: {np.degrees(turn):.4g} degrees in all')
         for whole in (np.pi, 2 * np.pi):
             if abs(np.degrees(turn) / whole - 1) < 0.02:
-                found.advice.append(
+                found.misplace(
                     f'the angles span {np.degrees(turn):.3g} degrees: they look like radians; a .yml takes degrees'
                 )
                 return
             if abs(turn / np.degrees(whole) - 1) < 0.02:
-                found.advice.append(
+                found.misplace(
                     f'the angles span {turn:.4g} radians: they look like degrees; give numpy.radians(angles)'
                 )
                 return
@@ -256,7 +274,7 @@ def _angles(found, scan, air):
     found.facts.append(f'consistency of the views: they disagree by {given:.2%} rms {what}')
     _, other = best_shift(plane, -plane.angles, 0.08 * np.ptp(plane.u)) if plane.DSD else (0.0, np.inf)
     if best > CLEAR and other < 0.4 * best:
-        found.advice.append(
+        found.misplace(
             f'with reversed angles the views disagree by {other:.2%} instead of {best:.2%}: change the sign of the angles, or '
             'mirror the columns'
         )
@@ -269,12 +287,15 @@ def _angles(found, scan, air):
             f"views {views[0]} and {views[1]} fit better in each other's place: check the order of the frames"
         )
         return
+    if np.degrees(turn) < HALF_TURN:
+        found.facts.append('axis: not measured, as the views span less than half a turn')
+        return
     pixel = geometry.dDetector[1]
     if abs(shift) > 0.5 * pixel and best < 0.7 * given:
         found.facts.append(
             f'axis: {shift:+.3g} mm on the panel ({shift / pixel:+.2g} pixels) lets them agree to {best:.2%}'
         )
-        found.advice.append(
+        found.misplace(
             f'the axis is off: add {shift:+.3g} mm to the second number of offDetector, or run lingo-mi calibrate'
         )
 

@@ -62,10 +62,9 @@ class Beam:
         if flats is not None and i0 is not None:
             raise InputError('flats and i0 both say the unattenuated beam; give one of them')
         air = region_of('air', options.air, views.shape)
-        limit = options.saturation
-        if limit is None:
-            limit = np.iinfo(views.dtype).max if views.dtype.kind in 'ui' else np.inf
-        panel = fields(views.shape, flats, darks, limit)
+        limit = _largest(views) if options.saturation is None else options.saturation
+        brightest = limit if options.saturation is not None or flats is None else _largest(flats)
+        panel = fields(views.shape, flats, darks, brightest)
         if flats is None and i0 is not None:
             # Nikon's white level is a count, with the dark signal in it.
             panel = replace(panel, flat=np.full(views.shape, float(i0)) if white is None else i0 - panel.dark)
@@ -90,3 +89,8 @@ class Beam:
         if self.percentile is None:
             return float(counts.sum() / reference.sum())
         return float(np.percentile(counts / reference, self.percentile))
+
+
+def _largest(frames: Frames) -> float:
+    """The largest count that their type can hold."""
+    return np.iinfo(frames.dtype).max if frames.dtype.kind in 'ui' else np.inf

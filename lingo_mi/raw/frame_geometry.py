@@ -50,8 +50,14 @@ def geometry_of(
         listed = isinstance(options.angles, str | PathLike)
         try:
             angles = read_numbers(options.angles) if listed else np.atleast_1d(np.asarray(options.angles, float))
+        except InputError:
+            raise
         except (TypeError, ValueError):
             raise InputError('angles must be a list of numbers, in degrees, or the name of a file of them') from None
+    if angles is not None and not np.isfinite(angles).all():
+        raise InputError(
+            f'{frames.where}: angle {int(np.argmin(np.isfinite(angles)))} is no finite number; give --angles'
+        )
     if angles is not None and len(angles) != n:
         raise InputError(f'{frames.where}: there are {len(angles)} angles for {n} views; these must agree')
     if isinstance(source, Geometry):

@@ -128,7 +128,7 @@ def _image(path):
         image = np.asarray(itk.imread(str(path)))
     elif package == 'fabio':
         with optional('fabio').open(str(path)) as file:
-            image = np.asarray(file.data)
+            image = _whole(path, file)
     else:
         image = read_tiff_file(path)
     if image.ndim != 2 or image.size == 0:
@@ -144,7 +144,14 @@ def _image_stack(path):
 
 def _edf(path):
     file = optional('fabio').open(str(path))
-    return file.nframes, lambda i: np.asarray(file.get_frame(i).data)
+    return file.nframes, lambda i: _whole(path, file.get_frame(i))
+
+
+def _whole(path, frame):
+    """The image of one of fabio's frames, which would fill up what is missing of it."""
+    if getattr(frame, 'incomplete_data', False):
+        raise InputError(f'{path}: is cut off: it holds less than its header says; copy it again')
+    return np.asarray(frame.data)
 
 
 def _tiff(path):

@@ -21,6 +21,8 @@ from lingo_mi.scan import Scan
 
 BELOW = -0.1  # a line integral that noise does not explain: 10 % more counts than the flat
 OFTEN = 0.02  # in this part of a view's pixels
+DARK = 0.005  # of the light of the other views: what a closed shutter leaves
+CLIPPED = 1e-3  # part of a view's pixels with the same highest count
 
 
 def import_raw(
@@ -32,8 +34,8 @@ def import_raw(
     geometry   of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, Nikon's .xtekct, or RTK's .xml. In a .yml
                nDetector may be left out, and nVoxel and dVoxel: the voxels are then as large as a pixel on the axis
 
-    Raises InputError where something is missing, contradictory or damaged; warns of views that are black or brighter than the
-    flat field.
+    Raises InputError where something is missing, contradictory or damaged; warns of views that are black, saturated or brighter
+    than the flat field, and where most pixels are left out.
     """
     recording = open_recording(path)
     views, n = recording.views, len(recording.views)
@@ -48,6 +50,8 @@ def import_raw(
     rows, columns = (v0, v1) if down > 0 else (nv - v1, nv - v0), (u0, u1) if across > 0 else (nu - u1, nu - u0)
     out = placed(given, (*rows, *columns))
     bins = out.bins(options.binning)
+    if options.binning > max(out.nDetector):
+        raise InputError(f'binning {options.binning} is more than the {max(out.nDetector)} pixels of a view')
     out = out.binned(options.binning).subset(chosen)
     if not grid_given(geometry):
         out = own_grid(out)
@@ -59,13 +63,20 @@ def import_raw(
 
     p = np.zeros((len(chosen), *out.nDetector), np.float32)
     valid, levels, part = np.zeros(p.shape, bool), np.ones(len(chosen)), beam.panel.part(kept)
+    light, clipped = np.zeros(len(chosen)), {}
     with Progress('Import', len(chosen), shown=progress) as bar:
         for k, i in enumerate(chosen):
             frame = views[i]
             levels[k] = beam.level(frame, float(exposure[i]))  # of the whole frame: air may lie outside the crop
             p[k], valid[k] = line_integrals(kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit)
+            light[k] = np.exp(np.minimum(-p[k][valid[k]], 50)).sum() / valid[k].size  # no overflow
+            highest = frame.max()
+            if highest < beam.limit and _full_range(highest) and (frame == highest).mean() > CLIPPED:
+                clipped[int(i)] = highest
             bar.update(k + 1)
-    _check_views(path, chosen, p, valid)
+    dark = light < DARK * np.median(light)
+    valid[dark] = False
+    _check_views(path, chosen, p, valid, clipped)
     scan, photons = Scan(out, p, valid), beam.panel.photons
     history: dict[str, Any] = dict(
         frames=str(path),
@@ -86,15 +97,34 @@ def import_raw(
     return scan, {name: value for name, value in history.items() if value is not None}
 
 
-def _check_views(path, chosen, p, valid):
-    """Warn of views that are black or brighter than the flat field. Raises InputError if all are black."""
+def _full_range(count):
+    """Whether a count is the highest one of a converter of 8 bits or more."""
+    return count >= 255 and float(np.log2(count + 1)).is_integer()
+
+
+def _check_views(path, chosen, p, valid, clipped):
+    """Warn of views that are black, saturated (`clipped`: the count, by view) or brighter than the flat field, and of few valid
+    pixels. Raises InputError if all are black."""
     black = [i for i, inside in zip(chosen, valid) if not inside.any()]
     above = [i for i, view, inside in zip(chosen, p, valid) if (view[inside] < BELOW).sum() > OFTEN * inside.sum()]
     if len(black) == len(chosen):
         raise InputError(f'{path}: no view is brighter than the dark frames; are the right dark frames given?')
     if black:
         warnings.warn(
-            f'{path}: {_list(black)} without counts (black): left out by the mask; use --views to drop them',
+            f'{path}: {_list(black)} without counts, or with hardly any (black): left out by the mask; use --views to drop '
+            'them',
+            stacklevel=4,
+        )
+    if valid.mean() < 0.5:
+        warnings.warn(
+            f'{path}: {1 - valid.mean():.2%} of the pixels are left out: are the flats, the darks and --saturation right?',
+            stacklevel=4,
+        )
+    if clipped:
+        highest = max(clipped.values())
+        warnings.warn(
+            f'{path}: {_list(list(clipped))} saturated: many pixels have exactly the highest count of {highest:g}; give '
+            f'--saturation {highest:g}',
             stacklevel=4,
         )
     if above:

@@ -19,6 +19,8 @@ from lingo_mi.raw.frames import Frames
 DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
 DIFFERENCE = (1, -4, 6, -4, 1)
 MOST_VIEWS = 64  # of which noise is measured
+FULL = 0.9  # a flat with more of its pixels saturated is none
+UNLIKE = 0.5  # a flat below this part of the others' brightness, or above its inverse, is none
 HOT = 0.05  # and one whose dark count is that part of the flat's counts off its neighbours'
 
 
@@ -48,7 +50,7 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
 
     Photons are those of a Poisson signal of the same scatter: mean^2 / variance of a pixel over the flats, each divided by its
     brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good. Raises InputError where a panel has
-    another size than `shape`, or the flats are no brighter than dark.
+    another size than `shape`, the flats are no brighter than dark or saturated, or one is unlike the others.
     """
     for name, frames in (('flats', flats), ('darks', darks)):
         if frames is not None and frames.shape != shape:
@@ -69,6 +71,11 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
         counts = flats[i]
         frame = counts - dark
         good &= np.isfinite(frame) & (counts < saturation)
+        if (counts >= saturation).mean() > FULL:
+            raise InputError(
+                f'{flats.where}: nearly all pixels of flat {i} reach the saturation, {saturation:g} counts; give flats of '
+                'a shorter exposure and the --exposure of the views, or --air'
+            )
         bright[i] = np.median(frame[np.isfinite(frame)]) if np.isfinite(frame).any() else 0.0
         if not bright[i] > 0:
             raise InputError(
@@ -77,7 +84,11 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
         frame = np.where(good, frame / bright[i], 1.0)
         total += frame
         square += frame**2
-    n = len(flats)
+    n, typical = len(flats), np.median(bright)
+    if (odd := np.flatnonzero((bright < UNLIKE * typical) | (bright > typical / UNLIKE))).size:
+        raise InputError(
+            f'{flats.where}: flat {odd[0]} is {bright[odd[0]] / typical:.2g} times as bright as the others; take it out'
+        )
     mean = total / n
     flat = mean * bright.mean()
     local = median_filter(mean, 5)

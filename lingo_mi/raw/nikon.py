@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import re
 import warnings
 from os import PathLike
 from pathlib import Path
@@ -74,12 +75,14 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
 def read_numbers(path: PathLike | str) -> np.ndarray:
     """Numbers [n] of a text file: one a line, or the second column, after the number of the view, as angles in Nikon's .ang.
 
-    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left, and for a line that
-    goes on with something else.
+    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left, for a line that
+    goes on with something else, and for decimal commas.
     """
     found = []
     with reading(path):
         lines = Path(path).read_text(encoding='utf-8', errors='replace').splitlines()
+    if _decimal_commas(lines):
+        raise InputError(f'{path}: its numbers seem to have decimal commas; write decimal points')
     for number, line in enumerate(lines, 1):
         cells = line.replace(':', ' ').replace(',', ' ').replace(';', ' ').split()[:2]  # times may follow
         try:
@@ -90,6 +93,15 @@ def read_numbers(path: PathLike | str) -> np.ndarray:
     if not found or not np.isfinite(found).all():
         raise InputError(f'{path}: holds no numbers; write one a line')
     return np.array(found)
+
+
+def _decimal_commas(lines):
+    """Whether commas within numbers are no separators: beside another separator, or after something that does not count views."""
+    rows = [re.split(r'[\s;:]+', line.strip()) for line in lines if re.match(r'\s*[-+]?\d', line)]
+    if any(re.fullmatch(r'[-+]?\d+,\d+', cell) for row in rows for cell in row[1:2]):
+        return True
+    first = [row[0].split(',')[0] for row in rows if re.fullmatch(r'[-+]?\d+,\d+', row[0])]
+    return len(first) > 1 and len({int(number) - k for k, number in enumerate(first)}) > 1
 
 
 def _is_number(text):

@@ -22,7 +22,7 @@ class Options:
     percentile     instead: that percentile of a view is its air level
     i0             instead: counts of the unattenuated beam
     exposure       [n] or one number: exposure of every view over that of the flats
-    saturation     counts from here on are not valid; None: the largest value of an integer type
+    saturation     counts from here on are not valid; None: the largest value of the integer type of views and of flats
     crop           (v0, v1, u0, u1), pixels of the whole frame to keep
     binning        pixels (v and u) that become one
     views          (first, end, step) of the views to keep; the end may be None

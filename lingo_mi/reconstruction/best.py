@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -30,6 +31,7 @@ LITTLE = 0.95  # times the score after one pass of a refinement: where more pass
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
+DOUBTFUL = 0.5  # a score above which the views contradict each other, or are too few; 0.36 was the worst sound one
 PLAIN = 'asd-pocs'
 TICKS = 20  # steps of the progress for a fit
 
@@ -145,6 +147,12 @@ class Best(Algorithm):
         gc.collect()
         dr.flush_malloc_cache()  # two thirds of the memory that the trials took
         chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
+        if chosen.score > DOUBTFUL:
+            warnings.warn(
+                f'views that are held out are predicted badly (error {chosen.score:.2g}; 0 is exact, 1 an empty volume): unless '
+                'they are few or very noisy, check geometry, angles and order of the views (lingo-mi inspect)',
+                stacklevel=3,
+            )
         found = self._apply(scan, plan[0].niter, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
         tried = means(chosen.volume, chosen.finer)

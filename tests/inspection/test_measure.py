@@ -172,3 +172,21 @@ def test_parallel_views_have_one_mass():
     gain = 1 + 0.1 * np.sin(np.arange(len(scan)))
     found = only(lm.Scan(scan.geometry, scan.projections * gain[:, None, None]), 'the mass of the views differs by 7')
     assert found.advice and not look(scan).advice
+
+
+def test_a_short_arc_does_not_tell_the_axis():
+    scan = scanned('foot', views=40)
+    for first in (0, 10, 25):
+        assert look(scan.subset(np.arange(first, first + 10))).advice == []
+
+
+def test_views_of_one_angle(foot):
+    same = replace(foot.geometry, angles=np.zeros(len(foot)))
+    assert 'all views have the same angle' in look(replace(foot, geometry=same)).advice[0]
+
+
+def test_lengths_in_other_units(foot):
+    wide = replace(foot.geometry, dDetector=(1000 * foot.geometry.dDetector[0], 1000 * foot.geometry.dDetector[1]))
+    assert any(
+        'give DSO, DSD and the size of the pixels in mm' in line for line in look(replace(foot, geometry=wide)).advice
+    )

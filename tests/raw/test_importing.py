@@ -224,12 +224,19 @@ def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
         (dict(exposure=[1, 2]), 'one for each of 6 views'),
         (dict(angles=[1.0, 2.0]), 'there are 2 angles for 6 views'),
         (dict(angles=5.0), 'there are 1 angles for 6 views'),
+        (dict(binning=41), 'binning 41 is more than the 40 pixels of a view'),
+        (dict(angles='commas.txt'), 'commas.txt: its numbers seem to have decimal commas'),
+        (dict(angles=[0.0, 1, np.nan, 3, 4, 5]), 'angle 2 is no finite number'),
+        (dict(flats='shut.npy'), 'flat 4 is .* times as bright as the others; take it out'),
+        (dict(saturation=500.0), 'nearly all pixels of flat 0 reach the saturation, 500 counts'),
         (dict(bining=2), "no option 'bining', did you mean binning"),
     ],
 )
 def test_refused_in_one_line(tmp_path, raw, scan_yml, change, message):
     given = save(tmp_path, raw)
     np.save(tmp_path / 'small.npy', raw.flats[:, :5])
+    np.save(tmp_path / 'shut.npy', np.concatenate([raw.flats[:4], raw.darks[:1] + 5, raw.flats[4:]]))
+    (tmp_path / 'commas.txt').write_text('0,25\n60,25\n120,25\n180,25\n240,25\n300,25\n')
     change = {name: tmp_path / value if isinstance(value, str) else value for name, value in change.items()}
     with pytest.raises(lm.InputError, match=message) as caught:
         load(tmp_path / 'views.npy', scan_yml, **{**given, **change})
@@ -501,3 +508,57 @@ def test_colours_are_refused(tmp_path, scan_yml):
     tifffile.imwrite(tmp_path / 'rgb.tif', np.zeros((20, 30, 3), np.uint8), photometric='rgb')
     with pytest.raises(InputError, match='holds colours'):
         read_volume(tmp_path / 'rgb.tif')
+
+
+def test_a_closed_shutter(tmp_path, scan_yml):
+    """Half of the noise of a dark frame is above the mean dark count, and looks like line integrals of 8."""
+    raw = raw_frames()
+    raw.views[2] = raw.darks[0]
+    given = save(tmp_path, raw)
+    with pytest.warns(UserWarning, match='view 2 is without counts, or with hardly any'):
+        scan = load(tmp_path / 'views.npy', scan_yml, **given)
+    assert not scan.valid[2].any() and scan.valid[[0, 1, 3, 4, 5]].mean() > 0.9
+
+
+def test_a_converter_of_fewer_bits_that_saturates(tmp_path, raw, scan_yml):
+    given = save(tmp_path, raw)
+    np.save(tmp_path / 'views.npy', np.minimum(raw.views, 16383))
+    with pytest.warns(UserWarning, match='6 views .* saturated: .* highest count of 16383; give --saturation 16383'):
+        load(tmp_path / 'views.npy', scan_yml, **given)
+    flats = np.minimum(raw.flats, 16000)  # below
+    np.save(tmp_path / 'flats.npy', flats)
+    with pytest.warns(UserWarning, match='of the pixels are left out') as caught:
+        scan = load(tmp_path / 'views.npy', scan_yml, **given, saturation=16383)
+    assert len(caught) == 1 and 0.2 < scan.valid.mean() < 0.5
+
+
+def test_views_and_flats_of_different_types(tmp_path, raw, scan_yml):
+    """Counts of flats may be higher than the type of the views can hold."""
+    given = save(tmp_path, raw)
+    np.save(tmp_path / 'views.npy', np.minimum(raw.views // 2, 32766).astype(np.int16))
+    np.save(tmp_path / 'flats.npy', np.minimum(raw.flats.astype(np.uint32) * 2, 65534).astype(np.uint16))
+    del given['darks']
+    assert (np.load(tmp_path / 'flats.npy') > 32767).mean() > 0.5
+    scan = load(tmp_path / 'views.npy', scan_yml, **given)
+    assert scan.valid is None or scan.valid.mean() > 0.9
+
+
+def test_most_pixels_left_out(tmp_path, raw, scan_yml):
+    given = save(tmp_path, raw)
+    with pytest.warns(UserWarning, match=r'[5-9]\d\.\d\d% of the pixels are left out'):
+        load(tmp_path / 'views.npy', scan_yml, **given, saturation=float(np.percentile(raw.flats[0], 30)))
+
+
+@pytest.mark.parametrize('several', [False, True])
+def test_a_cut_off_edf(tmp_path, raw, scan_yml, several):
+    """fabio would fill up what is missing."""
+    image = pytest.importorskip('fabio').edfimage.EdfImage(data=raw.views[0])
+    if several:
+        for frame in raw.views[1:]:
+            image.append_frame(data=frame)
+    (tmp_path / 'v').mkdir()
+    path = tmp_path / 'v' / 'a.edf'
+    image.write(str(path))
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(lm.InputError, match='a.edf: is cut off'):
+        load(path if several else path.parent, scan_yml, **save(tmp_path, raw))

@@ -94,6 +94,12 @@ def test_angles(tmp_path):
     path.write_text('1 0.5\n2 lost\n')
     with pytest.raises(lm.InputError, match="line 2 has 'lost' where a number must be"):
         read_numbers(path)
+    path.write_text('1,0\n2,90\n3,180\n')
+    assert read_numbers(path).tolist() == [0, 90, 180]
+    for text in ('0,0\n89,75\n179,5\n', '1;0,00\n2;89,75\n', '1:\t0,5\n'):
+        path.write_text(text)
+        with pytest.raises(lm.InputError, match='decimal commas; write decimal points'):
+            read_numbers(path)
     path.write_text('none')
     with pytest.raises(lm.InputError, match='holds no numbers'):
         read_numbers(path)

@@ -192,3 +192,9 @@ def test_more_than_an_array_can_hold(monkeypatch, sizes, what):
     if what != 'voxels':
         monkeypatch.setattr(run, 'check_memory', lambda *_, **__: None)
         check_room(geometry, FDK())
+
+
+def test_views_in_a_wrong_order_are_warned_of():
+    scan, _ = scanned(1)
+    with pytest.warns(UserWarning, match='held out are predicted badly'):
+        Best(niter=2).run(replace(scan, projections=scan.projections[np.random.default_rng(0).permutation(20)]))

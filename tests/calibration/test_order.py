@@ -1,0 +1,72 @@
+"""Sound scans are left in peace; a wrong order, sense or unit of the angles is told, and so are single views out of place."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from lingo_mi.calibration.order import order_faults
+from lingo_mi.geometry import circular
+
+SIZE, PIXELS = 40, 72
+
+
+def scanned(name='foot', views=24, total=360.0, mode='cone'):
+    phantom = lm.phantom(name, SIZE)
+    side = max(phantom.spacing) * SIZE
+    sizes = dict(nDetector=(80, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views, total))
+    if mode == 'cone':
+        geometry = lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.2 / PIXELS, **sizes)
+    else:
+        geometry = lm.Geometry.parallel(dDetector=side * 1.4 / PIXELS, **sizes)
+    return lm.simulate(phantom, geometry, progress=False).train
+
+
+@pytest.fixture(scope='module')
+def foot():
+    return scanned()
+
+
+@pytest.mark.parametrize('name', ['foot', 'chest', 'gaussians', 'shepp_logan'])
+@pytest.mark.parametrize(
+    ('total', 'views', 'mode'),
+    [(360, 24, 'cone'), (180, 20, 'cone'), (60, 20, 'cone'), (180, 50, 'parallel'), (360, 6, 'cone')],
+)
+def test_sound_scans(name, total, views, mode):
+    assert order_faults(scanned(name, views, total, mode)) == []
+
+
+def placed(scan, order):
+    return replace(scan, projections=scan.projections[order])
+
+
+@pytest.mark.parametrize(
+    ('order', 'words'),
+    [
+        (np.random.default_rng(1).permutation(24), 'hardly better than in a random order'),
+        (sorted(range(24), key=str), 'hardly better than in a random order'),  # 0, 1, 10, 11, ...
+        (np.arange(24)[::-1], 'with reversed angles'),
+    ],
+)
+def test_a_wrong_order(foot, order, words):
+    (fault,) = order_faults(placed(foot, np.asarray(order)))
+    assert words in fault
+
+
+def test_two_views_in_each_others_place():
+    order = np.arange(60)
+    order[[10, 31]] = order[[31, 10]]
+    (fault,) = order_faults(placed(scanned(views=60), order))
+    assert fault.startswith('views 10, 31: ')
+
+
+def test_radians_for_degrees(foot):
+    wrong = replace(foot.geometry, angles=np.radians(foot.geometry.angles))
+    (fault,) = order_faults(replace(foot, geometry=wrong))
+    assert 'check the angles' in fault
+
+
+def test_a_calibration_warns(foot):
+    with pytest.warns(UserWarning, match='with reversed angles'):
+        lm.calibrate(placed(foot, np.arange(24)[::-1]), progress=False)
