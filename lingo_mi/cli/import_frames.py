@@ -30,7 +30,7 @@ def arguments() -> argparse.Namespace:
         required=True,
         type=Path,
         metavar='F.npy',
-        help='the scan; F.yml, F.valid.npy and, for many poses, F.poses.npy are written beside it',
+        help='the scan; F.yml is written beside it, F.valid.npy where pixels are not valid, and F.poses.npy for many poses',
     )
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')

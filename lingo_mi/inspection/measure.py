@@ -59,7 +59,10 @@ def look(scan: Scan) -> Findings:
     )
     top = float(np.percentile(p[valid], 99.5))
     if -np.percentile(p[valid], 0.5) > 2 * max(top, 0):
-        found.advice.append('line integrals are negative: they look like ln(I / I0); give -ln(I / I0)')
+        found.advice.append(
+            'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
+            'views (import with --exposure, or --air)'
+        )
     _air_and_truncation(found, p, valid, top)
     photons = photons_of_images(p, scan.valid)
     if np.isfinite(photons) and photons < 1e8:
@@ -92,7 +95,8 @@ def _air_and_truncation(found, p, valid, top):
         return
     low = np.percentile(sides, 5)
     near = sides[sides <= low + 0.1 * (top - low)]
-    if low > 0.2 * top:
+    even = low < 0.5 * top and near.size > 0.9 * sides.size  # all around: air, but not at 0
+    if low > 0.2 * top and not even:
         found.facts.append('air: none beside the object, which fills the panel')
     else:
         found.air = float(np.median(near))

@@ -190,3 +190,12 @@ def test_lengths_in_other_units(foot):
     assert any(
         'give DSO, DSD and the size of the pixels in mm' in line for line in look(replace(foot, geometry=wide)).advice
     )
+
+
+@pytest.mark.parametrize('level', [0.05, 0.3])
+def test_an_air_level_that_is_not_0(foot, level):
+    """Flats of more exposure than the views, which is no object that fills the panel."""
+    lifted = replace(foot, projections=foot.projections + np.float32(level * foot.projections.max()))
+    found = look(lifted)
+    assert found.air == pytest.approx(level * foot.projections.max(), rel=0.02)
+    assert [advice[:6] for advice in found.advice] == ['air is']

@@ -562,3 +562,11 @@ def test_a_cut_off_edf(tmp_path, raw, scan_yml, several):
     path.write_bytes(path.read_bytes()[:-500])
     with pytest.raises(lm.InputError, match='a.edf: is cut off'):
         load(path if several else path.parent, scan_yml, **save(tmp_path, raw))
+
+
+def test_hdf5_without_a_flat(tmp_path, raw, scan_yml):
+    with pytest.importorskip('h5py').File(tmp_path / 'a.h5', 'w') as file:
+        for name, stack in dict(data=raw.views, data_white=raw.flats[:0], data_dark=raw.darks).items():
+            file[f'exchange/{name}'] = stack
+    with pytest.raises(lm.InputError, match='a.h5: holds no flats; give --flats'):
+        load(tmp_path / 'a.h5', scan_yml)
