@@ -30,7 +30,7 @@ def order_faults(scan: Scan) -> list[str]:
     Of many views, evenly spaced ones are compared. Takes four quick reconstructions. Raises InputError for a scan without signal,
     and where the source lies within the volume.
 
-        order_faults(scan)  # ['the views predict each other no better than in a random order: ...']
+        order_faults(scan)  # ['the views predict each other hardly better than in a random order: ...']
     """
     require_signal(scan, 'compare')
     require_rays(scan.geometry)
