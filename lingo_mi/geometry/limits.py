@@ -41,7 +41,7 @@ def angles(name: str, value: ArrayLike) -> np.ndarray:
     """`value` in radians as float64, of any shape. Raises InputError where one is not finite, or of too many turns."""
     array = numbers(name, value)
     if not np.all(np.abs(array) <= MOST_ANGLE):
-        raise InputError(f'{name} must be finite, at most {MOST_ANGLE:.0e} radians, not {shown(value)}')
+        raise InputError(f'{name} must be finite numbers, at most {MOST_ANGLE:.0e} radians, not {shown(value)}')
     return array
 
 

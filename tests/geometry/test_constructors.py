@@ -114,7 +114,7 @@ def test_poses_choose_their_kind():
         (Geometry.cone, dict(nVoxel=(1, 2)), 'nVoxel must be 3'),
         (Geometry.cone, dict(dDetector=0), 'dDetector must be positive'),
         (Geometry.cone, dict(angles=[]), 'at least one angle'),
-        (Geometry.cone, dict(tilt=np.nan), 'tilt must be finite, at most .* radians, not nan'),
+        (Geometry.cone, dict(tilt=np.nan), 'tilt must be finite numbers, at most .* radians, not nan'),
         (Geometry.parallel, dict(offDetector=(1, 2, 3)), 'offDetector must be 2'),
         (Geometry.cone, dict(COR='far'), 'COR must be made of numbers'),
         (Geometry.cone, dict(height=[1, 2]), 'each of 3 views'),
