@@ -204,7 +204,9 @@ def _hdf5(path):
 
     if 'exchange/data' in file:  # DXchange
         group = file['exchange']
-        flats, darks = (stack(group[name]) if name in group else None for name in ('data_white', 'data_dark'))
+        flats, darks = (
+            stack(group[name]) if name in group and len(group[name]) else None for name in ('data_white', 'data_dark')
+        )
         angles = np.asarray(group['theta'], float).ravel() if 'theta' in group else None
         if angles is not None and _unit(group['theta']).startswith('rad'):
             angles = np.degrees(angles)

@@ -53,8 +53,6 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
     another size than `shape`, the flats are no brighter than dark or saturated, or one is unlike the others.
     """
     for name, frames in (('flats', flats), ('darks', darks)):
-        if frames is not None and not len(frames):
-            raise InputError(f'{frames.where}: holds no {name}; give --{name}')
         if frames is not None and frames.shape != shape:
             raise InputError(f'{frames.where}: the {name} have {frames.shape} pixels, but the views have {shape}')
     dark = np.zeros(shape)

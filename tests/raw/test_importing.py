@@ -564,9 +564,13 @@ def test_a_cut_off_edf(tmp_path, raw, scan_yml, several):
         load(path if several else path.parent, scan_yml, **save(tmp_path, raw))
 
 
-def test_hdf5_without_a_flat(tmp_path, raw, scan_yml):
+@pytest.mark.parametrize(('empty', 'message'), [('data_white', 'no flat frames; give --flats'), ('data_dark', '')])
+def test_dxchange_with_stacks_of_no_frames(tmp_path, raw, scan_yml, empty, message):
     with pytest.importorskip('h5py').File(tmp_path / 'a.h5', 'w') as file:
-        for name, stack in dict(data=raw.views, data_white=raw.flats[:0], data_dark=raw.darks).items():
-            file[f'exchange/{name}'] = stack
-    with pytest.raises(lm.InputError, match='a.h5: holds no flats; give --flats'):
-        load(tmp_path / 'a.h5', scan_yml)
+        for name, stack in dict(data=raw.views, data_white=raw.flats, data_dark=raw.darks).items():
+            file[f'exchange/{name}'] = stack[:0] if name == empty else stack
+    if message:
+        with pytest.raises(lm.InputError, match=message):
+            load(tmp_path / 'a.h5', scan_yml)
+    else:
+        assert len(load(tmp_path / 'a.h5', scan_yml)) == 6
