@@ -31,7 +31,7 @@ LITTLE = 0.95  # times the score after one pass of a refinement: where more pass
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
-DOUBTFUL = 0.5  # a score above which the views contradict each other, or are too few; 0.36 was the worst sound one
+DOUBTFUL = 0.5  # a score above it says that something is wrong; sound scans of 1000 photons a pixel or more reach 0.36
 PLAIN = 'asd-pocs'
 TICKS = 20  # steps of the progress for a fit
 

@@ -6,26 +6,13 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from helpers.object_scan import scanned
 from lingo_mi.calibration.order import order_faults
-from lingo_mi.geometry import circular
-
-SIZE, PIXELS = 40, 72
-
-
-def scanned(name='foot', views=24, total=360.0, mode='cone'):
-    phantom = lm.phantom(name, SIZE)
-    side = max(phantom.spacing) * SIZE
-    sizes = dict(nDetector=(80, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views, total))
-    if mode == 'cone':
-        geometry = lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.2 / PIXELS, **sizes)
-    else:
-        geometry = lm.Geometry.parallel(dDetector=side * 1.4 / PIXELS, **sizes)
-    return lm.simulate(phantom, geometry, progress=False).train
 
 
 @pytest.fixture(scope='module')
 def foot():
-    return scanned()
+    return scanned('foot', views=24)
 
 
 @pytest.mark.parametrize('name', ['foot', 'chest', 'gaussians', 'shepp_logan'])
@@ -34,7 +21,7 @@ def foot():
     [(360, 24, 'cone'), (180, 20, 'cone'), (60, 20, 'cone'), (180, 50, 'parallel'), (360, 6, 'cone')],
 )
 def test_sound_scans(name, total, views, mode):
-    assert order_faults(scanned(name, views, total, mode)) == []
+    assert order_faults(scanned(name, mode, views, total)) == []
 
 
 def placed(scan, order):
@@ -57,7 +44,7 @@ def test_a_wrong_order(foot, order, words):
 def test_two_views_in_each_others_place():
     order = np.arange(60)
     order[[10, 31]] = order[[31, 10]]
-    (fault,) = order_faults(placed(scanned(views=60), order))
+    (fault,) = order_faults(placed(scanned('foot', views=60), order))
     assert fault.startswith('views 10, 31: ')
 
 

@@ -9,24 +9,10 @@ import pytest
 from scipy import ndimage
 
 import lingo_mi as lm
-from lingo_mi.geometry import circular
+from helpers.object_scan import scanned
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import look
 from lingo_mi.inspection.sheet import draw
-
-PIXELS, SIZE = 96, 40
-
-
-def scanned(name, mode='cone', views=25, total=360.0):
-    """A view of 12 degrees half a fan; the panel is higher than the object."""
-    phantom = lm.phantom(name, SIZE)
-    side = max(phantom.spacing) * SIZE
-    sizes = dict(nDetector=(110, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views, total))
-    if mode == 'cone':
-        geometry = lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.4 / PIXELS, **sizes)
-    else:
-        geometry = lm.Geometry.parallel(dDetector=side * 1.45 / PIXELS, **sizes)
-    return lm.simulate(phantom, geometry, progress=False).train
 
 
 @pytest.fixture(scope='module')
