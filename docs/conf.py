@@ -11,7 +11,7 @@ sys.path[:0] = [str(DOCS / '_ext'), str(DOCS.parent)]
 os.environ.setdefault('COLUMNS', '100')  # width of the command line's help
 
 import lingo_mi  # noqa: E402 - from the folder above
-from lingo_mi.progress import Progress  # noqa: E402
+from lingo_mi.common.progress import Progress  # noqa: E402
 
 project = 'lingo_mi'
 author = 'the lingo_mi developers'

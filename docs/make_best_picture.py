@@ -10,8 +10,8 @@ import matplotlib
 import numpy as np
 
 import lingo_mi as lm
-from lingo_mi.metrics import psnr_3d
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.studies.regret import Case, Study
 
 matplotlib.use('agg')

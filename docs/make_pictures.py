@@ -14,7 +14,7 @@ from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels
-from lingo_mi.metrics import psnr_3d_r2
+from lingo_mi.metrics.quality import psnr_3d_r2
 
 matplotlib.use('agg')
 import matplotlib.pyplot as plt

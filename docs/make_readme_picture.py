@@ -18,7 +18,7 @@ import numpy as np
 
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.metrics import current_names
+from lingo_mi.metrics.quality import current_names
 
 matplotlib.use('agg')
 import matplotlib.pyplot as plt
@@ -45,7 +45,7 @@ def fit(volume: Path, out: Path):
 
 def held_out(volume: Path, index: int) -> np.ndarray:
     """The true projection of a held-out view, [v, u]."""
-    from lingo_mi.runtime import use_variant
+    from lingo_mi.common.runtime import use_variant
 
     use_variant()
     from lingo_mi.projectors import grid

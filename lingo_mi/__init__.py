@@ -18,7 +18,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from lingo_mi.runtime import find_libllvm, mend_llvm
+from lingo_mi.common.runtime import find_libllvm, mend_llvm
 
 find_libllvm()  # before anything loads Dr.Jit
 mend_llvm()  # or after it
@@ -67,12 +67,12 @@ if TYPE_CHECKING:
     from lingo_mi.api.fitting import fit
     from lingo_mi.api.result import Gaussians, Result, load_result
     from lingo_mi.api.volumes import reconstruct
-    from lingo_mi.errors import InputError
+    from lingo_mi.common.errors import InputError
+    from lingo_mi.common.runtime import use_variant
     from lingo_mi.fitting.settings import Settings
     from lingo_mi.functional import project, voxelize
     from lingo_mi.geometry import Geometry, circular
     from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
-    from lingo_mi.runtime import use_variant
     from lingo_mi.scan import Dataset, Scan
 
 # Name -> the module that defines it.
@@ -104,8 +104,8 @@ _PUBLIC = {
     'Best': 'lingo_mi.reconstruction',
     'project': 'lingo_mi.functional',
     'voxelize': 'lingo_mi.functional',
-    'use_variant': 'lingo_mi.runtime',
-    'InputError': 'lingo_mi.errors',
+    'use_variant': 'lingo_mi.common.runtime',
+    'InputError': 'lingo_mi.common.errors',
 }
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi import notebook
-from lingo_mi.arrays import as_numpy, short_repr
-from lingo_mi.errors import InputError, require_type
+from lingo_mi.common import notebook
+from lingo_mi.common.arrays import as_numpy, short_repr
+from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Index, checked_views
 

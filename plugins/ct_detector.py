@@ -7,8 +7,8 @@ from os import PathLike
 
 import mitsuba as mi
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector
-from lingo_mi.errors import InputError
 
 
 class CTDetector(mi.Film):

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.projectors.view import View

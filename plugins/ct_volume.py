@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.phantoms import make
 from lingo_mi.scene.data_files import data_file

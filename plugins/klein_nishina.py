@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.compton import scattering
-from lingo_mi.errors import InputError
 
 
 def create(props: mi.Properties) -> mi.PhaseFunction:

@@ -8,10 +8,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter
-from lingo_mi.errors import InputError
 
 
 class XRayTube(mi.Emitter):

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.api.data import simulate
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.files.scans import write_scan
-from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Dataset, Scan
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lingo_mi.file_access import write_text
+from lingo_mi.storage.file_access import write_text
 
 
 class CellFiles:

@@ -22,11 +22,11 @@ import numpy as np
 from lingo_mi.api.calibration import Calibration, calibrate
 from lingo_mi.api.fitting import fit
 from lingo_mi.calibration.drift import Drift
-from lingo_mi.file_access import replacing, write_text
 from lingo_mi.projectors import grid
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.reconstruction import ASDPOCS, OSSART, reconstruct
 from lingo_mi.scan import Dataset, Scan
+from lingo_mi.storage.file_access import replacing, write_text
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.markdown import table
 from lingo_mi.studies.provenance import write_provenance

@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.scene.load import load_file

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, replacing
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import reading, replacing
 
 Column = tuple[str, Callable[[Any], str]]  # the title, and the cell of a row
 

@@ -22,7 +22,7 @@ from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.scan import Scan
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance

@@ -23,22 +23,22 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import parse
+from lingo_mi.common.runtime import cores
 from lingo_mi.completion.prepare import sampled
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import replacing, write_text
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.metrics import psnr_3d
-from lingo_mi.parsing import parse
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.held_out import split
-from lingo_mi.runtime import cores
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
+from lingo_mi.storage.file_access import replacing, write_text
 from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.provenance import provenance

@@ -11,8 +11,8 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from lingo_mi.file_access import replacing
 from lingo_mi.results.save import versions
+from lingo_mi.storage.file_access import replacing
 
 ROOT = Path(str(resources.files('lingo_mi'))).resolve().parent  # of the checkout, or site-packages
 

@@ -21,11 +21,11 @@ from os import PathLike
 from pathlib import Path
 from urllib.parse import quote
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import read_object, replacing, write_text
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.recipes import changes_of, settings_of
-from lingo_mi.metrics import current_names
+from lingo_mi.metrics.quality import current_names
 from lingo_mi.scene.shipped import scene_path
+from lingo_mi.storage.file_access import read_object, replacing, write_text
 
 Results = dict[tuple[str, str], dict]  # (scene, method) -> the metrics of the fit
 

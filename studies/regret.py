@@ -19,14 +19,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.stats import spearmanr
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.prepare import fit_cloud, sampled
 from lingo_mi.completion.views import insert_views
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.recipes import FAST
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
 from lingo_mi.reconstruction.best import SPREAD, START, refine
 from lingo_mi.reconstruction.refined import means

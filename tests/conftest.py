@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(scope='session', autouse=True)
 def variant() -> str:
     """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
-    from lingo_mi.runtime import use_variant
+    from lingo_mi.common.runtime import use_variant
 
     return use_variant(VARIANT)
 

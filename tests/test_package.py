@@ -28,10 +28,8 @@ def built(tmp_path_factory):
     """The tree that a wheel is packed from, built from a copy of the checkout."""
     pytest.importorskip('setuptools', '61', reason='building needs setuptools 61 or later')
     folder = tmp_path_factory.mktemp('package')
-    for name in PLACES:
-        # In a checkout that is run without an installation, links lead from the package to the folders beside it.
-        links = shutil.ignore_patterns('__pycache__', *(PLACES if name == 'lingo_mi' else ()))
-        shutil.copytree(ROOT / name, folder / name, ignore=links)
+    for name in PLACES:  # links lead from the package to the folders beside it
+        shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns('__pycache__'))
     for name in ('pyproject.toml', 'README.md'):
         shutil.copy(ROOT / name, folder)
     command = [sys.executable, '-c', 'from setuptools import setup; setup()', 'build_py', '--build-lib', 'built']

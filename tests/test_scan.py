@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from lingo_mi.arrays import as_numpy
-from lingo_mi.errors import InputError
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.scan import Dataset, Scan
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from helpers.fits import SHORT, error_of, geometry, some_points, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run

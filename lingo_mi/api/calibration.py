@@ -10,12 +10,12 @@ import numpy as np
 from lingo_mi.calibration.order import order_faults
 from lingo_mi.calibration.response.response import Response
 from lingo_mi.calibration.search import Found, search
-from lingo_mi.errors import InputError, require_type
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.parsing import whole
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.geometry import Geometry
-from lingo_mi.parsing import whole
-from lingo_mi.progress import Progress
 from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.runtime import ensure_variant, one_at_a_time
 from lingo_mi.scan import Dataset, Scan
 
 MOST_DEGREE, MOST_CURVE = 8, 3

@@ -8,27 +8,27 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi import parsing
-from lingo_mi.arrays import as_numpy
-from lingo_mi.errors import InputError, require_type
-from lingo_mi.file_access import as_path
+from lingo_mi.common import parsing
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.parsing import nearest, whole
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
 from lingo_mi.geometry.trajectories import spread
-from lingo_mi.parsing import nearest, whole
 from lingo_mi.phantoms import Phantom, make
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
 from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
-from lingo_mi.progress import Progress
 from lingo_mi.projectors import grid
 from lingo_mi.raw.importing import import_raw
 from lingo_mi.raw.options import Options
-from lingo_mi.runtime import ensure_variant, one_at_a_time
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory, require_densities, warn_if_truncated
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import choose_views, take_scan
+from lingo_mi.storage.file_access import as_path
 
 
 @one_at_a_time()

@@ -8,20 +8,20 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lingo_mi import parsing
 from lingo_mi.api.result import Result
-from lingo_mi.errors import InputError, require_type
-from lingo_mi.file_access import as_path, require_writable, writing
+from lingo_mi.common import parsing
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.folder_lock import LOCK, locked
-from lingo_mi.output_folder import CHECKPOINT
-from lingo_mi.progress import Progress
 from lingo_mi.results.watched_fit import watched_fit
 from lingo_mi.results.watchers import watchers_of
-from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory
+from lingo_mi.storage.file_access import as_path, require_writable, writing
+from lingo_mi.storage.folder_lock import LOCK, locked
+from lingo_mi.storage.output_folder import CHECKPOINT
 
 
 def fit(

@@ -12,17 +12,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lingo_mi import notebook
+from lingo_mi.common import notebook
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.parsing import whole
+from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.effects.forward import find_effects
-from lingo_mi.errors import InputError, require_type
-from lingo_mi.file_access import as_path, new_file, parsed_json, reading, replacing, writing
 from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting.fitted import Fitted, NeedsEffects
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.folder_lock import locked
 from lingo_mi.geometry import Geometry
-from lingo_mi.metrics import current_names
-from lingo_mi.output_folder import (
+from lingo_mi.metrics.quality import current_names
+from lingo_mi.report.figures import overview
+from lingo_mi.report.numbers import headline
+from lingo_mi.report.page import report_page
+from lingo_mi.report.view import Page
+from lingo_mi.results.measure import Measured, measure
+from lingo_mi.results.save import report_data, result_names, save
+from lingo_mi.scan import Dataset
+from lingo_mi.scene.load import load_scene
+from lingo_mi.storage.file_access import as_path, new_file, parsed_json, reading, replacing, writing
+from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.output_folder import (
     CHECKPOINT,
     CLOUD,
     METRICS,
@@ -33,16 +43,6 @@ from lingo_mi.output_folder import (
     require_ours,
     require_together,
 )
-from lingo_mi.parsing import whole
-from lingo_mi.report.figures import overview
-from lingo_mi.report.numbers import headline
-from lingo_mi.report.page import report_page
-from lingo_mi.report.view import Page
-from lingo_mi.results.measure import Measured, measure
-from lingo_mi.results.save import report_data, result_names, save
-from lingo_mi.runtime import ensure_variant
-from lingo_mi.scan import Dataset
-from lingo_mi.scene.load import load_scene
 
 
 class Gaussians(NamedTuple):

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.api.result import Result
-from lingo_mi.arrays import as_numpy
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.parsing import whole
+from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
-from lingo_mi.errors import InputError, require_type
-from lingo_mi.parsing import whole
 from lingo_mi.reconstruction import Algorithm, Best, Reconstruction, Refined, check_scan, progress_bar
 from lingo_mi.reconstruction import reconstruct as run
 from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.runtime import ensure_variant
 from lingo_mi.scan import Dataset, Scan
 
 

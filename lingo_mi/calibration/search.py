@@ -22,7 +22,7 @@ from lingo_mi.calibration.cross_prediction import coarse, cross_predicted, folds
 from lingo_mi.calibration.drift import Drift
 from lingo_mi.calibration.response.part import SURE
 from lingo_mi.calibration.response.response import Response
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.scan import Scan
 

@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, docs_arguments, docs_of
-from lingo_mi.file_access import require_writable
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.storage.file_access import require_writable
 
 
 def arguments() -> argparse.Namespace:

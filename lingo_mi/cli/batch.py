@@ -25,10 +25,10 @@ import sys
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, cluster_arguments, runner_of
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
-from lingo_mi.folder_lock import locked
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.storage.file_access import require_writable
+from lingo_mi.storage.folder_lock import locked
 
 SHOWN = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'gaussians', 'seconds_fit'
 

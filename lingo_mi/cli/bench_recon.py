@@ -25,9 +25,9 @@ import os
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.storage.file_access import require_writable, write_text
 
 os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # idle threads of one package must not slow the next one's
 

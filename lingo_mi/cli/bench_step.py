@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
 
 
 def arguments() -> argparse.Namespace:

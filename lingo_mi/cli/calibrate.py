@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, check_scan_output
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 
 EPILOG = """\
 examples:

@@ -17,13 +17,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from lingo_mi import parsing
-from lingo_mi.errors import InputError, brief, shown
-from lingo_mi.file_access import leftovers, require_writable, write_text
-from lingo_mi.folder_lock import LOCK, locked
-from lingo_mi.interrupts import noticed
-from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
+from lingo_mi.common import parsing
+from lingo_mi.common.errors import InputError, brief, shown
+from lingo_mi.common.interrupts import noticed
 from lingo_mi.scene.shipped import scenes
+from lingo_mi.storage.file_access import leftovers, require_writable, write_text
+from lingo_mi.storage.folder_lock import LOCK, locked
+from lingo_mi.storage.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
 
 class Parser(argparse.ArgumentParser):

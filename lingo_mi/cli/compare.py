@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, writing_file
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import require_writable, write_text
 
 EPILOG = """\
 examples:

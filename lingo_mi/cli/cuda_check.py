@@ -16,8 +16,8 @@ import tempfile
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import require_writable, write_text
 
 
 def arguments() -> argparse.Namespace:

@@ -14,10 +14,10 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
-from lingo_mi.folder_lock import locked
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.storage.file_access import require_writable
+from lingo_mi.storage.folder_lock import locked
 
 KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
 

@@ -26,14 +26,14 @@ from lingo_mi.cli.common import (
     read_input,
     writable_folder,
 )
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import nearest
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.folder_lock import locked
-from lingo_mi.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
-from lingo_mi.parsing import nearest
-from lingo_mi.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
+from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, clear_leftovers
 
 
 def arguments() -> argparse.Namespace:
@@ -114,7 +114,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, settings: Settings, parame
 
     parameters   of the scene file
     """
-    from lingo_mi.progress import Progress
+    from lingo_mi.common.progress import Progress
     from lingo_mi.results.fit_into import fit_into
     from lingo_mi.results.measure import summary
     from lingo_mi.results.watchers import watchers_of

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable, write_text
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import require_writable, write_text
 
 
 def arguments() -> argparse.Namespace:
@@ -35,7 +35,7 @@ def arguments() -> argparse.Namespace:
 
 def main() -> int:
     args = arguments()
-    from lingo_mi.progress import Progress
+    from lingo_mi.common.progress import Progress
     from lingo_mi.studies.fuzz.page import page
     from lingo_mi.studies.fuzz.pool import run, save_case
     from lingo_mi.studies.fuzz.readers import NAMES

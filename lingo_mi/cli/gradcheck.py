@@ -9,7 +9,7 @@ The exit code is 1 where an error is above 1e-4, and 2 for a scene that cannot b
 import argparse
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
 

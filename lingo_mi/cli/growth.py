@@ -16,9 +16,9 @@ import json
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, docs_arguments, docs_of
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, require_writable, write_text
-from lingo_mi.folder_lock import locked
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import reading, require_writable, write_text
+from lingo_mi.storage.folder_lock import locked
 from lingo_mi.studies.provenance import commit, machine, write_provenance
 
 KEYS = 'stage', 'axis', 'number', 'seconds', 'peak', 'commit', 'machine'
@@ -52,7 +52,7 @@ def main() -> None:
         raise InputError('lingo-mi growth asks Linux for the peak of memory, and this is another system')
     document, figures = docs_of(args)
     require_writable(args.out, args.out, 'choose another --out')
-    from lingo_mi.progress import Progress
+    from lingo_mi.common.progress import Progress
     from lingo_mi.studies.growth.report import draw, exponents
     from lingo_mi.studies.growth.stages import DEPENDS
     from lingo_mi.studies.growth.sweep import sweep

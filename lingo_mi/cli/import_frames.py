@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, check_scan_output
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 EPILOG = """\
 examples:

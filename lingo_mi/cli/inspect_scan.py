@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lingo_mi.cli.common import Parser, writable_file
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 if TYPE_CHECKING:
     from lingo_mi.inspection.measure import Findings
@@ -50,7 +50,7 @@ def main() -> None:
 def _compare_views(scan: Scan, found: Findings) -> None:
     """Adds what quick reconstructions say of the views' order, where they can be made."""
     from lingo_mi.calibration.order import order_faults
-    from lingo_mi.runtime import ensure_variant
+    from lingo_mi.common.runtime import ensure_variant
 
     try:
         ensure_variant()

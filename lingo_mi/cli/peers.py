@@ -19,13 +19,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, check_input, definitions, input_arguments, read_input, renewed_table
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
+from lingo_mi.storage.file_access import require_writable
 
 
 def arguments() -> argparse.Namespace:

@@ -6,11 +6,11 @@ from typing import Any
 
 from lingo_mi import phantoms
 from lingo_mi.cli.common import Parser, check_seed
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import replacing, require_writable
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.memory import room
 from lingo_mi.geometry.limits import MOST_VIEWS
-from lingo_mi.memory import room
 from lingo_mi.phantoms.x3d_scan import PIXELS
+from lingo_mi.storage.file_access import replacing, require_writable
 
 EPILOG = """\
 phantoms:
@@ -165,12 +165,12 @@ def main() -> None:
         write_volume(args.out, phantom.data, phantom.spacing, phantom.origin, 'normalised')
         print(f'{args.out}: {args.name}, {args.size}^3 voxels of {phantom.spacing[0]:g} mm')
     if args.projections:
+        from lingo_mi.common.progress import Progress
         from lingo_mi.files.scans import write_scan
         from lingo_mi.phantoms.x3d_scan import scan
-        from lingo_mi.progress import Progress
 
         if phantom.analytic is None:
-            from lingo_mi.runtime import use_variant
+            from lingo_mi.common.runtime import use_variant
 
             use_variant(args.variant)
         with Progress('Project', 2 * args.views) as bar:

@@ -51,14 +51,14 @@ from lingo_mi.cli.common import (
     writable_file,
     writing_file,
 )
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import parse
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.completion.clouds import FittedCloud, load_cloud
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start, sampled
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import optional, require_writable, write_text
 from lingo_mi.files.slabs import NIFTI, ZARR, plan_and_error_map, write_slabs
 from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.parsing import parse
-from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ALGORITHMS, FDK, Algorithm, Best, Reconstruction, progress_bar, reconstruct
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.effects_correction import linearised
@@ -69,11 +69,11 @@ from lingo_mi.reconstruction.slab_sweeps import discard
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.page import report_page
 from lingo_mi.results.measure import volume_quality
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import thinned
 from lingo_mi.scene.load import LoadedScene, defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
+from lingo_mi.storage.file_access import optional, require_writable, write_text
 
 FROM_CLOUD = 'refined', 'voxelize'  # algorithms that nothing can be done by without a cloud
 IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'voxelize'  # those that need not hold the whole volume

@@ -15,9 +15,9 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, renewed_table
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import require_writable
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
+from lingo_mi.storage.file_access import require_writable
 
 
 def arguments() -> argparse.Namespace:

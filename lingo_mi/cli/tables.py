@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from lingo_mi.cli.common import Parser, check_seed, check_threads, cluster_arguments, runner_of
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import leftovers, require_writable
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.recipes import METHODS, settings_of
-from lingo_mi.folder_lock import locked
-from lingo_mi.runtime import use_variant
+from lingo_mi.storage.file_access import leftovers, require_writable
+from lingo_mi.storage.folder_lock import locked
 
 ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer', 'best'
 PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper

@@ -12,12 +12,12 @@ from os import PathLike
 from pathlib import Path
 
 from lingo_mi.cohort.row import COLUMNS, Row, scene_of
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import reading
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.parsing import MOST_SEED, nearest
 from lingo_mi.files.scans import load_yaml, reader_of
 from lingo_mi.fitting.recipes import METHODS
-from lingo_mi.parsing import MOST_SEED, nearest
 from lingo_mi.scene.load import defaults
+from lingo_mi.storage.file_access import reading
 
 RESERVED = 'results.csv', 'results.parquet', 'batch.log'  # names in the output folder
 MOST_NAME = 100  # bytes of a name

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import parsed_json, reading
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files import scans
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 from lingo_mi.scene import outline
 from lingo_mi.scene.shipped import scene_path, scenes
+from lingo_mi.storage.file_access import parsed_json, reading
+from lingo_mi.storage.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
 # How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
 COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'

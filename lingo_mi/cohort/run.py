@@ -10,9 +10,9 @@ from lingo_mi.cohort.listing import BadList
 from lingo_mi.cohort.row import Row, stored
 from lingo_mi.cohort.table import CSV, PARQUET, Log, Table
 from lingo_mi.cohort.work import fit_row
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import leftovers
+from lingo_mi.common.errors import InputError
 from lingo_mi.jobs.job import Event, Job, Runner, run_all
+from lingo_mi.storage.file_access import leftovers
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lingo_mi.cohort.row import Row
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, replacing, write_text
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import reading, replacing, write_text
 
 CSV, PARQUET, LOG = 'results.csv', 'results.parquet', 'batch.log'
 FIRST = 'name', 'status', 'error', 'file', 'geometry', 'recipe', 'views', 'seed'

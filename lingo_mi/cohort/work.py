@@ -8,16 +8,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lingo_mi.cohort.row import Row, stored
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.folder_lock import locked
-from lingo_mi.output_folder import CHECKPOINT, clear_leftovers
 from lingo_mi.results.fit_into import fit_into
 from lingo_mi.scan import Dataset
 from lingo_mi.scene.checks import check_memory, warn_if_truncated
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import choose_views, take_scan
+from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.output_folder import CHECKPOINT, clear_leftovers
 
 PATIENCE = 60.0  # seconds: a worker that has lost its scheduler stops after its step, and writes its checkpoint
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.calibration.response.response import Response
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import Effects, find_effects
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import parsed_json
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.poses import Poses
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.output_folder import CLOUD, METRICS, require_together
 from lingo_mi.projectors.objects import Ellipsoids, find_objects
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import render_objects
+from lingo_mi.storage.file_access import parsed_json
+from lingo_mi.storage.output_folder import CLOUD, METRICS, require_together
 
 WANTED = 'give the result.xml of a fit, or the checkpoint.npz of one by naf, 3dgs or xgaussian'
 

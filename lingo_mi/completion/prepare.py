@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit

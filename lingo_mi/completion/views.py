@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.clouds import FittedCloud
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread

@@ -22,7 +22,7 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import logsumexp, softmax
 from scipy.stats import qmc
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 MOST_BANDS = 6
 MOST_STEPS = 1000  # of the search; the remaining error is `Bands.error`

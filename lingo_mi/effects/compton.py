@@ -16,8 +16,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.spectrum import compound, library
-from lingo_mi.errors import InputError
 
 ELECTRON = 510.99895  # m c^2, keV
 LEAST_ENERGY, MOST_ENERGY = 1.0, 800.0  # keV

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import convolve
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import MOST_SEED
 from lingo_mi.effects.focal_spot import checked_order
-from lingo_mi.errors import InputError
-from lingo_mi.parsing import MOST_SEED
 from lingo_mi.projectors.view import View
 
 RESPONSES = 'energy', 'count'

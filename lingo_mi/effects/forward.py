@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import DARKEST, Detector
 from lingo_mi.effects.focal_spot import FocalSpot, aperture_views
 from lingo_mi.effects.hardening import Tube, by_material, hardened
 from lingo_mi.effects.scatter import Scatter
-from lingo_mi.errors import InputError
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan

@@ -15,9 +15,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects import bands as energy_bands
 from lingo_mi.effects.spectrum import Spectrum, attenuation, monochromatic, tube_spectrum
-from lingo_mi.errors import InputError
 
 REFERENCE = 60.0  # keV; water attenuates .0206 per mm
 LARGEST = 10.0  # measured line integral up to which bands are fitted; 5e-5 of the signal remains there

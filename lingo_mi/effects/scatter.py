@@ -24,12 +24,12 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import uniform_filter
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import MOST_SEED
 from lingo_mi.effects.compton import scattering
 from lingo_mi.effects.hardening import Tube, by_material
 from lingo_mi.effects.spectrum import attenuation
-from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.parsing import MOST_SEED
 from lingo_mi.projectors.objects import GridInCube
 from lingo_mi.projectors.sampling import bounds, on_grid
 from lingo_mi.projectors.view import View

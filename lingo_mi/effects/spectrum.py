@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError
+from lingo_mi.common.arrays import short_repr
+from lingo_mi.common.errors import InputError
 
 STEP = 0.5  # keV, width of a spectrum's bins
 LEAST_KVP, MOST_KVP = 20.0, 300.0

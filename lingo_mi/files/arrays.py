@@ -11,9 +11,9 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, reading, replacing
-from lingo_mi.memory import require_room
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
+from lingo_mi.storage.file_access import one_line, reading, replacing
 
 _FLOAT32_MAX = float(np.finfo(np.float32).max)
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}

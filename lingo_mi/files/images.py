@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import one_line, reading, replacing
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.memory import require_room
 from lingo_mi.files.arrays import numeric
-from lingo_mi.memory import require_room
+from lingo_mi.storage.file_access import one_line, reading, replacing
 
 _LONGEST_HEADER = 1 << 20
 _MOST_LINES = 256  # in a block that is compressed as one

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import beside, reading
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.voxels import read_voxels
+from lingo_mi.storage.file_access import beside, reading
 
 _LONGEST_HEADER = 1 << 16
 UNITS = {'mm': 1.0, 'um': 1e-3, 'cm': 10.0, '?': 1.0}  # in mm

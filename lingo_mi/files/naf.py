@@ -28,12 +28,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import one_line, reading, replacing
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.memory import require_room
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
-from lingo_mi.memory import require_room
 from lingo_mi.scan import Dataset
+from lingo_mi.storage.file_access import one_line, reading, replacing
 
 _MOST = 1_000_000  # instructions of a pickle, and values in it; an array is one of a few instructions
 _LONGEST_TEXT = 10_000

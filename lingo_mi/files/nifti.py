@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, quiet, reading
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.voxels import MOST_DEFLATED, read_exactly, require_claim
+from lingo_mi.storage.file_access import one_line, quiet, reading
 
 _TO_MM = {'meter': 1000.0, 'micron': 1e-3}  # mm, and where no unit is told
 _LONGEST_HEADER = 540

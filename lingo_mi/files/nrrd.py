@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import beside, reading
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.voxels import read_voxels
+from lingo_mi.storage.file_access import beside, reading
 
 _LONGEST_HEADER = 1 << 16
 _TYPES = {

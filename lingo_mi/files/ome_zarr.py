@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError, brief, shown
-from lingo_mi.file_access import optional, reading
-from lingo_mi.memory import require_room
+from lingo_mi.common.errors import InputError, brief, shown
+from lingo_mi.common.memory import require_room
+from lingo_mi.storage.file_access import optional, reading
 
 # What numbers are packed with. Others, such as pickle, can run a stranger's code.
 CODECS = {'bytes', 'transpose', 'sharding_indexed', 'crc32c', 'gzip', 'zlib', 'bz2', 'lzma', 'lz4', 'zstd', 'blosc'}

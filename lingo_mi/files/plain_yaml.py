@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, reading
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import one_line, reading
 
 MOST_BYTES, MOST_VALUES, DEEPEST, LONGEST_TEXT = 8 << 20, 250_000, 16, 10_000
 

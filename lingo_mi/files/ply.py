@@ -21,9 +21,9 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, replacing
-from lingo_mi.memory import require_room
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
+from lingo_mi.storage.file_access import reading, replacing
 
 _CENTRE = 'x', 'y', 'z'
 _SCALE = 'scale_0', 'scale_1', 'scale_2'

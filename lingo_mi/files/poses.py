@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, reading
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.geometry import astra, matrices, rtk
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.storage.file_access import one_line, reading
 
 
 def read_poses(

@@ -13,7 +13,7 @@ from os import PathLike
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files import arrays
 from lingo_mi.files.scanner_dict import make_scan, to_geometry
 from lingo_mi.scan import Dataset

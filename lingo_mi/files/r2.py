@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import beside, new_folder, one_line, reading
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
 from lingo_mi.files import arrays
 from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
 from lingo_mi.geometry.limits import MOST_VIEWS
-from lingo_mi.memory import require_room
 from lingo_mi.scan import Dataset
+from lingo_mi.storage.file_access import beside, new_folder, one_line, reading
 
 META = 'meta_data.json'
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix

@@ -51,8 +51,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import beside, new_folder, reading, replacing
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.memory import require_room
+from lingo_mi.common.parsing import nearest
 from lingo_mi.files import arrays, naf, plain_yaml, public_scans, r2
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
@@ -70,9 +71,8 @@ from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
 from lingo_mi.geometry import astra
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.memory import require_room
-from lingo_mi.parsing import nearest
 from lingo_mi.scan import Dataset, Scan
+from lingo_mi.storage.file_access import beside, new_folder, reading, replacing
 
 _KEYS = {
     'DSO',

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import new_folder, optional, replacing
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.volumes import first_voxel, volume_header
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.storage.file_access import new_folder, optional, replacing
 
 NIFTI, ZARR = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr')
 THICKNESS = 64  # slices of a slab, unless the caller chooses

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, optional, quiet, reading
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
 from lingo_mi.files.voxels import LPS_TO_RAS, require_claim
-from lingo_mi.memory import require_room
+from lingo_mi.storage.file_access import one_line, optional, quiet, reading
 
 _KINDS = {'imagej', 'shaped', 'uniform', 'volumetric', 'bigtiff'}  # of TIFF files, in tifffile's words
 _DEFLATED_DICOM = '1.2.840.10008.1.2.1.99'

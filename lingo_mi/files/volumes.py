@@ -28,14 +28,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi import notebook
-from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import reading, replacing
+from lingo_mi.common import notebook
+from lingo_mi.common.arrays import short_repr
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files import arrays, metaimage, nifti, nrrd, ome_zarr, slices
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.voxels import LPS_TO_RAS, read_voxels
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.storage.file_access import reading, replacing
 
 _OURS = 'lingo_mi: '
 # Raw files known by their content: SHA-1 of the git blob -> shape [x, y, z], type. The first is the

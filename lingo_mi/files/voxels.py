@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading
-from lingo_mi.memory import require_room
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
+from lingo_mi.storage.file_access import reading
 
 MOST_DEFLATED = 1032  # bytes that a byte of deflate can stand for
 _CHUNK = 1 << 20

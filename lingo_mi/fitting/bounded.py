@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import room
 from lingo_mi.fitting.measured import knows_noise, trusted
 from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.memory import room
 from lingo_mi.reconstruction.held_out import LEAST_VIEWS
 from lingo_mi.scan import Scan
 

@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import replacing
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.checkpoint_schema import VERSION, require_sound
 from lingo_mi.fitting.state import State
-from lingo_mi.output_folder import CHECKPOINT, begin
+from lingo_mi.storage.file_access import replacing
+from lingo_mi.storage.output_folder import CHECKPOINT, begin
 
 LONGEST_HEADER = 2**16  # bytes of a .npy's
 

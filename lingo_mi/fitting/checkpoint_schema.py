@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.calibration.response.part import SMOOTH
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.fitting.models import parameter_shapes
 from lingo_mi.fitting.settings import HELD_OUT, Settings
 from lingo_mi.geometry.base import Geometry

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.lingo.density import fitted_factor, sampled
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.voxel_filter import voxel_centres
+from lingo_mi.metrics.ipsd import neighbour_distance
 from lingo_mi.reconstruction.sart import SART
 from lingo_mi.scan import Scan
 

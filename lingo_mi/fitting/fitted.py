@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.fitting import average, checkpoint, stopping
 from lingo_mi.fitting.checkpoint_schema import geometry_of, settings_of
 from lingo_mi.fitting.device_state import DeviceState
@@ -18,9 +19,8 @@ from lingo_mi.fitting.poses import Poses
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State, activate
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.metrics import current_names
+from lingo_mi.metrics.quality import current_names
 from lingo_mi.projectors.objects import Ellipsoids
-from lingo_mi.runtime import one_at_a_time
 
 
 class NeedsEffects(InputError):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
@@ -20,7 +21,6 @@ from lingo_mi.lingo import initialise as lingo
 from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.rectify import can_rectify
-from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model
 from lingo_mi.fitting.running import Running
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 
 

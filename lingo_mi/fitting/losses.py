@@ -23,8 +23,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import InputError
-from lingo_mi.metrics import C1, C2, WINDOW
+from lingo_mi.common.errors import InputError
+from lingo_mi.metrics.quality import C1, C2, WINDOW
 
 TILE = 8
 REACH = len(WINDOW) // 2

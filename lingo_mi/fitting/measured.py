@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.reconstruction import effects_correction as corrections
 from lingo_mi.reconstruction.preconditions import require_signal

@@ -7,10 +7,10 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.voxel_filter import voxel_centres
+from lingo_mi.metrics.ipsd import neighbour_distance
 
 
 def r2_initialise(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.settings import Settings
 
 # Zha et al., "R2-Gaussian: Rectifying Radiative Gaussian Splatting for Tomographic Reconstruction", NeurIPS 2024.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.settings import Settings
 from lingo_mi.scan import Scan
 

@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.average import Average
 from lingo_mi.fitting.bounded import bounded
@@ -23,7 +23,7 @@ from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.stopping import Search
 from lingo_mi.fitting.view_order import view_order
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.metrics import current_names
+from lingo_mi.metrics.quality import current_names
 from lingo_mi.scan import Scan
 from lingo_mi.scene.description import describe
 

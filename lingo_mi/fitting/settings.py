@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar
 
 from lingo_mi.calibration.response.part import VARIES
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.fitting.field.settings import FieldSettings
 from lingo_mi.fitting.view_order import ORDERS
 from lingo_mi.lingo.initialise import LingoSettings
-from lingo_mi.parsing import checked, nearest, parse, require_ranges
 from lingo_mi.projectors import cutoff
 
 # By the setting `render`:

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.densify import densify, reset_opacity

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.field_step import FieldStepper

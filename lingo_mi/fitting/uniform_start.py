@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.voxel_filter import voxel_centres
+from lingo_mi.metrics.ipsd import neighbour_distance
 
 
 def random_points(half: np.ndarray, flat: bool, n_points: int, rng: np.random.Generator) -> InitialCloud:

@@ -12,10 +12,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.arrays import as_numpy
-from lingo_mi.errors import InputError
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.projectors.upload import uploaded_tensor
-from lingo_mi.runtime import ensure_variant, one_at_a_time
 
 NAMES = 'means', 'scales', 'quaternions', 'density'
 COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian

@@ -25,10 +25,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError, require_type, shown
+from lingo_mi.common.errors import InputError, require_type, shown
+from lingo_mi.common.memory import room
 from lingo_mi.functional.frameworks import call
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.memory import room
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
 from lingo_mi.projectors.cloud import line_integrals

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.projectors.upload import uploaded_tensor
-from lingo_mi.runtime import one_at_a_time
 
 
 def call_jax(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...]) -> Any:

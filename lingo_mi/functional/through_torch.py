@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import torch
 
-from lingo_mi.errors import InputError
-from lingo_mi.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 
 
 def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any:

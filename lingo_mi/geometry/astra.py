@@ -19,7 +19,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.rays import Rays
 

@@ -29,9 +29,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi import notebook
-from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common import notebook
+from lingo_mi.common.arrays import short_repr
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.parsing import whole
 from lingo_mi.geometry import astra, limits, rtk, tigre
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import circle_of
@@ -39,7 +40,6 @@ from lingo_mi.geometry.drawing import drawing
 from lingo_mi.geometry.limits import MOST_COUNT
 from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import Motion, helix, scanner_rays
-from lingo_mi.parsing import whole
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 
 MOST_LENGTH = 1e12
 LEAST_LENGTH = 1 / MOST_LENGTH

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry.limits import LEAST_LENGTH, MOST_LENGTH, numbers
 
 Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]

@@ -25,11 +25,11 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import one_line, reading, replacing
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import rotation
+from lingo_mi.storage.file_access import one_line, reading, replacing
 
 ROOT = 'RTKThreeDCircularGeometry'
 _NUMBERS = (

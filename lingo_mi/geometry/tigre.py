@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lingo_mi.file_access import replacing
 from lingo_mi.inspection.measure import Findings
 from lingo_mi.scan import Scan
+from lingo_mi.storage.file_access import replacing
 
 
 def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:

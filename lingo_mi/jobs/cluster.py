@@ -14,13 +14,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.errors import InputError, brief
-from lingo_mi.file_access import optional
-from lingo_mi.gpu import visible_gpus
+from lingo_mi.common.errors import InputError, brief
+from lingo_mi.common.gpu import visible_gpus
+from lingo_mi.common.progress import Progress
+from lingo_mi.common.runtime import cores
 from lingo_mi.jobs.job import Event, Job, Tell
 from lingo_mi.jobs.worker import describe_worker, require_fit, work
-from lingo_mi.progress import Progress
-from lingo_mi.runtime import cores
+from lingo_mi.storage.file_access import optional
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
 MOST_LOCAL = 1024
@@ -184,7 +184,7 @@ def _local(distributed: Any, count: int) -> Iterator[str]:
         env = {'CUDA_VISIBLE_DEVICES': gpus[i % len(gpus)]} if gpus else {}
         return dict(
             nthreads=1, memory_limit=0, env=env, silence_logs=logging.ERROR
-        )  # memory is watched by `lingo_mi.memory`
+        )  # memory is watched by `lingo_mi.common.memory`
 
     workers = {i: dict(cls=distributed.Nanny, options=options(i)) for i in range(count)}
     scheduler = dict(cls=distributed.Scheduler, options=dict(host='127.0.0.1', dashboard_address='127.0.0.1:0'))

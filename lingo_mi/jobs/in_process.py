@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from lingo_mi.common.progress import Progress
 from lingo_mi.jobs.job import Event, Job, Tell, attempt
-from lingo_mi.progress import Progress
 
 
 class InProcess:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-from lingo_mi.errors import InputError, brief
+from lingo_mi.common.errors import InputError, brief
 
 
 @dataclass(frozen=True)

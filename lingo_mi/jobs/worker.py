@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.jobs.job import Event, Job, attempt
 
 PAUSE = 1.0  # seconds between two reports
@@ -75,7 +75,7 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
 def _prepare(threads: int, variant: str | None) -> None:
     import mitsuba as mi
 
-    from lingo_mi.runtime import ensure_variant, use_threads, use_variant
+    from lingo_mi.common.runtime import ensure_variant, use_threads, use_variant
 
     if variant is None:
         ensure_variant()

@@ -10,13 +10,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import require_ranges
 from lingo_mi.lingo.density import FACTORS, MODES, fitted_factor, mean_pixel, sampled
-from lingo_mi.lingo.ipsd import neighbour_distance
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
-from lingo_mi.parsing import require_ranges
+from lingo_mi.metrics.ipsd import neighbour_distance
 from lingo_mi.scan import Scan
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.lingo.masks import Masks

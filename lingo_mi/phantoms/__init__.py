@@ -18,9 +18,9 @@ from typing import Protocol
 
 import numpy as np
 
-from lingo_mi import notebook
-from lingo_mi.arrays import short_repr
-from lingo_mi.errors import InputError
+from lingo_mi.common import notebook
+from lingo_mi.common.arrays import short_repr
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 
 _NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.triangles import add_lengths, voxelize
 from lingo_mi.phantoms.solids import rotation

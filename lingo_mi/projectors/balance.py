@@ -24,7 +24,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.gpu import gpu, resident_warps
+from lingo_mi.common.gpu import gpu, resident_warps
 from lingo_mi.projectors.depth import hashed
 
 while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable

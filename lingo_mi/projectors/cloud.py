@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.projectors.backprop import Cuts, leaves
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project

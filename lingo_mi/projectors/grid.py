@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 
 GAUSS = 0.5 / 3**0.5  # abscissae of the two-point rule on [-1/2, 1/2]

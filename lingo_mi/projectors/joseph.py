@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.stack import Gathered, hat, lanes, sampled, span

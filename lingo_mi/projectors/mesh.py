@@ -31,7 +31,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.balance import SHARING, Share, Sharing, Target, Work, pack
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View, vector64

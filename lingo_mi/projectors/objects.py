@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors import cloud, grid
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable

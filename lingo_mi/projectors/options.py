@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.balance import SHARING, Sharing
 from lingo_mi.projectors.view import View

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View
 

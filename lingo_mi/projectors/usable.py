@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.common.errors import AccuracyWarning, InputError
 
 # In the scene's units. Beyond these, float32 overflows or the projector's float64 has too few digits.
 MOST_LENGTH, MOST_DENSITY, MOST_ASPECT = 1e12, 1e24, 1e7

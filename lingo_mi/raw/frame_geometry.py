@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import scanner_dict
 from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
 from lingo_mi.geometry.base import CircularGeometry, Geometry

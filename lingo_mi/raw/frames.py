@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import one_line, optional, reading
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
+from lingo_mi.storage.file_access import one_line, optional, reading
 
 RTK = '.his', '.hnd', '.hnc', '.xim'  # of Elekta's and Varian's scanners, one frame a file
 IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'} | dict.fromkeys(RTK, 'itk')

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import require_room
+from lingo_mi.common.progress import Progress
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.memory import require_room
-from lingo_mi.progress import Progress
 from lingo_mi.raw.beam import Beam
 from lingo_mi.raw.frame_geometry import geometry_of, grid_given, own_grid, placed
 from lingo_mi.raw.frames import open_recording

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import median_filter
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.raw.frames import Frames
 
 DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad

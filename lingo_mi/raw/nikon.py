@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import one_line, reading
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry.limits import MOST_VIEWS
+from lingo_mi.storage.file_access import one_line, reading
 
 
 def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:

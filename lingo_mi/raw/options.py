@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.parsing import checked, whole
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import checked, whole
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi import notebook
-from lingo_mi.arrays import as_numpy, short_repr
-from lingo_mi.file_access import as_path, new_file, writing
+from lingo_mi.common import notebook
+from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.metrics import compared
+from lingo_mi.metrics.quality import compared
 from lingo_mi.scan import Scan
+from lingo_mi.storage.file_access import as_path, new_file, writing
 
 # Called after every step as progress(steps done, all steps, |A x - b| / |b|). The last is None if an algorithm does not know it.
 Progress = Callable[[int, int, float | None], None]

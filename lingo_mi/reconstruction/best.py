@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.arcs import gaps

@@ -18,7 +18,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.reconstruction.system import evaluated
 from lingo_mi.scan import Scan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numbers import Integral, Real
 from typing import Any
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 LARGE = 1e18  # upper bound of parameters without their own; float32 cannot hold the square of larger ones
 ORDERS = ('ordered', 'random', 'angularDistance')

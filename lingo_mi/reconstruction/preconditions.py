@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.scan import Scan, require_finite
 

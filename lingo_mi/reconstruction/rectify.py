@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import SAME

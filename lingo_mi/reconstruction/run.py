@@ -9,13 +9,13 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from lingo_mi import progress as bars
-from lingo_mi.errors import InputError
+from lingo_mi.common import progress as bars
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.memory_needs import needed
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
-from lingo_mi.runtime import one_at_a_time
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 

@@ -39,8 +39,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path
+from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.sart_update import update
@@ -48,6 +47,7 @@ from lingo_mi.reconstruction.slab_sweeps import swept
 from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
+from lingo_mi.storage.file_access import as_path
 
 
 def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Generator) -> list[np.ndarray]:

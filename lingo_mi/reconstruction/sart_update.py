@@ -12,11 +12,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.common.runtime import one_at_a_time
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.stack import Block, Views
 from lingo_mi.reconstruction.system import System, evaluated, scalar
-from lingo_mi.runtime import one_at_a_time
 
 
 def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool) -> mi.Float:

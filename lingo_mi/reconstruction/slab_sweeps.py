@@ -26,9 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import leftovers, parsed_json, reading, write_text, writing
-from lingo_mi.folder_lock import locked
+from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.sart_update import normalised, updated
@@ -36,6 +34,8 @@ from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector_
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
+from lingo_mi.storage.file_access import leftovers, parsed_json, reading, write_text, writing
+from lingo_mi.storage.folder_lock import locked
 
 Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
 STATE, FILES = 'state.json', ('even.f32', 'odd.f32')

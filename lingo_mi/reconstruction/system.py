@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.arrays import as_numpy
-from lingo_mi.errors import InputError
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph

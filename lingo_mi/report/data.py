@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lingo_mi.errors import InputError, brief
+from lingo_mi.common.errors import InputError, brief
 from lingo_mi.geometry.base import Geometry
 
 

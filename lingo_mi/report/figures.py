@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.notebook import grey_range
+from lingo_mi.common.notebook import grey_range
 from lingo_mi.report.planes import plane, plane_extent, planes, richest, series
 
 PLANES = {2: ('Axial', 'x', 'y', 'z'), 1: ('Coronal', 'x', 'z', 'y'), 0: ('Sagittal', 'y', 'z', 'x')}

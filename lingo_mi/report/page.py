@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.file_access import replacing, write_text
-from lingo_mi.output_folder import PAGE, PICTURE
 from lingo_mi.report import figures, template
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, headline
 from lingo_mi.report.payload import colour_maps, history, payload
+from lingo_mi.storage.file_access import replacing, write_text
+from lingo_mi.storage.output_folder import PAGE, PICTURE
 
 
 def write_report(folder: PathLike | str, data: ReportData) -> Path:

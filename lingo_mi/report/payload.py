@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from lingo_mi.common.notebook import grey_range
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.notebook import grey_range
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
 from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, block_means, preview

@@ -8,7 +8,7 @@ import webbrowser
 from os import PathLike
 from pathlib import Path
 
-from lingo_mi.file_access import as_path, new_file, write_text, writing
+from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 
 
 class Page:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError, brief
+from lingo_mi.common.errors import InputError, brief
 from lingo_mi.files.volumes import Volume
 from lingo_mi.report import template
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text

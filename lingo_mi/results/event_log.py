@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path, optional, writing
-from lingo_mi.notebook import grey_range
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.notebook import grey_range
 from lingo_mi.report.planes import plane, richest
 from lingo_mi.results.watch import Snapshot
+from lingo_mi.storage.file_access import as_path, optional, writing
 
 
 class EventLog:

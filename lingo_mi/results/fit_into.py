@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.output_folder import CHECKPOINT, require_ours
 from lingo_mi.results.measure import measure
 from lingo_mi.results.save import result_names, save
 from lingo_mi.results.watch import Watcher
 from lingo_mi.results.watched_fit import watched_fit
 from lingo_mi.scan import Dataset
+from lingo_mi.storage.output_folder import CHECKPOINT, require_ours
 
 
 def fit_into(

@@ -18,9 +18,9 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from lingo_mi.errors import brief
+from lingo_mi.common.errors import brief
+from lingo_mi.common.progress import clock
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.progress import clock
 from lingo_mi.report import template
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.packing import Arrays, preview

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi import metrics
 from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.lingo.ipsd import ipsd, reverse_distance
+from lingo_mi.metrics import quality as metrics
+from lingo_mi.metrics.ipsd import ipsd, reverse_distance
 from lingo_mi.results.watch import Snapshot
 from lingo_mi.scan import Dataset, Scan
 

@@ -12,15 +12,19 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.errors import InputError, brief
-from lingo_mi.file_access import writing
+from lingo_mi.common.errors import InputError, brief
 from lingo_mi.files.images import write_exr
 from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import first_voxel, write_volume
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.models.alpha import harmonics
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.output_folder import (
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.page import write_report
+from lingo_mi.results.measure import Measured, comparable
+from lingo_mi.results.scene_file import write_scene
+from lingo_mi.storage.file_access import writing
+from lingo_mi.storage.output_folder import (
     CHECKPOINT,
     CLOUD,
     METRICS,
@@ -34,10 +38,6 @@ from lingo_mi.output_folder import (
     remove_others,
     view_name,
 )
-from lingo_mi.report.data import ReportData
-from lingo_mi.report.page import write_report
-from lingo_mi.results.measure import Measured, comparable
-from lingo_mi.results.scene_file import write_scene
 
 
 def save(

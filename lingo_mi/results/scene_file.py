@@ -9,10 +9,10 @@ import numpy as np
 
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.file_access import write_text
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.output_folder import CLOUD, VOLUME
 from lingo_mi.scene.description import describe
+from lingo_mi.storage.file_access import write_text
+from lingo_mi.storage.output_folder import CLOUD, VOLUME
 
 
 def write_scene(path: Path, geometry: Geometry, extent: float | None, effects: Effects | None = None) -> None:

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import as_path, parsed_json, reading
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.files.volumes import Volume, read_volume
-from lingo_mi.metrics import current_names
-from lingo_mi.output_folder import METRICS, VIEWS, VOLUME, require_together
+from lingo_mi.metrics.quality import current_names
 from lingo_mi.scan import values_digest
+from lingo_mi.storage.file_access import as_path, parsed_json, reading
+from lingo_mi.storage.output_folder import METRICS, VIEWS, VOLUME, require_together
 
 
 @dataclass(frozen=True, eq=False)

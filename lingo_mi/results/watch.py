@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lingo_mi.errors import brief
+from lingo_mi.common.errors import brief
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.kinds import Model

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from lingo_mi.common.interrupts import between_steps
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.interrupts import between_steps
 from lingo_mi.results.measure import quick_measure
 from lingo_mi.results.watch import Watcher, watched
 from lingo_mi.scan import Dataset

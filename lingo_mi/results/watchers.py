@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 
-from lingo_mi.errors import require_type
+from lingo_mi.common.errors import require_type
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.results.event_log import EventLog
 from lingo_mi.results.live import Live

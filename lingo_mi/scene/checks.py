@@ -7,9 +7,9 @@ import warnings
 
 import numpy as np
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import room
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.memory import room
 
 
 def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 
 def data_file(name: str, parameter: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import to_posed
 from lingo_mi.geometry import astra

@@ -10,9 +10,9 @@ from typing import Any
 
 import mitsuba as mi
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.interrupts import noticed
 from lingo_mi.effects.forward import find_effects
-from lingo_mi.errors import InputError
-from lingo_mi.interrupts import noticed
 from lingo_mi.scene.checks import check_memory, thinned
 from lingo_mi.scene.outline import outline
 

@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 from xml.parsers import expat
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.ply import require_elements
 
 MOST_BYTES = 64 * 2**20  # 100 000 views with a pose each are 20 MB

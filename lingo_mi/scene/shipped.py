@@ -7,7 +7,7 @@ from importlib import resources
 from os import PathLike
 from pathlib import Path
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 
 def scenes() -> dict[str, Path]:

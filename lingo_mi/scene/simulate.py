@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.progress import Progress
 from lingo_mi.effects.forward import Effects, find_effects
-from lingo_mi.errors import InputError
 from lingo_mi.files.volumes import Volume
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
-from lingo_mi.progress import Progress
 from lingo_mi.projectors import cutoff, grid
 from lingo_mi.projectors.objects import GridInCube, find_objects
 from lingo_mi.projectors.options import RenderOptions

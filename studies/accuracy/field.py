@@ -11,6 +11,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.field_model import FieldModel
 from lingo_mi.fitting.field.network import Network
@@ -21,7 +22,6 @@ from lingo_mi.geometry.base import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors import grid
 from lingo_mi.projectors.upload import uploaded
-from lingo_mi.runtime import use_variant
 from lingo_mi.studies.accuracy.compare import deviation
 from lingo_mi.studies.accuracy.sizes import FULL, Sizes
 from lingo_mi.studies.accuracy.tables import FIELD as COLUMNS

@@ -16,7 +16,7 @@ from lingo_mi.fitting.recipes import CLOUDS, METHODS
 from lingo_mi.fitting.state import start
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.ipsd import ipsd
+from lingo_mi.metrics.ipsd import ipsd
 from lingo_mi.phantoms.x3d_scan import simulate
 from lingo_mi.results.measure import quick_measure
 from lingo_mi.scan import Dataset, Scan

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lingo_mi.file_access import replacing
 from lingo_mi.report.figures import STYLE
+from lingo_mi.storage.file_access import replacing
 from lingo_mi.studies.accuracy.tables import BACKWARD
 from lingo_mi.studies.closed_form import NAMES
 

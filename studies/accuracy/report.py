@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lingo_mi.file_access import write_text
+from lingo_mi.storage.file_access import write_text
 from lingo_mi.studies.accuracy.plots import draw
 from lingo_mi.studies.accuracy.tables import TITLES, make_tables
 from lingo_mi.studies.markdown import insert_into

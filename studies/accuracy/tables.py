@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.cutoff import PRESETS
+from lingo_mi.storage.file_access import reading
 from lingo_mi.studies.closed_form import NAMES
 from lingo_mi.studies.markdown import table
 

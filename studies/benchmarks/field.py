@@ -17,6 +17,7 @@ from collections.abc import Callable
 import drjit as dr
 import numpy as np
 
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.field_step import FieldStepper
 from lingo_mi.fitting.field.settings import FieldSettings
@@ -25,7 +26,6 @@ from lingo_mi.fitting.state import State
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.initialise import InitialCloud
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
 
 WARM = 2  # turns that are not counted

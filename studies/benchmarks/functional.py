@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.functional import project
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
@@ -24,7 +25,6 @@ from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
-from lingo_mi.runtime import use_variant
 
 WARM = 3  # turns that are not counted
 

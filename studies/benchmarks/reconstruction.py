@@ -22,7 +22,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lingo_mi import phantoms, runtime
+from lingo_mi import phantoms
+from lingo_mi.common import runtime
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.grid_pair import GridPair

@@ -13,7 +13,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from lingo_mi.file_access import write_text
+from lingo_mi.storage.file_access import write_text
 
 KINDS = 'fp32', 'fp64', 'int', 'mufu', 'load', 'store', 'atomic', 'branch', 'sync', 'other'
 SECTORS = {'l': 'loads', 's': 'stores', 'a': 'atomics'}

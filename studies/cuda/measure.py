@@ -16,13 +16,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.common.gpu import gpu
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.step import Stepper
-from lingo_mi.gpu import gpu
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
 from lingo_mi.studies.cuda.model import Card, counts, predicted
 from lingo_mi.studies.cuda.work import VIEW, image

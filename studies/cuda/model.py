@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import resources
 
-from lingo_mi.gpu import GPU, gpu
+from lingo_mi.common.gpu import GPU, gpu
 
 ATOMICS = 0.74  # sectors a clock and multiprocessor
 LAUNCH = 3e-6  # seconds

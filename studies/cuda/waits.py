@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.studies.markdown import table
 
 CALLS = {

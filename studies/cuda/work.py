@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.step import Stepper
@@ -31,7 +32,6 @@ from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
-from lingo_mi.runtime import use_variant
 from lingo_mi.scan import Scan
 from lingo_mi.studies.pairs import count_pairs
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import FAST
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene

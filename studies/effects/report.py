@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lingo_mi.file_access import read_object, replacing, write_text
 from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
+from lingo_mi.storage.file_access import read_object, replacing, write_text
 from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS
 from lingo_mi.studies.markdown import insert_into, table
 from lingo_mi.studies.provenance import provenance, write_provenance

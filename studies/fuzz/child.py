@@ -15,7 +15,7 @@ import warnings
 from pathlib import Path
 from random import Random
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.studies.fuzz.readers import case, reader, write
 
 LONGEST = 300  # characters of a message

@@ -94,7 +94,7 @@ def _checkpoint(path: Path, rng: Random) -> None:
 
 
 def _scene(path: Path, rng: Random) -> None:
-    from lingo_mi.runtime import ensure_variant
+    from lingo_mi.common.runtime import ensure_variant
     from lingo_mi.scene.load import load_scene
 
     ensure_variant()

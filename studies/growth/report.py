@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lingo_mi.file_access import replacing
+from lingo_mi.storage.file_access import replacing
 from lingo_mi.studies.growth.stages import AXES, DEPENDS
 from lingo_mi.studies.growth.sweep import exponent
 from lingo_mi.studies.markdown import table

@@ -146,7 +146,7 @@ def _sart(size: Size):
 
 
 def _measure(size: Size):
-    from lingo_mi import metrics
+    from lingo_mi.metrics import quality as metrics
 
     rng, shape = np.random.default_rng(0), (size.voxels,) * 3
     truth = rng.random(shape, np.float32)
@@ -217,7 +217,7 @@ def measure(stage: str, size: Size, least: float = 0.2) -> dict:
 
 
 def main() -> None:
-    from lingo_mi.runtime import use_variant
+    from lingo_mi.common.runtime import use_variant
 
     p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     p.add_argument('stage', choices=DEPENDS)

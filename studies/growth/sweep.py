@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import astuple, replace
 
-from lingo_mi.errors import InputError, brief
+from lingo_mi.common.errors import InputError, brief
 from lingo_mi.studies.growth.stages import DEPENDS, Size
 
 BASE = Size(voxels=64, pixels=128, views=20, gaussians=10_000)

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import reading, replacing
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import reading, replacing
 from lingo_mi.studies.hard_cases.measuring import PARAMETERS, Result, miss
 
 INTRODUCTION = """# Hard cases

@@ -23,10 +23,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi import metrics
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.interrupts import between_steps
+from lingo_mi.common.progress import Progress
 from lingo_mi.completion.views import insert_views
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import replacing
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.initial import initial_cloud
@@ -34,14 +34,14 @@ from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.fitting.resume import extensible
 from lingo_mi.fitting.settings import Settings
-from lingo_mi.interrupts import between_steps
-from lingo_mi.output_folder import CHECKPOINT
+from lingo_mi.metrics import quality as metrics
 from lingo_mi.phantoms.x3d_scan import scan
-from lingo_mi.progress import Progress
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Refined, progress_bar
 from lingo_mi.results.measure import measure
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
+from lingo_mi.storage.file_access import replacing
+from lingo_mi.storage.output_folder import CHECKPOINT
 from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.simulated import LARGEST, counting, noisy
 from lingo_mi.studies.tables.objects import PHANTOMS, VOLUMES, averaged, load_object

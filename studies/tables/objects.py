@@ -10,7 +10,7 @@ import numpy as np
 from skimage.transform import resize_local_mean
 
 from lingo_mi import phantoms
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import read_volume
 
 PHANTOMS = 'foot', 'chest'

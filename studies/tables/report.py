@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.file_access import replacing
 from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.storage.file_access import replacing
 from lingo_mi.studies.provenance import write_provenance
 from lingo_mi.studies.tables import paper
 from lingo_mi.studies.tables.cells import ALGORITHMS, CT, NEW_VIEWS, Cells, Fit, Volume

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import leftovers
-from lingo_mi.folder_lock import locked
+from lingo_mi.common.errors import InputError
 from lingo_mi.jobs.job import Event, Job, Runner, run_all
+from lingo_mi.storage.file_access import leftovers
+from lingo_mi.storage.folder_lock import locked
 from lingo_mi.studies.provenance import command
 from lingo_mi.studies.tables.cells import Cells, Fit, Scale, Volume, recipe
 

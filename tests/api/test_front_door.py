@@ -11,7 +11,7 @@ import lingo_mi as lm
 from helpers.same import assert_same
 from lingo_mi.files.volumes import first_voxel, read_volume
 from lingo_mi.geometry import circular
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 
 SCANNER = dict(DSO=100, DSD=150, nDetector=(24, 30), dDetector=(2, 2), nVoxel=(20,) * 3, dVoxel=(1.2,) * 3)
 VOLUME = np.linspace(0, 1, 8000).reshape(20, 20, 20)  # densities per mm

@@ -23,7 +23,7 @@ from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.geometry.trajectories import spread
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.simulate import take_scan

@@ -18,7 +18,7 @@ import pytest
 from helpers.fault_server import Server
 from helpers.script import SCENE
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.output_folder import CHECKPOINT, METRICS, digest
+from lingo_mi.storage.output_folder import CHECKPOINT, METRICS, digest
 
 SHARE = 16
 KINDS = 'kill', 'full', 'denied'

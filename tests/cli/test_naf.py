@@ -8,8 +8,8 @@ import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, fit, run
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.clouds import load_cloud
-from lingo_mi.errors import InputError
 from lingo_mi.projectors import grid
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import take_scan

@@ -12,8 +12,8 @@ import pytest
 import lingo_mi as lm
 from helpers.script import FIT, fit, fit_process, run
 from lingo_mi.files.volumes import write_volume
-from lingo_mi.folder_lock import LOCK, locked
-from lingo_mi.output_folder import MANIFEST
+from lingo_mi.storage.folder_lock import LOCK, locked
+from lingo_mi.storage.output_folder import MANIFEST
 
 QUICK = '--iterations', '2', '-D', 'n_points=100'
 

@@ -13,17 +13,17 @@ from helpers.effect_parts import detector, tube
 from helpers.effects import physics
 from helpers.same import assert_same, assert_same_volume
 from helpers.script import FIT, SCENE, fit, run
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion import views
 from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.completion.views import as_corrected, complete, fitted_views, without_effects
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry.base import CircularGeometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import compared, psnr_3d, psnr_3d_r2
+from lingo_mi.metrics.quality import compared, psnr_3d, psnr_3d_r2
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best
 from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.wide_pixels import excess_width

@@ -15,10 +15,10 @@ from lingo_mi.cohort import work
 from lingo_mi.cohort.listing import BadList, read_list
 from lingo_mi.cohort.row import Row, stored
 from lingo_mi.cohort.table import Table
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import write_volume
-from lingo_mi.output_folder import CHECKPOINT, METRICS
+from lingo_mi.storage.output_folder import CHECKPOINT, METRICS
 
 SHORT = 'fast:iterations=20,n_points=100'
 
@@ -213,7 +213,7 @@ def test_another_batch_in_the_folder(home):
 
 
 def lm_locked(folder):
-    from lingo_mi.folder_lock import locked
+    from lingo_mi.storage.folder_lock import locked
 
     return locked(folder)
 

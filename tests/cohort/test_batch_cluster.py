@@ -13,7 +13,7 @@ from helpers.cohorts import BATCH, events, results
 from helpers.dask_cluster import cluster, wait_until
 from helpers.same import fits_alike
 from helpers.script import SCENE, run
-from lingo_mi.output_folder import CHECKPOINT, METRICS
+from lingo_mi.storage.output_folder import CHECKPOINT, METRICS
 
 pytest.importorskip('distributed')
 KEYS = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'gaussians', 'iterations'

@@ -6,10 +6,10 @@ import pytest
 from scipy import stats
 
 import lingo_mi as lm
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector, taps
 from lingo_mi.effects.focal_spot import FocalSpot, square
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.view import View
 

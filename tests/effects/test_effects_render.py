@@ -11,12 +11,12 @@ import pytest
 import lingo_mi as lm
 from helpers.effects import XML, direct, kernels, physics
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.bands import band
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.effects.hardening import Tube, TubeParameters, hardened
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
-from lingo_mi.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.reconstruction.effects_correction import corrected, linearised
 from lingo_mi.scene.load import load_scene

@@ -8,12 +8,12 @@ from mitsuba import chi2
 
 from helpers.effects import XML
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.compton import CELLS, klein_nishina, scattering
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter, _energies, smoothed
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
-from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.objects import GridInCube, find_objects
 from lingo_mi.projectors.sampling import bounds, on_grid

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects import spectrum as module
 from lingo_mi.effects.bands import Bands, band
 from lingo_mi.effects.spectrum import attenuation, monochromatic, tube_spectrum
-from lingo_mi.errors import InputError
 
 pytest.importorskip('spekpy', reason="needs pip install 'lingo_mi[physics]'")
 pytest.importorskip('xraylib', reason="needs pip install 'lingo_mi[physics]'")

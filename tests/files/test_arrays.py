@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.voxels import read_exactly
 

@@ -4,7 +4,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import images
 from lingo_mi.files.images import read_exr, write_exr
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import metaimage
 
 SHAPE = (4, 5, 6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.scans import small_dataset
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import naf
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.scan import Dataset, Scan

@@ -7,7 +7,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import nifti
 
 SHAPE = (4, 5, 6)

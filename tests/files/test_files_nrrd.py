@@ -6,7 +6,7 @@ import gzip
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import nrrd
 
 SHAPE = (4, 5, 6)

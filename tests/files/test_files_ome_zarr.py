@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.slabs import write_slabs
 from lingo_mi.files.volumes import first_voxel, read_volume
 

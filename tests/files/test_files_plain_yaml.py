@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import plain_yaml
 from lingo_mi.files.plain_yaml import load
 

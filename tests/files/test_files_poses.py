@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from helpers.poses import to_matrices
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.geometry import astra, matrices, rtk

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.scans import small_dataset
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import r2
 from lingo_mi.scan import Dataset, Scan
 
@@ -218,7 +218,7 @@ def test_one_image_listed_many_times(tmp_path, monkeypatch):
     meta = json.loads((tmp_path / 'meta_data.json').read_text())
     meta['proj_train'] = meta['proj_train'][:1] * 50
     (tmp_path / 'meta_data.json').write_text(json.dumps(meta))
-    monkeypatch.setattr('lingo_mi.memory.host_room', lambda: 49 * 24 * 8)
+    monkeypatch.setattr('lingo_mi.common.memory.host_room', lambda: 49 * 24 * 8)
     refused(tmp_path, 'memory')
     meta['proj_train'] *= 3000
     (tmp_path / 'meta_data.json').write_text(json.dumps(meta))

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from helpers.scans import small_dataset
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.geometry import Geometry
@@ -468,7 +468,7 @@ def test_held_out_views_of_an_npy_are_refused(tmp_path):
 
 def test_more_exr_views_than_memory_holds(tmp_path, monkeypatch):
     write_scan(tmp_path / 'scan', small_dataset(), 'exr')
-    monkeypatch.setattr('lingo_mi.memory.host_room', lambda: 100.0)
+    monkeypatch.setattr('lingo_mi.common.memory.host_room', lambda: 100.0)
     with pytest.raises(InputError, match='memory'):
         read_scan(tmp_path / 'scan')
 

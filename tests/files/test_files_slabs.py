@@ -9,7 +9,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.slabs import write_slabs
 from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
@@ -195,7 +195,7 @@ import sys, json
 from pathlib import Path
 import numpy as np
 import lingo_mi as lm
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 use_variant('llvm_ad_mono')
 from lingo_mi.files.slabs import write_slabs
 

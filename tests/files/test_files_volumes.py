@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lingo_mi import file_access
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files import volumes, voxels
 from lingo_mi.files.volumes import centred_affine, first_voxel, git_blob_sha1, read_volume, write_volume
 from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.storage import file_access
 
 SHAPE, SPACING = (4, 5, 6), (0.5, 1.0, 2.5)
 COUNTS = np.arange(120, dtype=np.uint8).reshape(SHAPE)

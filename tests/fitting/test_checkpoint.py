@@ -10,7 +10,7 @@ import pytest
 
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import checkpoint, checkpoint_schema
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.balls import BALL, ellipsoids, geometry
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import edge_start as edges
 from lingo_mi.fitting.edge_start import edge_start
 from lingo_mi.geometry.trajectories import circular

@@ -14,9 +14,9 @@ import pytest
 
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, error_of, geometry, some_points, stop_at, tiny_scan
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting import checkpoint, step, view_loss
 from lingo_mi.fitting.cloud_model import CloudModel

@@ -12,8 +12,7 @@ from helpers.checkpoints import contents, write_as_before
 from helpers.fits import assert_equal_states, error_of, geometry, stop_at, tiny_scan
 from helpers.script import FIT, fit
 from helpers.script import run as run_script
-from lingo_mi import output_folder
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.densify import clone, prune, reset_opacity, split
 from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
@@ -23,6 +22,7 @@ from lingo_mi.fitting.state import activate, start
 from lingo_mi.fitting.uniform_start import cuboid, random_points
 from lingo_mi.projectors.radiance import radiance_towards
 from lingo_mi.projectors.view import View, vector64
+from lingo_mi.storage import output_folder
 
 ALPHA = '3dgs', 'xgaussian'
 SHORT = dict(

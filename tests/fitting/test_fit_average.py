@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import loop, running
 from lingo_mi.fitting.models.integral import PARAMETERS
 from lingo_mi.fitting.settings import AdamSettings

@@ -13,11 +13,11 @@ from helpers.effect_parts import detector, rendered_from_files, stepper_of, tube
 from helpers.effects import XML
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
 from helpers.script import fit
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
-from lingo_mi.errors import InputError
 from lingo_mi.files.images import read_exr
 from lingo_mi.fitting import losses
 from lingo_mi.fitting.fitted import Fitted

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers.fits import SHORT, geometry, some_points, stop_at, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import step
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.loop import run

@@ -11,9 +11,9 @@ from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop
 from helpers.same import assert_same
 from lingo_mi.calibration.drift import Drift
 from lingo_mi.calibration.response.response import Response
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.clouds import FittedCloud, load_cloud
 from lingo_mi.completion.prepare import prepare_completed, prepare_start
-from lingo_mi.errors import InputError
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run
 from lingo_mi.geometry.trajectories import circular

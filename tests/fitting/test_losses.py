@@ -6,17 +6,17 @@ from scipy.ndimage import correlate1d
 from skimage.filters import threshold_otsu
 from skimage.metrics import structural_similarity
 
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 
 use_variant()
 
 import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 
-from lingo_mi.errors import InputError  # noqa: E402
+from lingo_mi.common.errors import InputError  # noqa: E402
 from lingo_mi.fitting.loss_scale import loss_scale, otsu  # noqa: E402
 from lingo_mi.fitting.losses import combined, gradient_error, tv  # noqa: E402
-from lingo_mi.metrics import C1, C2, WINDOW, ssim_map  # noqa: E402
+from lingo_mi.metrics.quality import C1, C2, WINDOW, ssim_map  # noqa: E402
 
 
 def l1(image, truth, *shape):

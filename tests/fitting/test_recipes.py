@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.recipes import CLOUDS, METHODS, settings_of
 from lingo_mi.fitting.settings import Settings
 

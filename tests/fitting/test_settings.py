@@ -5,7 +5,7 @@ from dataclasses import MISSING, fields, is_dataclass
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.recipes import METHODS, settings_of
 from lingo_mi.fitting.settings import Settings
 

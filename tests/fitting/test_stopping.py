@@ -7,9 +7,9 @@ import pytest
 
 from helpers.checkpoints import contents, write_as_before
 from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.errors import InputError
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.bounded import bounded
 from lingo_mi.fitting.fitted import Fitted

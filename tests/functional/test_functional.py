@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from helpers.same import adds_in_any_order, assert_same
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.functional import project, voxelize
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.upload import uploaded_tensor
-from lingo_mi.runtime import ensure_variant
 from lingo_mi.studies import oracle
 from lingo_mi.studies.closed_form import image_and_gradients
 from lingo_mi.studies.oracle import Pose, random_cloud, relative

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting import checkpoint
 from lingo_mi.studies.fuzz import corpus, pool
 from lingo_mi.studies.fuzz.child import verdict

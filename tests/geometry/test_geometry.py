@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.bodies import BODIES
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, rotation, scanner_rays, spread

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.poses import to_matrices
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.matrices import from_matrices

@@ -49,7 +49,7 @@ def work(request, calls):
     from helpers.write_faults import Faults
     from lingo_mi.cli import fit, reconstruct, tables
     from lingo_mi.cli.common import guard
-    from lingo_mi.runtime import use_variant
+    from lingo_mi.common.runtime import use_variant
     from lingo_mi.studies.tables import cells
 
     def save():

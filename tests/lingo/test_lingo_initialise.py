@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.r2_start import r2_initialise
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo import density as densities
 from lingo_mi.lingo.density import FAINTEST, least_squares_factor, mean_pixel
 from lingo_mi.lingo.initialise import LingoSettings, draw, initialise
-from lingo_mi.lingo.ipsd import ipsd, neighbour_distance, reverse_distance
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import occupancy
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
+from lingo_mi.metrics.ipsd import ipsd, neighbour_distance, reverse_distance
 from lingo_mi.scan import Scan
 
 

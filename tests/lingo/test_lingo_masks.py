@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.trajectories import circular

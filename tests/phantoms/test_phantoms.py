@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lingo_mi import phantoms
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.phantoms import chest, foot, gaussians, mesh, shepp_logan
 from lingo_mi.phantoms import x3d_scan as scanning

@@ -12,7 +12,7 @@ import pytest
 
 from helpers.same import assert_same
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, transform, values_of
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState

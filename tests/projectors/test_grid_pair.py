@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from helpers.grids import backproject, scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.projectors.grid import project

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.grids import backproject, scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.grid import Lines, line_integrals, project, view_rays, view_table
 
 

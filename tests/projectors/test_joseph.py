@@ -7,7 +7,7 @@ import pytest
 from helpers.grids import scan
 from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, shaken, turned
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph

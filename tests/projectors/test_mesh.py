@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_variant
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.phantoms.mesh import Mesh, flange
-from lingo_mi.runtime import use_variant
 
 use_variant()
 

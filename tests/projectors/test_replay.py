@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.same import assert_same
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.projectors import replay
 from lingo_mi.projectors.cloud import columns, line_integrals, line_integrals_of_rows
 from lingo_mi.projectors.options import RenderOptions

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers.same import assert_same
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals

@@ -11,7 +11,7 @@ import yaml
 import lingo_mi as lm
 from helpers.raw_frames import raw_frames
 from lingo_mi.cli import main
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import rtk

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.algorithms import ITERATIVE
 from helpers.grids import scan as small
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ALGORITHMS, CGLS, FDK, SART, Reconstruction, Refined, progress_bar, reconstruct

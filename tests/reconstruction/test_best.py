@@ -9,10 +9,10 @@ from scipy.ndimage import gaussian_filter
 
 import lingo_mi as lm
 from helpers.grids import scan as small
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.phantoms import make
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run

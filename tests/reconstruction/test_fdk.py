@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers.balls import BALL, centres, ellipsoids, geometry
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.fdk import FDK, WINDOWS, filtered, ramp, ray_weights, view_weights

@@ -13,11 +13,11 @@ from helpers.algorithms import ITERATIVE
 from helpers.grids import scan as small
 from helpers.matrices import matrix
 from lingo_mi import phantoms
+from lingo_mi.common.errors import InputError
 from lingo_mi.completion.views import complete
-from lingo_mi.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d_r2
+from lingo_mi.metrics.quality import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refined

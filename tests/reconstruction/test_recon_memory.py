@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='
 PROGRAM = """
 import sys
 import numpy as np
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 use_variant('llvm_ad_mono')
 import mitsuba as mi
 from lingo_mi.geometry.base import CircularGeometry

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.balls import BALL, assert_ball, centres, ellipsoids, geometry
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.reconstruction.fdk import FDK

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import grid
 from lingo_mi.studies.benchmarks import mbirjax_bridge

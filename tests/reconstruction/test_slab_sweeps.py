@@ -14,7 +14,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry.base import PosedGeometry
 from lingo_mi.geometry.rays import Rays
@@ -222,7 +222,7 @@ import sys
 import numpy as np
 import lingo_mi as lm
 from lingo_mi.reconstruction.slab_sweeps import needed
-from lingo_mi.runtime import use_variant
+from lingo_mi.common.runtime import use_variant
 use_variant('llvm_ad_mono')
 
 def go(side, slices, pixels, views, thickness, blocksize):

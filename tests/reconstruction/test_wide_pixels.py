@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from lingo_mi import phantoms
 from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d_r2
+from lingo_mi.metrics.quality import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project
 from lingo_mi.projectors.joseph import Joseph

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.report import figures, planes
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.numbers import headline
@@ -288,6 +288,7 @@ def test_bad_data(changes, message):
 
 
 def test_import_leaves_matplotlib_alone():
-    code = "import sys, lingo_mi.report.page, lingo_mi.metrics, lingo_mi.progress\nprint('matplotlib' in sys.modules)"
+    modules = 'lingo_mi.report.page, lingo_mi.metrics.quality, lingo_mi.common.progress'
+    code = f"import sys, {modules}\nprint('matplotlib' in sys.modules)"
     out = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
     assert out == 'False\n'

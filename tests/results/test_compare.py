@@ -9,7 +9,7 @@ import pytest
 
 from helpers.browser import browser, opened, readout
 from helpers.script import run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.images import write_exr
 from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.files.volumes import write_volume

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.checkpoint import load
 from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.fitting.loop import run

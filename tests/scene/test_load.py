@@ -2,7 +2,7 @@
 
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.scene.load import load_scene, plain
 
 

@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from helpers.script import SCENE
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.scene import outline as limits
 from lingo_mi.scene.data_files import data_file
 from lingo_mi.scene.load import defaults, load_scene

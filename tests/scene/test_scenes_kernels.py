@@ -9,8 +9,8 @@ import pytest
 
 from helpers.effects import direct, kernels
 from lingo_mi.cli.common import SCANNER
+from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import find_effects
-from lingo_mi.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.scene.load import defaults, load_scene
 

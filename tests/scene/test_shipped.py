@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.scene.shipped import scene_path, scenes
 
 FOLDER = Path(__file__).parents[2] / 'scenes'

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.scan import Dataset
 from lingo_mi.studies.box_voxels import with_boxes
 

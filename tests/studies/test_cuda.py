@@ -8,9 +8,9 @@ import pytest
 
 from helpers.fits import SHORT, geometry, some_points, tiny_scan
 from helpers.script import FIT, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.gpu import GPU
 from lingo_mi.fitting.loop import run as run_fit
-from lingo_mi.gpu import GPU
 from lingo_mi.studies.cell_files import CellFiles
 from lingo_mi.studies.cuda import assemble, measure, model, report, waits
 from lingo_mi.studies.cuda.assemble import Kernel, find_ptxas

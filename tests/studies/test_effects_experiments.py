@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.script import FIT, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.scene.shipped import scenes
 from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, SETTINGS, measure, quality
 from lingo_mi.studies.effects.report import write

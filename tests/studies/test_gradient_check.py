@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.same import assert_same
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.studies import gradient_check
 from lingo_mi.studies.gradient_check import check_gradients, load_scene_file, table

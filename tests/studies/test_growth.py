@@ -12,7 +12,7 @@ from unittest import mock
 import pytest
 
 from helpers.script import FIT
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.studies.growth import stages, sweep
 from lingo_mi.studies.growth.report import exponents, rows_of
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from helpers.script import FIT
 from helpers.script import run as run_script
-from lingo_mi.errors import AccuracyWarning, InputError
+from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
 from lingo_mi.fitting.device_state import DeviceState
@@ -24,7 +24,7 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo.masks import Masks, masks
 from lingo_mi.lingo.otsu import otsu as otsu_of_paper
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
-from lingo_mi.metrics import ssim_map
+from lingo_mi.metrics.quality import ssim_map
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64

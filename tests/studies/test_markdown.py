@@ -3,7 +3,7 @@
 import pytest
 
 from helpers.script import FIT, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.studies.markdown import check_places, insert, insert_into, table
 
 TEXT = 'a\n<!-- table x -->\nold\nrows\n<!-- end x -->\nb\n'

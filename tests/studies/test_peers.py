@@ -10,12 +10,12 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from helpers.script import FIT
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.metrics import psnr_3d
+from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge

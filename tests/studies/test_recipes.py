@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from helpers.script import FIT
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.studies import recipes as study
 
 METRICS = dict(

@@ -14,7 +14,7 @@ import pytest
 
 from helpers.same import fits_alike
 from helpers.script import FIT, run
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.fitting.recipes import METHODS
 from lingo_mi.phantoms import make
@@ -253,7 +253,7 @@ def test_killed(tmp_path):
     """`kill -9` in the middle of the second cell: the first stays, and the same command ends the table."""
     arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
     code = (
-        'import runpy, sys\nimport lingo_mi\nfrom lingo_mi.runtime import use_variant\n'
+        'import runpy, sys\nimport lingo_mi\nfrom lingo_mi.common.runtime import use_variant\n'
         f'use_variant({mi.variant()!r})\nfrom lingo_mi.studies.tables import cells as tables\n'
         'tables.SCALES["small"] = tables.Scale(16, 24, 200, (20,), ("foot",))\ntables.SCANNED = 25\n'
         'sys.argv = sys.argv[1:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n'

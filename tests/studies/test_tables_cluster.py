@@ -10,7 +10,7 @@ import pytest
 
 from helpers.dask_cluster import cluster, wait_until
 from helpers.script import FIT, run
-from lingo_mi.folder_lock import locked
+from lingo_mi.storage.folder_lock import locked
 from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume
 
 pytest.importorskip('distributed')

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lingo_mi.errors import InputError
-from lingo_mi.parsing import require_ranges
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import require_ranges
 
 FINEST = 2**21  # points along a side: float32's positions within its cells have 3 bits left
 

@@ -10,7 +10,8 @@ import pytest
 from helpers.checkpoints import contents
 from helpers.fields import SMALL
 from helpers.fits import assert_equal_states, error_of, geometry, stop_at, tiny_scan
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import use_threads
 from lingo_mi.fitting import bounded as limits
 from lingo_mi.fitting import checkpoint
 from lingo_mi.fitting.field import field_step
@@ -20,7 +21,6 @@ from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.recipes import settings_of
 from lingo_mi.reconstruction.fdk import FDK
-from lingo_mi.runtime import use_threads
 
 
 @pytest.fixture

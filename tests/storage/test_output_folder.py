@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from lingo_mi.errors import InputError
-from lingo_mi.folder_lock import LOCK
-from lingo_mi.output_folder import (
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.folder_lock import LOCK
+from lingo_mi.storage.output_folder import (
     CHECKPOINT,
     MANIFEST,
     METRICS,

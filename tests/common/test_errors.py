@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 
 def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarray:

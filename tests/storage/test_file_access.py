@@ -7,13 +7,13 @@ from unittest import mock
 
 import pytest
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import beside, read_object, reading, replacing, require_writable, write_text
+from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.output_folder import manifest_of
 from lingo_mi.results.stored import read_stored
+from lingo_mi.storage.file_access import beside, read_object, reading, replacing, require_writable, write_text
+from lingo_mi.storage.output_folder import manifest_of
 
 
 @pytest.mark.parametrize('name', ['v.raw', 'v', 'below/v.raw', './v.raw', 'a..b'])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from lingo_mi import metrics
-from lingo_mi.errors import InputError
-from lingo_mi.metrics import (
+from lingo_mi.common.errors import InputError
+from lingo_mi.metrics import quality as metrics
+from lingo_mi.metrics.quality import (
     psnr_2d,
     psnr_2d_r2,
     psnr_3d,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from helpers.script import FIT, SCENE
-from lingo_mi import memory
-from lingo_mi.gpu import GPU, resident_warps
+from lingo_mi.common import memory
+from lingo_mi.common.gpu import GPU, resident_warps
 
 
 def test_limits_of_control_groups(tmp_path):

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lingo_mi.errors import InputError
+from lingo_mi.common.errors import InputError
 
 LLVM_HELP = (
     'Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import correlate1d
 
-from lingo_mi.errors import InputError
-from lingo_mi.runtime import cores
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import cores
 
 WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()

@@ -11,7 +11,7 @@ from PIL import Image
 
 import lingo_mi as lm
 from helpers.browser import browser, opened
-from lingo_mi import notebook
+from lingo_mi.common import notebook
 from lingo_mi.files.volumes import read_volume, write_volume
 from lingo_mi.report.view import Page
 

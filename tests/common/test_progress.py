@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from lingo_mi import progress
-from lingo_mi.progress import Progress
+from lingo_mi.common import progress
+from lingo_mi.common.progress import Progress
 
 
 class Terminal(io.StringIO):

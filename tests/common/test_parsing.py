@@ -2,8 +2,8 @@
 
 import pytest
 
-from lingo_mi.errors import InputError
-from lingo_mi.parsing import parse
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import parse
 
 
 @pytest.mark.parametrize('text, value', [('9007199254740993', 2**53 + 1), ('1e4', 10_000), ('-3', -3), ('2.0', 2)])

@@ -9,12 +9,12 @@ import sys
 
 import pytest
 
-from lingo_mi import folder_lock
-from lingo_mi.errors import InputError
-from lingo_mi.folder_lock import LOCK, locked
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage import folder_lock
+from lingo_mi.storage.folder_lock import LOCK, locked
 
 HOLD = (
-    'import sys\nfrom lingo_mi.folder_lock import locked\n'
+    'import sys\nfrom lingo_mi.storage.folder_lock import locked\n'
     'with locked(sys.argv[1]):\n print("held", flush=True)\n sys.stdin.read()'
 )
 

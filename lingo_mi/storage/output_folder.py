@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.file_access import flush_folder, leftovers, parsed_json, reading, replacing, writing
-from lingo_mi.folder_lock import LOCK
+from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import flush_folder, leftovers, parsed_json, reading, replacing, writing
+from lingo_mi.storage.folder_lock import LOCK
 
 METRICS, CHECKPOINT, MANIFEST, VIEWS = 'metrics.json', 'checkpoint.npz', '.lingo_mi.json', 'views'
 VOLUME, CLOUD, SCENE, PICTURE, PAGE = 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'report.png', 'report.html'

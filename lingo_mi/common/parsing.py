@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 
 MOST_SEED = 2**62  # two generators share the 64 bits of a detector's key
 

@@ -8,8 +8,8 @@ import sys
 from os import PathLike
 from pathlib import Path
 
-from lingo_mi.errors import InputError
-from lingo_mi.gpu import gpu
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.gpu import gpu
 
 
 def room() -> float:

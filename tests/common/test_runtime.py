@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.runtime import find_libllvm, use_threads
+from lingo_mi.common.runtime import find_libllvm, use_threads
 
 
 def test_folders_of_packages_with_few_folders_above(monkeypatch):

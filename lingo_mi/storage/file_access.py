@@ -18,7 +18,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lingo_mi.errors import InputError, shown
+from lingo_mi.common.errors import InputError, shown
 
 
 def one_line(error: BaseException | str) -> str:

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from lingo_mi.errors import InputError, shown
-from lingo_mi.file_access import writing
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.storage.file_access import writing
 
 try:
     import fcntl

@@ -1,0 +1,1 @@
+"""Numbers that compare: PSNR and SSIM (`quality`), the paper's IPSD (`ipsd`)."""

@@ -1,0 +1,1 @@
+"""Files and folders that a kill, a full disk or a second process cannot spoil."""
