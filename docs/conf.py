@@ -30,7 +30,7 @@ extensions = [
     'plain_docstrings',
     'plugin_pages',
     'command_help',
-    'recipes',
+    'method_values',
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
 

@@ -10,7 +10,6 @@ import matplotlib
 import numpy as np
 
 import lingo_mi as lm
-from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import scaled_grid
 from lingo_mi.lingo.voxel_filter import valid_voxels
@@ -26,15 +25,15 @@ LOW, HIGH = '#f2b705', '#d1495b'
 
 def main():
     data = lm.simulate('x3d_foot', views=VIEWS, parameters=dict(pixels=256, pixel_size=2))
-    result = lm.fit(data, 'fast:init=lingo,init_density=fdk', iterations=ITERATIONS)
-    lingo_steps(data, result)
-    two_stages(data, result)
+    fit = lm.fit(data, lm.Fast(start=lm.MaskStart(density='fdk')), iterations=ITERATIONS)
+    lingo_steps(data, fit)
+    two_stages(data, fit)
 
 
-def lingo_steps(data, result):
+def lingo_steps(data, fit):
     """One picture a step: masks, occupancy, valid voxels, initial cloud, fitted cloud, volume."""
-    scan, geometry, settings = data.train, data.train.geometry, result.settings
-    start = initial_cloud(scan, settings)
+    scan, geometry = data.train, data.train.geometry
+    start = fit.method.starting_cloud(scan)
     found, rays = masks(scan.normalised), geometry.normalised_rays()
     figure, panels = plt.subplots(2, 3, figsize=(11, 7.6))
     masked, coarse, cells, points, cloud, slices = panels.flat
@@ -44,40 +43,40 @@ def lingo_steps(data, result):
     masked.contour(found.high[0], [0.5], colors=HIGH, linewidths=1.2)
     masked.set_title('1  masks of every projection\nlow (yellow) and high (red)')
 
-    resolution = settings.start.occupancy_voxels
-    low, _ = valid_voxels(rays, found, (resolution,) * 3, geometry.half)
+    resolution = fit.method.start.occupancy_voxels
+    low, _ = valid_voxels(rays, found, (resolution,) * 3, geometry.grid.half)
     coarse.imshow(depth(low, (resolution,) * 3), cmap='Blues')
     coarse.set_title(
         f'2  occupancy on {resolution}³ cells\nP = {start.info["P"]:.3f}, scaled by S = {start.info["S"]:.2f}'
     )
 
-    grid = scaled_grid(geometry.nVoxel, start.info['S'])
-    low, high = valid_voxels(rays, found, grid, geometry.half)
+    grid = scaled_grid(geometry.grid.shape, start.info['S'])
+    low, high = valid_voxels(rays, found, grid, geometry.grid.half)
     red = np.ma.masked_equal(depth(high, grid), 0)
     cells.imshow(np.ma.masked_equal(depth(low, grid), 0), cmap='YlOrBr', vmin=0)
     cells.imshow(red, cmap='Reds', vmin=-red.max() / 2)
     cells.set_title(f'3  valid voxels of {grid[0]}³\n{len(low):,} low, {len(high):,} high')
 
-    scatter(points, start.points / geometry.scale, start.density, geometry)
+    scatter(points, start.points / geometry.grid.scale, start.density, geometry)
     points.set_title(f'4  initial cloud\n{len(start):,} points, FDK densities')
-    scatter(cloud, result.gaussians.means, result.gaussians.density, geometry)
-    cloud.set_title(f'5  fitted cloud\n{len(result):,} Gaussians after {settings.iterations} steps')
-    slices.imshow(sagittal(result.volume()), cmap='gray', vmin=0, vmax=data.volume.max())
+    scatter(cloud, fit.gaussians.means, fit.gaussians.density, geometry)
+    cloud.set_title(f'5  fitted cloud\n{len(fit):,} Gaussians after {fit.steps} steps')
+    slices.imshow(sagittal(fit.volume()), cmap='gray', vmin=0, vmax=data.volume.max())
     slices.set_title('6  volume of the cloud\none slice')
     for axes in panels.flat:
         axes.set(xticks=[], yticks=[])
     save(figure, 'lingo_steps')
 
 
-def two_stages(data, result):
+def two_stages(data, fit):
     """Slices of volumes, and how far they are from the truth."""
     scan = data.train
     volumes = {
         'truth': data.volume,
         f'FDK, {VIEWS} measured views': lm.reconstruct(scan, lm.FDK()).volume,
-        f'FDK, completed to {ALL_VIEWS}': lm.reconstruct(scan, lm.FDK(), start=result, views=ALL_VIEWS).volume,
-        'the cloud itself': result.volume(),
-        'refined from the cloud': lm.reconstruct(scan, lm.Refined(), start=result, views=ALL_VIEWS).volume,
+        f'FDK, completed to {ALL_VIEWS}': lm.reconstruct(scan, lm.FDK(), start=fit, views=ALL_VIEWS).volume,
+        'the cloud itself': fit.volume(),
+        'refined from the cloud': lm.reconstruct(scan, lm.Refined(), start=fit, views=ALL_VIEWS).volume,
     }
     figure, panels = plt.subplots(2, len(volumes), figsize=(13, 5.7))
     top = data.volume.max()
@@ -105,7 +104,7 @@ def depth(index, grid):
 def scatter(axes, points, density, geometry):
     """Points [N, 3], mm, seen along the x axis, coloured by density, the dense ones in front."""
     order = np.argsort(density)
-    _, y, z = np.array(geometry.sVoxel) / 2
+    _, y, z = np.array(geometry.grid.size) / 2
     axes.set_facecolor('black')
     axes.scatter(points[order, 1], points[order, 2], c=density[order], s=0.4, cmap='inferno', linewidths=0)
     axes.set(xlim=(-y, y), ylim=(-z, z), aspect='equal')

@@ -18,6 +18,7 @@ import numpy as np
 
 from lingo_mi.files.images import read_exr
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import current_names
 
 matplotlib.use('agg')
@@ -53,7 +54,9 @@ def held_out(volume: Path, index: int) -> np.ndarray:
 
     scanner = load_scene(ROOT / 'scenes' / 'chest.xml').scanner
     data = read_volume(volume)
-    return grid.project(data.data, scanner.test_geometry.with_volume(data.data.shape, data.spacing).subset([index]))[0]
+    return grid.project_volume(
+        data.data, scanner.test_geometry.on(Grid(data.data.shape, data.spacing)).subset([index])
+    )[0]
 
 
 def main():

@@ -2,7 +2,7 @@
 
 pip install -e '.[browser]'
 lingo-mi fit x3d_foot --views 25 --iterations 300 --out out/fast
-lingo-mi fit x3d_foot --views 25 --iterations 100 --recipe lingo --out out/lingo
+lingo-mi fit x3d_foot --views 25 --iterations 100 --method lingo --out out/lingo
 python docs/make_report_pictures.py out/fast out/lingo
 """
 

@@ -23,10 +23,10 @@ data
 # %%
 # The fit
 # -------
-# 'fast' is this project's recipe; 'lingo' and 'r2' are the published ones. 600 steps are usual; 250 are enough here.
+# `Fast` is this project's method; `LINGO` and `R2` are the published ones. 600 steps are usual; 250 are enough here.
 
-result = lm.fit(data, 'fast', iterations=250, n_points=4000)
-result
+fit = lm.fit(data, lm.Fast(), iterations=250, n_points=4000)
+fit
 
 # %%
 # What comes out
@@ -47,17 +47,17 @@ def compare(truth, found, titles, label, **options):
     fig.colorbar(signed, ax=axes[2], label=label)
 
 
-compare(data.volume[32].T, result.volume()[32].T, ('truth', 'fit'), 'density [1/mm]', origin='lower')
+compare(data.volume[32].T, fit.volume()[32].T, ('truth', 'fit'), 'density [1/mm]', origin='lower')
 
 # %%
 # And a view that the fit has not seen.
 
-rendered = result.render(data.test.geometry.subset([5]))
+rendered = fit.render(data.test.geometry.subset([5]))
 compare(data.test.projections[5], rendered[0], ('held-out view', 'rendered'), 'line integral')
 
 # %%
-# The numbers: PSNR and SSIM of held-out views and volume. `result.save('out/foot')` writes all of this to files.
+# The numbers: PSNR and SSIM of held-out views and volume. `fit.save('out/foot')` writes all of this to files.
 
-numbers = result.metrics()
+numbers = fit.metrics()
 for name in ('psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'gaussians'):
     print(f'{name:10s} {numbers[name]:.4g}')

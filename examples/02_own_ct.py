@@ -27,9 +27,9 @@ chest
 
 angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
 scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(7.5, 7.5))
-grid = dict(nVoxel=volume.shape, dVoxel=chest.spacing)
-geometry = lm.Geometry.cone(**scanner, **grid, angles=angles)
-between = lm.Geometry.cone(**scanner, **grid, angles=angles[:4] + np.pi / 20)
+grid = lm.Grid(volume.shape, chest.spacing)
+geometry = lm.Geometry.cone(**scanner, grid=grid, angles=angles)
+between = lm.Geometry.cone(**scanner, grid=grid, angles=angles[:4] + np.pi / 20)
 data = lm.simulate(volume, geometry, held_out=between)
 data
 
@@ -37,13 +37,13 @@ data
 # The fit, from the 20 views alone. Densities keep their unit. Sliders go through the fitted volume and the held-out views; the
 # picture below them has the true slices and the difference. Ribs and vessels of a voxel's width are more than 20 views tell.
 
-result = lm.fit(data, 'fast', iterations=250, n_points=4000)
-result
+fit = lm.fit(data, 'fast', iterations=250, n_points=4000)
+fit
 
 # %%
 # `save` writes the volume as NIfTI with its voxel size and position, the Gaussians as PLY, and a report.
 
-folder = result.save(Path(tempfile.mkdtemp()) / 'chest')
+folder = fit.save(Path(tempfile.mkdtemp()) / 'chest')
 print(*sorted(path.name for path in folder.iterdir()), sep='\n')
 
 # %%

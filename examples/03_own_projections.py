@@ -20,7 +20,7 @@ import lingo_mi as lm
 
 angles = np.radians(np.arange(30) * 12.0)
 geometry = lm.Geometry.cone(
-    DSO=500, DSD=750, nDetector=(64, 64), dDetector=(2.5, 2.5), nVoxel=(48,) * 3, dVoxel=(2,) * 3, angles=angles
+    DSO=500, DSD=750, nDetector=(64, 64), dDetector=(2.5, 2.5), grid=lm.Grid(48, 2), angles=angles
 )
 head = lm.phantom('shepp_logan', size=48)
 I0 = 1e5
@@ -39,9 +39,9 @@ scan
 # Fit 24 of the views and look at the six that are left.
 
 data = lm.Dataset(scan.subset(np.arange(30) % 5 != 4), scan.subset(np.arange(30) % 5 == 4))
-result = lm.fit(data, 'fast', iterations=300, n_points=4000)
-print(f'held-out views: {result.metrics()["psnr_2d"]:.1f} dB')
-result
+fit = lm.fit(data, 'fast', iterations=300, n_points=4000)
+print(f'held-out views: {fit.metrics()["psnr_2d"]:.1f} dB')
+fit
 
 # %%
 # As files: an array, and the geometry in TIGRE's names. Angles are in degrees in files.

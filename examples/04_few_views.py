@@ -23,29 +23,28 @@ geometry = lm.Geometry.cone(
     DSD=1500,
     nDetector=(128, 128),
     dDetector=(4, 4),
-    nVoxel=foot.data.shape,
-    dVoxel=foot.spacing,
+    grid=foot.grid,
     angles=np.linspace(0, np.pi, 10, endpoint=False),
 )
 data = lm.simulate(foot, geometry)
-result = lm.fit(data, 'fast', iterations=300, n_points=3000)
+fit = lm.fit(data, 'fast', iterations=300, n_points=3000)
 data
 
 # %%
-# Five volumes of the same ten views. `start=result` hands the cloud's own volume over.
+# Five volumes of the same ten views. `start=fit` hands the cloud's own volume over.
 
 volumes = {
     'FDK': lm.reconstruct(data.train, lm.FDK()),
     'SART': lm.reconstruct(data.train, lm.SART(niter=20)),
     'ASD-POCS': lm.reconstruct(data.train, lm.ASDPOCS(niter=20)),
-    'cloud': result,
-    'refined': lm.reconstruct(data.train, lm.Refined(niter=10, completed_niter=0), start=result),
+    'cloud': fit,
+    'refined': lm.reconstruct(data.train, lm.Refined(niter=10, completed_niter=0), start=fit),
 }
 
 fig, axes = plt.subplots(2, 3, figsize=(9, 6.6), layout='constrained')
 shown = {'truth': foot.data}
 for name, found in volumes.items():
-    numbers = found.metrics() if found is result else found.metrics(foot.data)
+    numbers = found.metrics() if found is fit else found.metrics(foot.data)
     shown[f'{name}, {numbers["psnr_3d"]:.1f} dB'] = np.asarray(found)
 for axis, (title, volume) in zip(axes.flat, shown.items()):
     axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())

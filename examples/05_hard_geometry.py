@@ -19,8 +19,7 @@ foot = lm.phantom('foot', size=64)
 count = 24
 angles = np.linspace(-2 * np.pi, 2 * np.pi, count, endpoint=False)
 scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(6, 6))
-grid = dict(nVoxel=foot.data.shape, dVoxel=foot.spacing)
-told = lm.Geometry.helix(**scanner, **grid, angles=angles, pitch=60)
+told = lm.Geometry.helix(**scanner, grid=foot.grid, angles=angles, pitch=60)
 told
 
 # %%
@@ -31,7 +30,7 @@ rng = np.random.default_rng(1)
 turns, shifts = rng.normal(0, 1, (count, 3)), rng.normal(0, 2, (count, 3))  # degrees, mm
 turns, shifts = turns - turns.mean(0), shifts - shifts.mean(0)
 moved = told.rays().moved(Rotation.from_rotvec(np.radians(turns)).as_matrix(), shifts)
-real = lm.Geometry.from_poses(moved, told.nDetector, **grid)
+real = lm.Geometry.from_poses(moved, told.nDetector, grid=foot.grid)
 measured = lm.simulate(foot, real)
 misled = lm.Dataset(lm.Scan(told, measured.train.projections), volume=foot.data)
 
@@ -47,7 +46,7 @@ fits = {
 }
 
 fig, axes = plt.subplots(2, 2, figsize=(8, 7), layout='constrained')
-volumes = {'truth': foot.data, **{name: result.volume() for name, result in fits.items()}}
+volumes = {'truth': foot.data, **{name: fit.volume() for name, fit in fits.items()}}
 for axis, (name, volume) in zip(axes.flat, volumes.items()):
     shown = axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
     title = name if name == 'truth' else f'{name}: {fits[name].metrics()["psnr_3d"]:.1f} dB'
@@ -56,8 +55,8 @@ fig.colorbar(shown, ax=axes, label='density [1/mm]')
 
 # %%
 # Correction wins back more than half of what the wrong poses cost. The misfit in the measured views says so without the truth:
-# `result.render()` renders the views of `result.geometry`, which holds the poses as the fit has corrected them.
+# `fit.render()` renders the views of `fit.geometry`, which holds the poses as the fit has corrected them.
 
-for name, result in fits.items():
-    rms = np.sqrt(np.mean((result.render() - measured.train.projections) ** 2))
+for name, fit in fits.items():
+    rms = np.sqrt(np.mean((fit.render() - measured.train.projections) ** 2))
     print(f'{name:10s} rms misfit of line integrals {rms:.3f}')

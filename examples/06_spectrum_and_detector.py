@@ -37,6 +37,6 @@ axes[1, 1].legend(loc='center right', fontsize='small')
 # %%
 # Where the spectrum is ignored, metal comes out too thin, in its middle most ("cupping"), and the hole is not empty.
 
-for name, result in fits.items():
-    error = result.volume() - data.volume
+for name, fit in fits.items():
+    error = fit.volume() - data.volume
     print(f'{name:7s} rms error of the density {np.sqrt(np.mean(error**2)):.2e} 1/mm')

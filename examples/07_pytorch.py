@@ -19,9 +19,7 @@ device = 'cuda' if torch.cuda.is_available() else 'cpu'
 lm.use_variant('cuda_ad_mono' if device == 'cuda' else 'llvm_ad_mono')
 foot = lm.phantom('foot', size=48)
 angles = np.linspace(0, np.pi, 12, endpoint=False)
-geometry = lm.Geometry.cone(
-    DSO=1000, DSD=1500, nDetector=(72, 72), dDetector=(8, 8), nVoxel=foot.data.shape, dVoxel=foot.spacing, angles=angles
-)
+geometry = lm.Geometry.cone(DSO=1000, DSD=1500, nDetector=(72, 72), dDetector=(8, 8), grid=foot.grid, angles=angles)
 target = torch.as_tensor(lm.simulate(foot, geometry).train.projections, device=device)
 
 # %%

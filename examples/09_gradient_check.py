@@ -26,9 +26,7 @@ cloud = [
     rng.normal(size=(count, 4)),  # quaternions, any length
     rng.uniform(0.01, 0.1, count),  # densities
 ]
-geometry = lm.Geometry.cone(
-    DSO=200, DSD=300, nDetector=(64, 64), dDetector=(2, 2), nVoxel=(32,) * 3, dVoxel=(3,) * 3, angles=[0.3]
-)
+geometry = lm.Geometry.cone(DSO=200, DSD=300, nDetector=(64, 64), dDetector=(2, 2), grid=lm.Grid(32, 3), angles=[0.3])
 weights = rng.normal(size=(1, 64, 64)).astype(np.float32)
 leaves = [mi.TensorXf(x.astype(np.float32)) for x in cloud]
 dr.enable_grad(*leaves)

@@ -25,7 +25,7 @@ cloud = (
     rng.uniform(0.1, 1, count),
 )
 geometry = lm.Geometry.cone(
-    DSO=1000, DSD=1500, nDetector=(512, 512), dDetector=(0.6, 0.6), nVoxel=(64,) * 3, dVoxel=(3,) * 3, angles=[0.0]
+    DSO=1000, DSD=1500, nDetector=(512, 512), dDetector=(0.6, 0.6), grid=lm.Grid(64, 3), angles=[0.0]
 )
 reference = lm.project(*cloud, geometry, extent=9.0)
 

@@ -3,13 +3,13 @@
     import lingo_mi as lm
 
     data = lm.simulate('x3d_foot', views=25)            # or lm.load('scan.pickle')
-    result = lm.fit(data, 'fast')
-    result.volume()                                     # [x, y, z], density per mm
-    result.render(data.test.geometry)                   # [view, v, u], line integrals
-    lm.reconstruct(data.train, lm.SART(niter=20), start=result)
-    images = lm.project(*result.gaussians, data.test.geometry)   # differentiable: NumPy, Dr.Jit, PyTorch, JAX
+    fit = lm.fit(data, lm.LINGO())                      # or lm.Fast(), lm.R2(), ...
+    fit.volume()                                        # [x, y, z], density per mm
+    fit.render(data.test.geometry)                      # [view, v, u], line integrals
+    lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
+    images = lm.project(*fit.gaussians, data.test.geometry, extent=fit.method.extent)   # NumPy, Dr.Jit, PyTorch, JAX
 
-The names below are loaded on first use, and choose a variant of Mitsuba where none is active. `import lingo_mi` and
+The names below are loaded on first use, and choose a variant of Mitsuba if none is active. `import lingo_mi` and
 `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba.
 """
 
@@ -29,84 +29,77 @@ watch_variants()
 
 __version__ = '0.2.0.dev0'
 
-__all__ = [  # noqa: RUF022 - in the order of their use
-    'simulate',
-    'load',
-    'load_raw',
-    'phantom',
-    'calibrate',
-    'Calibration',
-    'Geometry',
-    'circular',
-    'Scan',
-    'Dataset',
-    'fit',
-    'Settings',
-    'Result',
-    'Gaussians',
-    'load_result',
-    'reconstruct',
-    'Reconstruction',
-    'FDK',
-    'SART',
-    'OSSART',
-    'SIRT',
-    'CGLS',
-    'ASDPOCS',
-    'Refined',
-    'Best',
-    'project',
-    'voxelize',
-    'use_variant',
-    'InputError',
-]
-
-if TYPE_CHECKING:
-    from lingo_mi.api.calibration import Calibration, calibrate
+if TYPE_CHECKING:  # editors read these in the place of the table below
+    from lingo_mi.api.calibration import calibrate
     from lingo_mi.api.data import load, load_raw, phantom, simulate
     from lingo_mi.api.fitting import fit
-    from lingo_mi.api.result import Gaussians, Result, load_result
     from lingo_mi.api.volumes import reconstruct
+    from lingo_mi.calibration.calibration import Calibration
     from lingo_mi.common.errors import InputError
     from lingo_mi.common.runtime import use_variant
-    from lingo_mi.fitting.settings import Settings
+    from lingo_mi.fitting.field.options import Field
+    from lingo_mi.fitting.fit import Fit, load_fit
+    from lingo_mi.fitting.fitted_model import Gaussians
+    from lingo_mi.fitting.method import Method
+    from lingo_mi.fitting.methods.densities import DensityMethod
+    from lingo_mi.fitting.methods.fast import Fast
+    from lingo_mi.fitting.methods.lingo import LINGO
+    from lingo_mi.fitting.methods.naf import NAF
+    from lingo_mi.fitting.methods.r2 import R2
+    from lingo_mi.fitting.methods.splatting import GaussianSplatting, XGaussian
+    from lingo_mi.fitting.options.bounds import ScaleBounds
+    from lingo_mi.fitting.options.corrections import Corrections
+    from lingo_mi.fitting.options.densification import Clone, CloneOpacities, Halve
+    from lingo_mi.fitting.options.loss import ImageLoss, Loss
+    from lingo_mi.fitting.options.rates import DensityRates, FieldRates, OpacityRates
+    from lingo_mi.fitting.options.stopping import Stopping
+    from lingo_mi.fitting.start.edges import EdgeStart
+    from lingo_mi.fitting.start.fdk import FDKStart
+    from lingo_mi.fitting.start.masks import MaskStart
+    from lingo_mi.fitting.start.start import Start, StartingCloud
+    from lingo_mi.fitting.start.uniform import CuboidStart, RandomStart
     from lingo_mi.functional import project, voxelize
-    from lingo_mi.geometry import Geometry, circular
+    from lingo_mi.geometry import Geometry, Grid, circular
     from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
     from lingo_mi.scan import Dataset, Scan
 
-# Name -> the module that defines it.
-_PUBLIC = {
-    'simulate': 'lingo_mi.api.data',
-    'load': 'lingo_mi.api.data',
-    'load_raw': 'lingo_mi.api.data',
-    'phantom': 'lingo_mi.api.data',
-    'calibrate': 'lingo_mi.api.calibration',
-    'Calibration': 'lingo_mi.api.calibration',
-    'Geometry': 'lingo_mi.geometry',
-    'circular': 'lingo_mi.geometry',
-    'Scan': 'lingo_mi.scan',
-    'Dataset': 'lingo_mi.scan',
-    'fit': 'lingo_mi.api.fitting',
-    'Settings': 'lingo_mi.fitting.settings',
-    'Result': 'lingo_mi.api.result',
-    'Gaussians': 'lingo_mi.api.result',
-    'load_result': 'lingo_mi.api.result',
-    'reconstruct': 'lingo_mi.api.volumes',
-    'Reconstruction': 'lingo_mi.reconstruction',
-    'FDK': 'lingo_mi.reconstruction',
-    'SART': 'lingo_mi.reconstruction',
-    'OSSART': 'lingo_mi.reconstruction',
-    'SIRT': 'lingo_mi.reconstruction',
-    'CGLS': 'lingo_mi.reconstruction',
-    'ASDPOCS': 'lingo_mi.reconstruction',
-    'Refined': 'lingo_mi.reconstruction',
-    'Best': 'lingo_mi.reconstruction',
-    'project': 'lingo_mi.functional',
-    'voxelize': 'lingo_mi.functional',
-    'use_variant': 'lingo_mi.common.runtime',
-    'InputError': 'lingo_mi.common.errors',
+# Module -> the public names that it defines, in the order of their use.
+_MODULES = {
+    'api.data': 'simulate load load_raw phantom',
+    'api.calibration': 'calibrate',
+    'calibration.calibration': 'Calibration',
+    'geometry': 'Geometry Grid circular',
+    'scan': 'Scan Dataset',
+    'api.fitting': 'fit',
+    'fitting.methods.lingo': 'LINGO',
+    'fitting.methods.fast': 'Fast',
+    'fitting.methods.r2': 'R2',
+    'fitting.methods.splatting': 'GaussianSplatting XGaussian',
+    'fitting.methods.naf': 'NAF',
+    'fitting.methods.densities': 'DensityMethod',
+    'fitting.method': 'Method',
+    'fitting.start.start': 'Start StartingCloud',
+    'fitting.start.masks': 'MaskStart',
+    'fitting.start.edges': 'EdgeStart',
+    'fitting.start.fdk': 'FDKStart',
+    'fitting.start.uniform': 'RandomStart CuboidStart',
+    'fitting.options.loss': 'Loss ImageLoss',
+    'fitting.options.rates': 'DensityRates OpacityRates FieldRates',
+    'fitting.options.densification': 'Clone Halve CloneOpacities',
+    'fitting.options.corrections': 'Corrections',
+    'fitting.options.stopping': 'Stopping',
+    'fitting.options.bounds': 'ScaleBounds',
+    'fitting.field.options': 'Field',
+    'fitting.fit': 'Fit load_fit',
+    'fitting.fitted_model': 'Gaussians',
+    'api.volumes': 'reconstruct',
+    'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS Refined Best',
+    'functional': 'project voxelize',
+    'common.runtime': 'use_variant',
+    'common.errors': 'InputError',
 }
+_PUBLIC = {name: f'lingo_mi.{module}' for module, names in _MODULES.items() for name in names.split()}
+__all__ = list(_PUBLIC)
 
 
 def __getattr__(name: str):

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.geometry.rays import Index, checked_views
+
+
+class PixelEffects(Protocol):
+    """What a scan needs of its effects, whose class `effects.forward.Effects` is in a package above this one."""
+
+    def masked(self, scan: Scan) -> Scan:
+        """The scan with dead pixels invalid."""
+        ...
+
+    def binned(self, pixels: int) -> Any:
+        """The same effects on a panel of which that many pixels became one."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +49,7 @@ class Scan:
     valid: np.ndarray | None = None
 
     __repr__ = short_repr
-    effects: Any = None  # `Effects` is in a package above this one
+    effects: PixelEffects | None = None
 
     def _repr_html_(self) -> str:
         """For a notebook: the projections with a slider, and the scanner."""
@@ -103,10 +115,14 @@ class Scan:
         effects = self.effects and self.effects.binned(by[0] * by[1])
         return replace(self, geometry=geometry, projections=p, valid=valid, effects=effects)
 
+    def on(self, grid: Grid) -> Scan:
+        """The same scan with other voxels."""
+        return replace(self, geometry=self.geometry.on(grid))
+
     def digest(self) -> str:
         """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""
         geometry, rays = self.geometry, self.geometry.rays()
-        numbers = geometry.nVoxel, geometry.dVoxel, geometry.offOrigin, geometry.nDetector
+        numbers = geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre, geometry.nDetector
         found = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
         for array in (rays.source, rays.corner, rays.u, rays.v, self.projections, self.valid):
             found.update(b'' if array is None else np.ascontiguousarray(array).data)
@@ -115,7 +131,7 @@ class Scan:
     @property
     def normalised(self) -> np.ndarray:
         """Line integrals in the normalised frame, float32 [view, v, u]."""
-        return self.projections * np.float32(self.geometry.scale)
+        return self.projections * np.float32(self.geometry.grid.scale)
 
 
 def require_finite(projections: np.ndarray) -> None:
@@ -162,5 +178,5 @@ class Dataset:
         if self.test is not None and len(self.test):
             parts.append(self.test._views(f'Held out: {len(self.test)} views'))
         if self.volume is not None and self.volume.ndim == 3:
-            parts.append('<br>' + notebook.slices(self.volume, geometry.dVoxel, geometry.offOrigin))
+            parts.append('<br>' + notebook.slices(self.volume, geometry.grid.spacing, geometry.grid.centre))
         return notebook.box('Dataset', *parts) + geometry._repr_html_()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -11,7 +10,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Dataset
 from lingo_mi.scene.data_files import data_file
@@ -120,8 +119,8 @@ class CTScanner(mi.Sensor):
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
             np.linalg.norm(rays.corner[self.index])
-            + np.linalg.norm(self.geometry.offOrigin)
-            + np.linalg.norm(self.geometry.sVoxel)
+            + np.linalg.norm(self.geometry.grid.centre)
+            + np.linalg.norm(self.geometry.grid.size)
         )
 
     @staticmethod
@@ -132,7 +131,7 @@ class CTScanner(mi.Sensor):
             return found
 
         def on_grid(scan):
-            return replace(scan, geometry=own_grid(props, scan.geometry))
+            return scan.on(own_grid(props, scan.geometry.grid))
 
         return Dataset(on_grid(found.train), found.test and on_grid(found.test))
 
@@ -184,8 +183,8 @@ class CTScanner(mi.Sensor):
         way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if circle else 'a pose a view'
         return (
             f'CTScanner[\n  mode = {g.mode}, {way},\n  nDetector = {g.nDetector}, '
-            f'dDetector = {g.dDetector},\n  nVoxel = {g.nVoxel}, '
-            f'dVoxel = {g.dVoxel}, offOrigin = {g.offOrigin},\n  views = {len(g)}, view = {self.index}\n]'
+            f'dDetector = {g.dDetector},\n  nVoxel = {g.grid.shape}, '
+            f'dVoxel = {g.grid.spacing}, offOrigin = {g.grid.centre},\n  views = {len(g)}, view = {self.index}\n]'
         )
 
 

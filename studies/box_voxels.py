@@ -1,7 +1,7 @@
 """A scene's scan with voxels that are (nearly) boxes of constant density, as a file of X3D's kind.
 
     python -m lingo_mi.studies.box_voxels x3d_aneurism aneurism_boxes.pickle
-    lingo-mi fit x3d_aneurism --projections aneurism_boxes.pickle --recipe r2
+    lingo-mi fit x3d_aneurism --projections aneurism_boxes.pickle --method r2
 
 X3D's views are made by TIGRE's default projector, Siddon's, which takes a voxel for a box. Those of this package are exact for
 the trilinear interpolant of voxels. Here every voxel is cut into --cut pieces a side of its own density, whose interpolant is
@@ -37,9 +37,9 @@ def with_boxes(dataset: Dataset, cut: int = 2) -> Dataset:
         fine = np.repeat(fine, cut, axis)
 
     def scanned(scan: Scan) -> Scan:
-        pieces = scan.geometry.with_volume(fine.shape, tuple(side / cut for side in scan.geometry.dVoxel))
+        pieces = scan.geometry.on(scan.geometry.grid.finer(cut))
         with Progress('Scan of boxes', len(scan)) as bar:
-            return replace(scan, projections=grid.project(fine, pieces, lambda done, _: bar.update(done)))
+            return replace(scan, projections=grid.project_volume(fine, pieces, lambda done, _: bar.update(done)))
 
     return Dataset(scanned(dataset.train), dataset.test and scanned(dataset.test), dataset.volume)
 

@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.api.calibration import Calibration, calibrate
+from lingo_mi.api.calibration import calibrate
 from lingo_mi.api.fitting import fit
+from lingo_mi.calibration.calibration import Calibration
 from lingo_mi.calibration.drift import Drift
 from lingo_mi.projectors import grid
 from lingo_mi.raw.line_integrals import photons_of_images
-from lingo_mi.reconstruction import ASDPOCS, OSSART, reconstruct
+from lingo_mi.reconstruction import ASDPOCS, OSSART, run_algorithm
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.storage.file_access import replacing, write_text
 from lingo_mi.studies.cell_files import CellFiles
@@ -71,10 +72,8 @@ def binned(dataset: Dataset, factor: int) -> Dataset:
         return dataset
 
     def of(scan):
-        g = scan.geometry
-        count = [max(1, n // factor) for n in g.nVoxel]
-        step = [s / n for s, n in zip(g.sVoxel, count)]
-        return replace(scan.binned(factor), geometry=scan.binned(factor).geometry.with_volume(count, step))
+        grid = scan.geometry.grid
+        return scan.binned(factor).on(grid.resized([max(1, n // factor) for n in grid.shape]))
 
     return Dataset(of(dataset.train), of(dataset.test))
 
@@ -97,7 +96,7 @@ def rows(
 
 
 def cloud_rows(
-    dataset: Dataset, folder: Path, progress: Callable[[str], None] = print, **settings
+    dataset: Dataset, folder: Path, progress: Callable[[str], None] = print, **options
 ) -> Iterable[Explained]:
     """Rows of fits that find the corrections with the cloud, stored below `folder`."""
     test, stored = dataset.test, _Stored(folder, 'with_the_cloud', dataset)
@@ -105,11 +104,11 @@ def cloud_rows(
 
     def fitted(name, changes):
         result = fit(dataset.train, 'fast', progress=False, **changes)
-        return _row(name, test, result.fitted.expected(test.geometry))
+        return _row(name, test, result.expected(test.geometry))
 
     for name, changes in WITH_CLOUD.items():
         progress(name)
-        chosen = settings | changes
+        chosen = options | changes
         yield stored.row(name, chosen, lambda: fitted(name, chosen))
 
 
@@ -133,7 +132,7 @@ def find(dataset: Dataset, kinds: Iterable[str]) -> Calibration:
         air='air' in asked,
         gain='gain' in asked,
         curve=int('curve' in asked),
-        scatter='scatter' in asked and dataset.train.geometry.nVoxel[2] > 1,
+        scatter='scatter' in asked and dataset.train.geometry.grid.shape[2] > 1,
     )
 
 
@@ -146,7 +145,7 @@ class _Stored:
         self.scans = f'{dataset.train.digest()} {dataset.test.digest()}'
 
     def row(self, name: str, made_with: dict, compute: Callable[[], Explained]) -> Explained:
-        """The row of this name, computed unless it is stored and was made with these numbers or settings."""
+        """The row of this name, computed unless it is stored and was made with these numbers or options."""
         of, place = f'{self.scans} {json.dumps(made_with)}', name.replace(' ', '_')
         found: dict[str, Any] | None = self.cells.get(self.table, place)
         if found is None or found['of'] != of:
@@ -166,8 +165,8 @@ def _with(calibration, numbers):
 
 def _judged(name, dataset, calibration):
     corrected = calibration.corrected(dataset)
-    volume = reconstruct(corrected.train, ASDPOCS()).volume
-    expected = grid.project(volume, corrected.test.geometry)
+    volume = run_algorithm(corrected.train, ASDPOCS()).volume
+    expected = grid.project_volume(volume, corrected.test.geometry)
     if calibration.found.response is not None:
         expected = calibration.found.response.applied(expected, dataset.test.geometry)
     return _row(name, dataset.test, expected)
@@ -186,8 +185,8 @@ def _ideal(dataset):
     valid = np.concatenate([np.ones(s.projections.shape, bool) if s.valid is None else s.valid for s in scans])
     every = Scan(g.joined(dataset.test.geometry), np.concatenate([s.projections for s in scans]), valid)
     order = np.argsort(every.geometry.angles)
-    volume = reconstruct(every.subset(order), OSSART(niter=10, blocksize=4)).volume
-    p = grid.project(volume, every.geometry)
+    volume = run_algorithm(every.subset(order), OSSART(niter=10, blocksize=4)).volume
+    p = grid.project_volume(volume, every.geometry)
     photons = photons_of_images(every.projections, every.valid)
     if np.isfinite(photons):
         rng = np.random.default_rng(0)

@@ -1,6 +1,6 @@
 """What an early stop and weights of the pixels are worth to a fit of noisy projections.
 
-A cell is one fit of one scan by the recipe `fast`: a JSON file, written atomically. A stored cell is not computed again.
+A cell is one fit of one scan by `Fast`: a JSON file, written atomically. A stored cell is not computed again.
 
     study = Study(Path('out/noise'))
     study.compute_missing([Case('foot', photons=1000)])
@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting.initial import initial_cloud
-from lingo_mi.fitting.loop import run as fit
-from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.scan import Scan
 from lingo_mi.studies.cell_files import CellFiles
@@ -60,14 +59,14 @@ class Study:
     iterations   steps of a fit, at most
     """
 
-    def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = FAST.iterations):
+    def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = Fast.iterations):
         self.size, self.pixels, self.iterations = size, pixels, iterations
         self.cells = CellFiles(folder, 'steps', 'psnr_3d')
         self.dataset = functools.lru_cache(1)(self._dataset)
 
     def name(self, case: Case) -> str:
         scan = f'{case.object}_{self.size}_{self.pixels}_x{case.finer}_{case.views}_views_{case.photons:.17g}_photons'
-        steps = '' if self.iterations == FAST.iterations else f'_{self.iterations}_steps'
+        steps = '' if self.iterations == Fast.iterations else f'_{self.iterations}_steps'
         return f'{scan}{steps}'
 
     def get(self, case: Case, setting: str) -> dict | None:
@@ -88,14 +87,13 @@ class Study:
 
     def _compute(self, case: Case, setting: str) -> dict:
         scan, truth = self.dataset(case)
-        settings = FAST.changed(iterations=self.iterations, **SETTINGS[setting])
+        method = Fast().changed(iterations=self.iterations, **SETTINGS[setting])
 
-        def measure(model, state):
-            return dict(psnr_3d=psnr_3d(model.volume(state), truth))
+        def measure(fit):
+            return dict(psnr_3d=psnr_3d(fit.volume(), truth))
 
         began = time.process_time()
-        cloud = initial_cloud(scan, settings)
-        fitted = fit(scan, settings, cloud, 0, measure, at=range(EVERY, self.iterations + 1, EVERY))
+        fitted = run(scan, method, measure=measure, at=range(EVERY, self.iterations + 1, EVERY))
         return dict(
             asdict(case),
             setting=setting,

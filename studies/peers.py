@@ -26,16 +26,15 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import parse
 from lingo_mi.common.runtime import cores
-from lingo_mi.completion.prepare import sampled
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run as fit
-from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
-from lingo_mi.reconstruction.held_out import split
+from lingo_mi.reconstruction.held_out import split_views
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.storage.file_access import replacing, write_text
@@ -49,12 +48,12 @@ ACROSS = 5  # slices side by side in the picture
 
 def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
     """A function that samples a fitted cloud."""
-    return sampled(fit(scan, FAST, initial_cloud(scan, FAST, 0), 0))
+    return fit(scan, Fast()).volume
 
 
 def _refined(scan: Scan) -> np.ndarray:
     """For objects finer than the voxels, as measured ones are (docs/how_to/few_views.md)."""
-    return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=_cloud(scan)).volume
+    return run_algorithm(scan, Refined(finer=2, completed_niter=0, niter=4), sample=_cloud(scan)).volume
 
 
 def _itk() -> Any:
@@ -75,7 +74,7 @@ def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
 
 def _wrong(volume: np.ndarray, held_out: Scan) -> float:
     """Root mean square error of a volume's projections over the valid pixels of views."""
-    wrong = (grid.project(volume, held_out.geometry) - held_out.projections).astype(float)
+    wrong = (grid.project_volume(volume, held_out.geometry) - held_out.projections).astype(float)
     return float(np.sqrt(np.mean(np.square(wrong if held_out.valid is None else wrong[held_out.valid]))))
 
 
@@ -106,7 +105,7 @@ class Method:
             return self.volume(scan), {}
         value = self.values[0]
         if len(self.values) > 1:
-            kept, held_out = split(scan, 5)
+            kept, held_out = split_views(scan, 5)
             value = min(self.values, key=lambda value: self._miss(kept, value, held_out))
         return self.volume(scan, value), {self.setting: value}
 
@@ -116,14 +115,14 @@ class Method:
 
 
 METHODS = {
-    'fdk': Method('FDK', lambda scan: FDK().run(scan).volume),
-    'sart': Method('SART', lambda scan: SART().run(scan).volume),
-    'asd-pocs': Method('ASD-POCS', lambda scan: ASDPOCS().run(scan).volume),
+    'fdk': Method('FDK', lambda scan: run_algorithm(scan, FDK()).volume),
+    'sart': Method('SART', lambda scan: run_algorithm(scan, SART()).volume),
+    'asd-pocs': Method('ASD-POCS', lambda scan: run_algorithm(scan, ASDPOCS()).volume),
     'rtk-tv': Method('RTK, total variation', _rtk_tv, 'beta', (1.0, 3.0, 10.0, 30.0)),
     'mbirjax': Method('MBIRJAX', _qggmrf, 'sharpness', (0.0, 1.0, 2.0, 3.0)),
     'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
     'refined': Method('`fast`, then `refined`, `finer=2`', _refined),
-    'best': Method('`best`', lambda scan: Best().run(scan).volume),
+    'best': Method('`best`', lambda scan: run_algorithm(scan, Best()).volume),
 }
 NEEDS = {
     'rtk-tv': (_itk, "RTK: pip install -e '.[reference]'"),
@@ -223,7 +222,7 @@ class Study:
             return self.dataset.volume
         path = self.folder / f'{REFERENCE}.nii.gz'
         if not path.exists():
-            FDK().run(self.dataset.train).save(path)
+            run_algorithm(self.dataset.train, FDK()).save(path)
         return read_volume(path).data
 
     def _compute(self, chosen: Dataset, method: str) -> dict:
@@ -231,7 +230,7 @@ class Study:
         began, processor = time.perf_counter(), time.process_time()
         volume, settings = method_of(method).run(chosen.train)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
-        Reconstruction(volume, [], seconds, chosen.train.geometry).save(
+        Reconstruction(volume, [], seconds, chosen.train.geometry.grid).save(
             self._volume_path(_case(len(chosen.train)), method), force=True
         )
         return dict(

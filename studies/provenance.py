@@ -11,7 +11,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from lingo_mi.results.save import versions
+from lingo_mi.fitting.save import versions
 from lingo_mi.storage.file_access import replacing
 
 ROOT = Path(str(resources.files('lingo_mi'))).resolve().parent  # of the checkout, or site-packages

@@ -1,10 +1,10 @@
-"""Comparison of recipes: quality of fits against time for some scenes, as curves and as a Markdown table.
+"""Comparison of methods: quality of fits against time for some scenes, as curves and as a Markdown table.
 
-Each fit is a separate process, `lingo-mi fit`, in a folder named after its settings. A fit with a result is not run again; an
+Each fit is a separate process, `lingo-mi fit`, in a folder named after its options. A fit with a result is not run again; an
 interrupted one continues.
 
     comparison = Comparison(Path('out/recipes'), views=25, iterations=5000)
-    results = comparison.results(['x3d_foot'], ['fast', 'r2:V_S=1'])
+    results = comparison.results(['x3d_foot'], ['fast', 'lingo:V_S=1'])
     print(table(results))
     draw(results, Path('out/recipes/recipes.png'))
 """
@@ -22,8 +22,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting.recipes import changes_of, settings_of
-from lingo_mi.metrics.quality import current_names
+from lingo_mi.fitting.methods.by_name import changes_of, method_of
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.file_access import read_object, replacing, write_text
 
@@ -40,7 +39,7 @@ COLUMNS = dict(
     ipsd_targets=('born', '{:,}'),
     gaussians=('Gaussians', '{:,}'),
     iterations=('iterations', '{}'),
-    seconds_init=('init, s', '{:.1f}'),
+    seconds_init=('start, s', '{:.1f}'),
     seconds_fit=('fit, s', '{:.0f}'),
 )
 
@@ -54,7 +53,7 @@ class Comparison:
     folder       of their folders
     views        fitted
     iterations   of all methods but `fast`, which keeps its own number, and those that name it themselves
-    changes      'name=value', settings of every fit or parameters of its scene
+    changes      'name=value', options of every fit or parameters of its scene
     """
 
     folder: Path
@@ -66,13 +65,13 @@ class Comparison:
         """The metrics of all fits; those that are missing are run first.
 
         scenes    files of scenes, or names of shipped ones
-        methods   names of METHODS, or `name:setting=value,...`
+        methods   names of METHODS, or `name:option=value,...`
 
         Raises InputError for an unknown method, before any fit, and where a fit fails.
         """
         methods = list(methods)
         for method in methods:
-            settings_of(method)
+            method_of(method)
         scenes = list(scenes)
         names = [Path(scene).stem for scene in scenes]
         if twice := [name for name in names if names.count(name) > 1]:
@@ -88,9 +87,8 @@ class Comparison:
                 command.append('--resume')
             print(' '.join(command), file=sys.stderr)
             if code := run_command(command):
-                raise InputError(f'{scene}: lingo-mi fit --recipe {method} failed with exit code {code}')
-        found = current_names(read_object(folder / 'metrics.json'))
-        return found | dict(history=[current_names(entry) for entry in found['history']])
+                raise InputError(f'{scene}: lingo-mi fit --method {method} failed with exit code {code}')
+        return read_object(folder / 'metrics.json')
 
     def _require_same_scene(self, folder: Path, scene: PathLike | str) -> None:
         try:
@@ -116,7 +114,7 @@ class Comparison:
             title = title[:LONGEST] + '_' + hashlib.sha256(title.encode()).hexdigest()[:12]
         folder = self.folder / title
         program = [sys.executable, '-m', 'lingo_mi', 'fit', str(scene)]
-        options = ['--recipe', name, '--views', str(self.views), '--out', str(folder)]
+        options = ['--method', name, '--views', str(self.views), '--out', str(folder)]
         return folder, program + options + [word for change in changes for word in ('-D', change)]
 
 

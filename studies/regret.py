@@ -20,16 +20,17 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import spearmanr
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.completion.prepare import fit_cloud, sampled
+from lingo_mi.completion.prepare import fit_cloud
 from lingo_mi.completion.views import insert_views
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.loop import run as fit
-from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.methods.fast import Fast
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
 from lingo_mi.reconstruction.best import SPREAD, START, refine
 from lingo_mi.reconstruction.refined import means
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
@@ -100,7 +101,7 @@ class Study:
             self._cloud(case)  # not in this setting's time, but in its sum
         began, extra = time.process_time(), {}
         if setting in (BEST, BEST_CLOUD):
-            found = Best(cloud=setting == BEST_CLOUD).run(dataset.train, fit=fit_cloud)
+            found = run_algorithm(dataset.train, Best(cloud=setting == BEST_CLOUD), fit=fit_cloud)
             volume = found.volume
             wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
             assert found.error is not None
@@ -117,25 +118,24 @@ class Study:
 
     def _volume(self, case: Case, scan: Scan, setting: str) -> np.ndarray:
         if setting == 'asd-pocs':
-            return ASDPOCS().run(scan).volume
+            return run_algorithm(scan, ASDPOCS()).volume
         if setting in VOXELS:
             finer = 2 if setting == 'refined_finer' else 1
-            start = ASDPOCS(niter=START).run(scan).volume
+            start = run_algorithm(scan, ASDPOCS(niter=START)).volume
             return means(refine(scan, start, Best.niter, finer).volume, finer)
         cloud = self._cloud(case)[0]
-        sample = sampled(cloud)
         if setting == 'cloud':
-            return sample(scan.geometry)
+            return cloud.volume()
         if setting == 'cloud_finer':
-            return Refined(finer=2, completed_niter=0, niter=4).run(scan, sample=sample).volume
+            return run_algorithm(scan, Refined(finer=2, completed_niter=0, niter=4), sample=cloud.volume).volume
         completed = insert_views(scan, max(COMPLETED, len(scan)), cloud.render)
         if setting == 'completed':
-            return ASDPOCS(niter=10).run(completed).volume
-        return Refined().run(scan, sample=sample, completed=completed).volume
+            return run_algorithm(completed, ASDPOCS(niter=10)).volume
+        return run_algorithm(scan, Refined(), sample=cloud.volume, completed=completed).volume
 
-    def _fitted(self, case: Case) -> tuple[Fitted, float]:
+    def _fitted(self, case: Case) -> tuple[Fit, float]:
         began, scan = time.process_time(), self.dataset(case).train
-        return fit(scan, FAST, initial_cloud(scan, FAST, 0), 0), time.process_time() - began
+        return fit(scan, Fast()), time.process_time() - began
 
     def _dataset(self, case: Case) -> Dataset:
         if case.object in MEASURED:
@@ -157,11 +157,11 @@ class Study:
         every = load_scene(scene_path(case.object)).scanner.dataset
         assert every is not None  # it has no object
         train, whole = every.train, every.train.geometry
-        shape = [max(1, round(n * self.size / max(whole.nVoxel))) for n in whole.nVoxel]
+        shape = [max(1, round(n * self.size / max(whole.grid.shape))) for n in whole.grid.shape]
         train = train.binned(max(1, round(max(whole.nDetector) / (2 * self.size))))
-        spacing = [side / n for side, n in zip(whole.sVoxel, shape)]
-        train = replace(train, geometry=train.geometry.with_volume(shape, spacing))
-        return replace(choose_views(Dataset(train), case.views), volume=FDK().run(train).volume)
+        spacing = [side / n for side, n in zip(whole.grid.size, shape)]
+        train = train.on(Grid(shape, spacing, train.geometry.grid.centre))
+        return replace(choose_views(Dataset(train), case.views), volume=run_algorithm(train, FDK()).volume)
 
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds.

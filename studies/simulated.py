@@ -25,9 +25,9 @@ def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tupl
     thing = load_object(name, size * finer)
     truth = averaged(thing, size)
     geometry = default_geometry(thing, circular(views), pixels)
-    line_integrals = grid.project(thing.data, geometry)
+    line_integrals = grid.project_volume(thing.data, geometry)
     unit = np.float32(LARGEST / line_integrals.max())
-    return geometry.with_volume(truth.data.shape, truth.spacing), line_integrals * unit, truth.data * unit
+    return geometry.on(truth.grid), line_integrals * unit, truth.data * unit
 
 
 def counting(photons: float, electronic_noise: float = 0.0) -> Detector:

@@ -1,11 +1,14 @@
 """What an installation holds: every module, plugin, study and scene of the checkout."""
 
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import lingo_mi
 
 ROOT = Path(__file__).parents[1]
 PLACES = {
@@ -54,3 +57,14 @@ def test_an_installation_holds_every_file(built):
 
 def test_neither_tests_nor_scripts_are_installed(built):
     assert [path.name for path in built.iterdir()] == ['lingo_mi']
+
+
+def test_import_from_the_folder_that_holds_the_clone(tmp_path):
+    """The clone's folder, which has the package's name, is no package: Python must go on to the path of the installation."""
+    (tmp_path / 'lingo_mi').symlink_to(ROOT)
+    code = 'import lingo_mi, lingo_mi.plugins, lingo_mi.scenes; print(lingo_mi.__version__)'
+    environment = os.environ | {'PYTHONPATH': str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == lingo_mi.__version__

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 import yaml
 
-from helpers.fits import SHORT, error_of, geometry, some_points, tiny_scan
+from helpers.fits import SHORT, error_of, geometry, tiny_scan
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
-from lingo_mi.fitting.initial import initial_cloud
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.recipes import METHODS
-from lingo_mi.fitting.view_loss import Target
+from lingo_mi.fitting.measure import quick_measure
+from lingo_mi.fitting.methods.by_name import METHODS
+from lingo_mi.fitting.start.masks import MaskStart
+from lingo_mi.fitting.view_loss import MeasuredView
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.initialise import LingoSettings, initialise
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres
 from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -107,7 +108,7 @@ def test_files_keep_the_mask(tmp_path, scan):
 
 def test_filtered_backprojection_needs_every_pixel(scan):
     with pytest.raises(InputError, match='needs every pixel'):
-        FDK().run(Scan(scan.geometry, scan.projections, patches(scan)))
+        run_algorithm(Scan(scan.geometry, scan.projections, patches(scan)), FDK())
 
 
 # ---- the initial cloud -------------------------------------------------------------------------------------
@@ -134,19 +135,19 @@ def brute_force(frames, found, points, misses, outside):
 @pytest.mark.parametrize('misses', [0, 1])
 def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     g, valid = scan.geometry, patches(scan)
-    found = masks(spoilt(scan, valid, 1e9) * g.scale, 0.1, valid)
+    found = masks(spoilt(scan, valid, 1e9) * g.grid.scale, 0.1, valid)
     assert not (found.low | found.high)[~valid].any() and found.high[valid].any() and not found.high[valid].all()
-    expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.scale, 0.1)
+    expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.grid.scale, 0.1)
     assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
     frames, grid = g.normalised_rays(), (12, 12, 12)
-    low, high = valid_voxels(frames, found, grid, g.half, misses, outside)
-    np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.half), misses, outside))
-    assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.half, misses, outside)[0])
+    low, high = valid_voxels(frames, found, grid, g.grid.half, misses, outside)
+    np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.grid.half), misses, outside))
+    assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.grid.half, misses, outside)[0])
     # Blocks of cells are tested at once on large grids; they must not lose a cell behind an invalid pixel.
     large = (40, 40, 40)
-    whole = valid_voxels(frames, found, large, g.half, misses, outside)[0]
+    whole = valid_voxels(frames, found, large, g.grid.half, misses, outside)[0]
     sample = np.random.default_rng(0).choice(40**3, 300, replace=False)
-    expected = sample[brute_force(frames, found, voxel_centres(large, g.half, sample), misses, outside)]
+    expected = sample[brute_force(frames, found, voxel_centres(large, g.grid.half, sample), misses, outside)]
     np.testing.assert_array_equal(np.sort(expected), np.intersect1d(whole, sample))
 
 
@@ -156,13 +157,12 @@ def test_densities_come_from_valid_pixels(scan):
     for value in (0, 1e6):
 
         def render(points, density, spacing, views, value=value):
-            return spoilt(scan, valid, value)[views] * g.scale
+            return spoilt(scan, valid, value)[views] * g.grid.scale
 
         clouds.append(
-            initialise(
+            MaskStart(n_points=300).from_views(
                 # A Scan would forget what stands there.
-                SimpleNamespace(geometry=g, normalised=spoilt(scan, valid, value) * g.scale, valid=valid),
-                LingoSettings(n_points=300),
+                SimpleNamespace(geometry=g, normalised=spoilt(scan, valid, value) * g.grid.scale, valid=valid),
                 np.random.default_rng(0),
                 render,
             )
@@ -198,14 +198,13 @@ def test_truncated_scans_keep_what_the_panel_misses():
     g = narrow.geometry
 
     def cloud(outside):
-        settings = METHODS['lingo'].changed(outside=outside, n_points=400)
-        return initial_cloud(narrow, settings)
+        return METHODS['lingo'].changed(outside=outside, n_points=400).starting_cloud(narrow)
 
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         automatic = cloud('auto')
         literal = cloud('ignore')
-        whole = initial_cloud(wide, METHODS['lingo'].changed(outside='auto', n_points=400))
+        whole = METHODS['lingo'].changed(outside='auto', n_points=400).starting_cloud(wide)
     with pytest.warns(UserWarning, match='edge of the panel in 6 of 6 views'):
         strict = cloud('invalid')
     assert automatic.info['outside'] == 'ignore' and whole.info['outside'] == 'invalid'
@@ -218,58 +217,52 @@ def test_truncated_scans_keep_what_the_panel_misses():
 # ---- the fit -----------------------------------------------------------------------------------------------
 
 
-def kernels(scan, settings, start):
+def kernels(scan, method):
     """Hashes of the compiled kernels of a fit, in the order of their launches, traced in every step."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
         dr.kernel_history_clear()
-        run(scan, settings, start, seed=3)
+        run(scan, method, seed=3)
         return [k['hash'] for k in dr.kernel_history([dr.KernelType.JIT])]
 
 
 def test_without_a_mask_no_kernel_knows_of_masks(scan, monkeypatch):
-    settings, start = SHORT.changed(iterations=6, densify_from=100), some_points(scan.geometry)
+    method = SHORT.changed(iterations=6, densify_from=100)
     masked = Scan(scan.geometry, scan.projections, patches(scan))
-    plain, with_mask = kernels(scan, settings, start), kernels(masked, settings, start)
+    plain, with_mask = kernels(scan, method), kernels(masked, method)
     with monkeypatch.context() as patch:
-        patch.setattr(Target, 'masked', lambda self, image: image)
-        bare = kernels(scan, settings, start)
+        patch.setattr(MeasuredView, 'masked', lambda self, image: image)
+        bare = kernels(scan, method)
     assert plain == bare and len(plain) > 6
     assert set(with_mask) - set(plain)
     assert len(set(with_mask)) <= len(set(plain))  # one form for all views, whatever their masks
 
 
 def test_held_out_pixels_that_are_not_valid_do_not_count(scan):
-    from types import SimpleNamespace
-
-    from lingo_mi.results.measure import quick_measure
-
-    valid = patches(scan)
-    dataset = Dataset(scan, Scan(scan.geometry, scan.projections, valid))
+    dataset = Dataset(scan, Scan(scan.geometry, scan.projections, patches(scan)))
 
     def measured(value):
-        views = spoilt(scan, valid, value) * np.float32(1.01)
-        return quick_measure(dataset, 9)(SimpleNamespace(expected=lambda state, geometry: views), None)
+        views = spoilt(scan, patches(scan), value) * np.float32(1.01)
+        return quick_measure(SimpleNamespace(data=dataset, views=views))
 
     assert measured(0) == measured(1e6) and np.isfinite(measured(0)['psnr_2d'])
 
 
 def test_fit_of_a_spoilt_scan(scan):
     """With the mask, what is not valid leaves no trace in the fit; without it, it ruins the fit."""
-    valid, start = patches(scan), some_points(scan.geometry)
-    settings = SHORT.changed(iterations=150, densify_from=1000)
-    good = run(scan, settings, start, seed=3)
-    masked = run(Scan(scan.geometry, spoilt(scan, valid, 5 * scan.projections.max()), valid), settings, start, seed=3)
-    ruined = run(Scan(scan.geometry, spoilt(scan, valid, 0)), settings, start, seed=3)
+    valid, method = patches(scan), SHORT.changed(iterations=150, densify_from=1000)
+    good = run(scan, method, seed=3)
+    masked = run(Scan(scan.geometry, spoilt(scan, valid, 5 * scan.projections.max()), valid), method, seed=3)
+    ruined = run(Scan(scan.geometry, spoilt(scan, valid, 0)), method, seed=3)
     errors = [error_of(fitted, scan) for fitted in (good, masked, ruined)]
     assert errors[1] < 2 * errors[0] and errors[1] < errors[2] / 2
 
 
 def test_initial_cloud_of_a_masked_scan(scan):
     masked = Scan(scan.geometry, scan.projections, patches(scan))
-    cloud = initial_cloud(masked, METHODS['fast'].changed(n_points=300))
+    cloud = METHODS['fast'].changed(n_points=300).starting_cloud(masked)
     assert len(cloud) == 300 and (cloud.density > 0).all()
     with pytest.raises(InputError, match='needs every pixel'):
-        initial_cloud(masked, METHODS['r2'].changed(n_points=300))
+        METHODS['r2'].changed(n_points=300).starting_cloud(masked)
 
 
 def test_views_without_one_valid_pixel():
@@ -277,6 +270,5 @@ def test_views_without_one_valid_pixel():
     valid = np.ones(scan.projections.shape, bool)
     valid[1] = False
     blind = Scan(scan.geometry, scan.projections, valid)
-    cloud = initial_cloud(blind, METHODS['fast'].changed(n_points=200))
-    fitted = run(blind, SHORT.changed(iterations=8), cloud)
+    fitted = run(blind, SHORT.changed(start='edges', n_points=200, iterations=8))
     assert all(np.isfinite(v).all() for v in fitted.state.values.values())

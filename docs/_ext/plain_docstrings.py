@@ -7,16 +7,21 @@ What is plain in them, and what it becomes:
         code = example()          a block of code, where a paragraph is indented and is no list of names, or is Python
     |A x - b|, rate_*             characters of reStructuredText, which lose their meaning outside of `backticks`
 
-A docstring that holds directives or roles is reStructuredText already and stays as it is.
+A docstring that holds directives or roles is reStructuredText already and stays as it is. Sections in
+numpydoc's form may follow the plain text; `sphinx.ext.napoleon` reads them.
 """
 
 import ast
 import inspect
 import re
 
+from sphinx.ext.napoleon import Config, NumpyDocstring
+
+NUMPYDOC = Config(napoleon_use_ivar=True, napoleon_use_rtype=False)
 _NAME = r'`?[A-Za-z_|][\w.|/=\'-]*`?'
 ENTRY = re.compile(rf'^({_NAME}(?:, {_NAME})*)(?:(?:\s{{2,}}|\s+:\s+)(\S.*))?$')
 RST = re.compile(r'^\s*\.\. |:\w+:`|^:param|^:return', re.MULTILINE)
+SECTION = re.compile(r'^(?=[A-Z][\w ]*\n-{3,}$)', re.MULTILINE)  # before a title that is underlined
 QUOTED = re.compile(r'(``.+?``|`[^`\n]+`)')
 
 
@@ -25,8 +30,11 @@ def to_rst(text: str) -> str:
     text = inspect.cleandoc(text)
     if RST.search(text):
         return text
+    text, *sections = SECTION.split(text)
+    sections = [section if section.startswith('Examples') else escaped(section) for section in sections]
     blocks = [block for block in re.split(r'\n\s*\n', text) if block.strip()]
-    return '\n\n'.join(_block(block.splitlines()) for block in blocks) + '\n'
+    text = '\n\n'.join([*(_block(block.splitlines()) for block in blocks), *sections]) + '\n'
+    return str(NumpyDocstring(text, NUMPYDOC)) if sections else text
 
 
 def _block(lines: list[str]) -> str:

@@ -3,96 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
 
-import numpy as np
-
+from lingo_mi.calibration.calibration import Calibration
 from lingo_mi.calibration.order import order_faults
 from lingo_mi.calibration.response.response import Response
-from lingo_mi.calibration.search import Found, search
+from lingo_mi.calibration.search import search
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.common.parsing import whole
+from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
-from lingo_mi.geometry import Geometry
-from lingo_mi.reconstruction.effects_correction import linearised
+from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Dataset, Scan
 
 MOST_DEGREE, MOST_CURVE = 8, 3
-_TERMS = dict(
-    air='air level',
-    gain='gain over 1',
-    curve='curve, coefficients from the square on',
-    scatter='scatter over the open beam',
-)
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What `lm.calibrate` has found; `corrected` is the scan with it.
-
-    geometry    of the scan that was given
-    found       numbers, their standard errors, and how well views predict each other before and after
-    """
-
-    geometry: Geometry
-    found: Found
-
-    @property
-    def needed(self) -> bool:
-        """Whether anything was found that is taken."""
-        drift = self.found.drift
-        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._response is not None
-
-    @property
-    def _response(self) -> Response | None:
-        """The response, if any of its numbers was found."""
-        response = self.found.response
-        return response if response is not None and any(part.values.any() for part in response.parts) else None
-
-    def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
-        """The same views with the panel where it was found. Views that were held out get what was found for their time, which
-        their angles tell: the scan's views must be in the order in which they were taken.
-
-        Raises InputError for a scan by another scanner.
-        """
-        require_type('scan', scan, (Scan, Dataset))
-        if isinstance(scan, Dataset):
-            test = None if scan.test is None else self._moved(scan.test)
-            return replace(scan, train=self._moved(scan.train), test=test)
-        return self._moved(scan)
-
-    def _moved(self, scan: Scan) -> Scan:
-        if scan.geometry.mode != self.geometry.mode or scan.geometry.nDetector != self.geometry.nDetector:
-            raise InputError('this calibration is that of a scan by another scanner: calibrate this one')
-        if not self.needed:
-            return scan
-        response = self._response
-        if response is not None:
-            if scan.effects is not None:  # it was found on line integrals
-                scan = linearised(scan, scan.effects)
-            scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
-        return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
-
-    def lines(self) -> list[str]:
-        """What was found, in sentences."""
-        f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
-        told = []
-        for name, value in f.measured.items():
-            error, why = f.errors[name], f.refused.get(name)
-            if name == 'yaw':
-                text = f'panel turned in its plane by {np.degrees(value):+.3f} degrees +- {np.degrees(error):.3f}'
-            elif name[0] not in 'uv':
-                text = f'{_TERMS[name.rstrip("0123456789_")]} ({name}): {value:+.3g} +- {error:.2g}'
-            else:
-                what = 'shift' if len(name) == 1 else f'drift of order {name[1:]}'
-                pixels = value / pixel[name[0]]
-                text = f'{what} of the panel along {name[0]}: {value:+.4g} mm +- {error:.2g} ({pixels:+.3f} pixels)'
-            told.append(text + (f', not taken: {why}' if why else ''))
-        told.append(
-            f'views predict each other to {f.after:.4g} rms instead of {f.before:.4g} (line integrals, smoothed)'
-        )
-        return told
 
 
 @one_at_a_time()
@@ -131,16 +54,16 @@ def calibrate(
     """
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
-    drift = whole('drift', drift, 0)
+    drift = whole_number('drift', drift, 0)
     if drift > MOST_DEGREE:
         raise InputError(f'drift is the degree of a polynomial, 0 to {MOST_DEGREE}, not {drift}')
-    curve = whole('curve', curve, 0)
+    curve = whole_number('curve', curve, 0)
     if curve > MOST_CURVE:
         raise InputError(f'curve is a number of coefficients, 0 to {MOST_CURVE}, not {curve}')
     for name, value in dict(air=air, gain=gain, scatter=scatter).items():
         require_type(name, value, bool)
     train = scan.train if isinstance(scan, Dataset) else scan
-    measured = train if train.effects is None else linearised(train, train.effects)
+    measured = line_integrals(train)
     with Progress('Calibrate', 1, shown=progress) as bar:
 
         def report(done, total):
@@ -156,6 +79,6 @@ def calibrate(
             highest=max(float(measured.projections.max()), 1e-6),
         )
         calibration = Calibration(train.geometry, search(measured, drift, response, report))
-    for fault in order_faults(calibration._moved(measured)):
+    for fault in order_faults(calibration.corrected(measured)):
         warnings.warn(fault, stacklevel=2)
     return calibration

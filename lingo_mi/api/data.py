@@ -11,15 +11,15 @@ import numpy as np
 from lingo_mi.common import parsing
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.common.parsing import nearest, whole
+from lingo_mi.common.parsing import nearest, whole_number
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.phantoms import Phantom, make
+from lingo_mi.phantoms.x3d_scan import project_phantom
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
-from lingo_mi.phantoms.x3d_scan import simulate as project_phantom
 from lingo_mi.projectors import grid
 from lingo_mi.raw.importing import import_raw
 from lingo_mi.raw.options import Options
@@ -46,7 +46,7 @@ def simulate(
 
     source      a Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a
                 `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
-    geometry    for a phantom or a volume: the scanner. A volume must have `geometry.nVoxel` voxels. Without it, a phantom
+    geometry    for a phantom or a volume: the scanner. A volume must have `geometry.grid.shape` voxels. Without it, a phantom
                 is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out. On a grid
                 other than its own, a phantom is its voxels
     views       how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
@@ -67,7 +67,7 @@ def simulate(
     """
     ensure_variant()
     seed = parsing.seed(seed)
-    views = 0 if views is None else whole('views', views, 1)
+    views = 0 if views is None else whole_number('views', views, 1)
     for name, given in (('geometry', geometry), ('held_out', held_out)):
         if given is not None:
             require_type(name, given, Geometry, 'such as lm.Geometry.cone(...)')
@@ -88,8 +88,10 @@ def simulate(
     if geometry is None:
         raise InputError('a volume needs a scanner: give a geometry, such as lm.Geometry.cone(...)')
     volume = source.data if isinstance(source, Phantom) else as_numpy(source, 'the volume', np.float32)
-    if volume.shape != geometry.nVoxel:
-        raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    if volume.shape != geometry.grid.shape:
+        raise InputError(
+            f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.grid.shape}'
+        )
     if views:  # fails early
         spread(len(geometry), views)
     require_densities(volume)
@@ -104,7 +106,7 @@ def simulate(
         if isinstance(source, Phantom):
             projections = project_phantom(source, every, report)
         else:
-            projections = grid.project(volume, every, report)
+            projections = grid.project_volume(volume, every, report)
     scan = Scan(every, projections)
     if held_out is None:
         return choose_views(Dataset(scan, None, volume), views)
@@ -132,7 +134,7 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
             f'geometry must be the path of a geometry file, not {type(geometry).__name__}; '
             'with a Geometry, make the scan by lm.Scan(geometry, numpy.load(path))'
         )
-    views = 0 if views is None else whole('views', views, 1)
+    views = 0 if views is None else whole_number('views', views, 1)
     dataset = choose_views(read_scan(as_path('path', path), geometry), views)
     warn_if_truncated(dataset.train.geometry)
     return dataset

@@ -1,96 +1,142 @@
-"""Fitting a cloud of Gaussians to a scan in one call."""
+"""Fitting a scan in one call."""
 
 from __future__ import annotations
 
-import tempfile
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
-from lingo_mi.api.result import Result
 from lingo_mi.common import parsing
 from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.interrupts import between_steps
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant
-from lingo_mi.fitting.recipes import settings_of
-from lingo_mi.fitting.settings import Settings
-from lingo_mi.results.watched_fit import watched_fit
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.measure import few_views, quick_measure
+from lingo_mi.fitting.method import Method
+from lingo_mi.fitting.methods.by_name import method_of
+from lingo_mi.fitting.save import result_names
+from lingo_mi.results.watch import watched
 from lingo_mi.results.watchers import watchers_of
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import check_memory
-from lingo_mi.storage.file_access import as_path, require_writable, writing
-from lingo_mi.storage.folder_lock import LOCK, locked
-from lingo_mi.storage.output_folder import CHECKPOINT
+from lingo_mi.storage.file_access import as_path
+from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.output_folder import CHECKPOINT, clear_leftovers, require_ours, result_folder
 
 
 def fit(
     scan: Scan | Dataset,
-    recipe: str | Settings = 'fast',
+    method: str | Method = 'fast',
     *,
     seed: int = 0,
-    checkpoint: str | PathLike | None = None,
+    folder: str | PathLike | None = None,
     resume: bool = False,
-    progress: bool = True,
+    force: bool = False,
+    title: str = '',
+    progress: bool | Callable[..., None] = True,
     live: bool = False,
     log_dir: str | PathLike | None = None,
-    **settings: Any,
-) -> Result:
+    record: dict | None = None,
+    **options: Any,
+) -> Fit:
     """Fit a cloud of 3D Gaussians, or a neural field, to a scan.
 
-    scan         the views to fit; of a `Dataset` these are `train`, and quality on its held-out views and true volume is
-                 measured on the way
-    recipe       'fast' (this project's own), 'lingo' or 'r2' (the published ones), '3dgs' or 'xgaussian' (baselines that
-                 composite opacities: they make views, but no volume) or 'naf' (a neural field), with changes as in
-                 'lingo:V_S=1'; or `Settings`
-    seed         of every random choice
-    checkpoint   a file (.npz) written every 30 s and at the end; what `resume` goes on from
-    resume       go on from the checkpoint, as if it had never stopped; the scan and all settings must be the same
-    progress     whether to show a progress bar on standard error
-    live         whether to serve a page that grows while the fit runs, to this machine alone; its address is printed, and in a
-                 notebook the page is shown below the cell
-    log_dir      a folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard')
-    settings     any setting of the fit by name, such as iterations=800, n_points=20_000 or lambda_tv=0.1 (see `Settings`)
+    Parameters
+    ----------
+    scan : Scan or Dataset
+        The views to fit. Of a `Dataset` these are `train`, and quality on its held-out views and true volume is measured on the
+        way.
+    method : Method or str
+        `Fast` (this package's own), `LINGO` or `R2` (the published ones), `GaussianSplatting` or `XGaussian` (baselines that
+        composite opacities: they make views, but no volume), `NAF` (a neural field), or a method of yours. Or its name, with
+        options as in 'lingo:V_S=1'.
+    seed : int
+        Of every random choice.
+    folder : path, optional
+        Of the result. The fit writes a checkpoint there every 30 s, and at the end all that `Fit.save` writes.
+    resume : bool
+        Go on from the checkpoint in the folder, as if the fit had never stopped; scan and options must be the same.
+    force : bool
+        Replace an earlier result in the folder.
+    title : str
+        Of the report (default: the folder's name).
+    progress : bool or callable
+        Whether to show a progress bar on standard error; or a function that is called between steps, as `fitting.loop.run` does.
+    live : bool
+        Serve a page that grows while the fit runs, to this machine alone. Its address is printed; a notebook shows the page.
+    log_dir : path, optional
+        A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
+    record : dict, optional
+        Further entries of metrics.json in the folder.
+    options
+        Any option of the method by its flat name, such as iterations=800, n_points=20_000 or lambda_tv=0.1.
 
-    Returns a `Result`. Ctrl-C stops between two steps and leaves a checkpoint, where one is named. Raises InputError for an
-    unknown recipe or setting, a scan without signal or larger than memory, a checkpoint of another fit or that cannot be
-    written, and a fit that diverges.
+    Returns
+    -------
+    Fit
 
-        result = lm.fit(data, 'fast', checkpoint='out/foot.npz')
+    Raises
+    ------
+    InputError
+        For an unknown method or option, a scan without signal or larger than memory, a folder that is in use or cannot be
+        written, a checkpoint of another fit, and a fit that diverges.
+    KeyboardInterrupt
+        Between two steps after Ctrl-C; with a folder, its checkpoint is written.
+
+    Examples
+    --------
+    `fit = lm.fit(data, lm.LINGO(), folder='out/foot')`
     """
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
-    require_type('recipe', recipe, (str, Settings))
+    require_type('method', method, (str, Method))
+    require_type('live', live, bool)
     seed = parsing.seed(seed)
     dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
+    chosen = method.changed(**options) if isinstance(method, Method) else method_of(method, **options)
+    if resume and folder is None:
+        raise InputError('resume=True needs the folder of the checkpoint to go on from: give folder=FOLDER')
+    path = None if folder is None else result_folder(as_path('folder', folder), force=force, resume=resume)
     check_memory(dataset.train.geometry)
-    if isinstance(recipe, Settings):
-        name, chosen = 'settings', recipe.changed(**settings)
-    else:
-        name, chosen = recipe, settings_of(recipe, **settings)
-    path = None if checkpoint is None else as_path('checkpoint', checkpoint)
-    if resume and path is None:
-        raise InputError('resume=True needs the checkpoint to go on from: give checkpoint=FILE')
-    if path is not None:
-        with writing(path):
-            if path.is_dir():
-                raise InputError(f'{path}: is a folder; name a file in it, such as {path / CHECKPOINT}')
-            if path.is_symlink():
-                raise InputError(f'{path}: is a link, which is not written to; name the file itself')
-            if path.exists() and not resume:
-                raise InputError(f'{path}: exists already; give resume=True to go on from it, or remove it')
-        require_writable(path.parent, path)
-    with _lock(path), tempfile.TemporaryDirectory() as folder:
-        # Kept even where nobody names a file: `Result.save` writes it.
-        file = Path(folder) / CHECKPOINT if path is None else path
-        watchers = watchers_of(dataset.train.geometry, live, log_dir, name)
-        with Progress('Fit', chosen.iterations, shown=progress) as bar:
-            fitted = watched_fit(dataset, chosen, seed, bar.update, watchers, file, resume)
-        return Result(fitted, name, file.read_bytes(), dataset)
+    label = title or (chosen.name if path is None else path.name)
+    with nullcontext() if path is None else locked(path):
+        if path is not None:
+            clear_leftovers(path)
+            require_ours(path, result_names(chosen, 0 if dataset.test is None else len(dataset.test)))
+        checkpoint = None if path is None else path / CHECKPOINT
+        watchers, few = watchers_of(dataset.train.geometry, live, log_dir, label), few_views(dataset)
+        with (
+            _reporting(chosen.iterations, progress) as report,
+            watched(watchers, chosen.iterations) as watch,
+            between_steps() as check,
+        ):
+
+            def between(iteration: int, **fields: Any) -> None:
+                report(iteration, **fields)
+                watch.step(iteration, **fields)
+                check()
+
+            def measure(fit: Fit) -> dict:
+                fit.data = few
+                numbers = quick_measure(fit)
+                watch.look(fit, numbers)
+                return numbers
+
+            result = run(dataset.train, chosen, seed, measure=measure, progress=between, path=checkpoint, resume=resume)
+        result.data = dataset
+        if path is not None:
+            result.write(path, label, record)
+            result.folder = path
+    return result
 
 
-def _lock(path: Path | None):
-    """Keeps other processes from writing a checkpoint; its folder may hold those of several fits."""
-    if path is None:
-        return nullcontext()
-    return locked(path.parent, LOCK if path.name == CHECKPOINT else f'{LOCK}-{path.name}')
+@contextmanager
+def _reporting(total: int, progress: bool | Callable[..., None]) -> Iterator[Callable[..., None]]:
+    if callable(progress):
+        yield progress
+        return
+    with Progress('Fit', total, shown=progress) as bar:
+        yield bar.update

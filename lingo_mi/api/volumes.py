@@ -4,84 +4,199 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from math import prod
 from os import PathLike
-from typing import Any
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.api.result import Result
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.common.parsing import whole
-from lingo_mi.common.runtime import ensure_variant
-from lingo_mi.completion.clouds import FittedCloud
+from lingo_mi.common.parsing import whole_number
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
-from lingo_mi.reconstruction import Algorithm, Best, Reconstruction, Refined, check_scan, progress_bar
-from lingo_mi.reconstruction import reconstruct as run
-from lingo_mi.reconstruction.effects_correction import linearised
+from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.reconstruction import FDK, Algorithm, Best, Reconstruction, Refined
+from lingo_mi.reconstruction.line_integrals import line_integrals
+from lingo_mi.reconstruction.preconditions import require_rays, require_signal
+from lingo_mi.reconstruction.run import check_room, mask_images, progress_bar, run_algorithm, run_in_slabs
+from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.scan import Dataset, Scan
+from lingo_mi.storage.file_access import as_path, check_new_file, writing
+from lingo_mi.storage.folder_lock import writing_file
 
 
+@overload
 def reconstruct(
     scan: Scan | Dataset,
     algorithm: Algorithm,
     *,
-    start: Result | ArrayLike | None = None,
+    start: Fit | ArrayLike | None = None,
     views: int | None = None,
+    out: str | PathLike | None = None,
+    slab: None = None,
+    force: bool = False,
     progress: bool = True,
-) -> Reconstruction:
+) -> Reconstruction: ...
+
+
+@overload
+def reconstruct(
+    scan: Scan | Dataset,
+    algorithm: Algorithm,
+    *,
+    start: Fit | None = None,
+    views: int | None = None,
+    out: str | PathLike,
+    slab: int,
+    force: bool = False,
+    progress: bool = True,
+) -> Path: ...
+
+
+@one_at_a_time()
+def reconstruct(
+    scan: Scan | Dataset,
+    algorithm: Algorithm,
+    *,
+    start: Fit | ArrayLike | None = None,
+    views: int | None = None,
+    out: str | PathLike | None = None,
+    slab: int | None = None,
+    force: bool = False,
+    progress: bool = True,
+) -> Reconstruction | Path:
     """Reconstruct a volume on the voxels of a scan's geometry.
 
-    scan        projections and geometry; of a `Dataset` its `train`. Effects that it knows are taken out first: beam hardening,
-                scatter, dead pixels; blur together with scatter, or with a result to start from
-    algorithm   one of `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined`, `Best`, with its parameters
-    start       the `Result` of a fit to this scan, or a volume [x, y, z] in 1/mm, to start from; `Refined` needs a result
-    views       with a result: how many views to reconstruct from. Those that were not measured are rendered from the cloud (the
-                two stages of the paper), and the algorithm starts from nothing. The scan must be one on a circle
-    progress    whether to show a progress bar on standard error
+    Parameters
+    ----------
+    scan : Scan or Dataset
+        Projections and geometry; of a `Dataset` its `train`. Effects that it knows are taken out first: beam hardening, scatter,
+        dead pixels; blur together with scatter, or with a fit to start from. `dataclasses.replace(scan, effects=None)` takes the
+        projections for line integrals.
+    algorithm : Algorithm
+        `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined` or `Best`, with its options. `Best` chooses its settings by
+        measured views that it holds out, and takes neither `start` nor `views`; with `cloud` it fits a cloud by itself.
+    start : Fit or array, optional
+        A fit to this scan, or a volume [x, y, z] in 1/mm, to start from. `Refined` needs one.
+    views : int, optional
+        With a fit: how many views to reconstruct from. Those that were not measured are rendered from the fit (the two stages of
+        the paper), and the algorithm starts from nothing. The scan must be one on a circle. `Refined` meets these views first,
+        and then the measured ones; without `views`, the measured ones alone.
+    out : path, optional
+        Write the volume there (.nii, .nii.gz or .ome.zarr), as `Reconstruction.save` does.
+    slab : int, optional
+        Make the volume in slabs of so many slices, and write each to `out`, so that it need not fit into memory: by `FDK`,
+        `SART`, `OSSART` and `SIRT`. Iterative ones hold the volume in a folder beside `out`, whose name ends in .slabs, until it
+        is written. If they are stopped, the same call goes on.
+    force : bool
+        Replace an earlier file.
+    progress : bool
+        Show a progress bar on standard error.
 
-    `Best` chooses its settings by measured views that it holds out, and takes neither `start` nor `views`; with
-    `cloud` it fits a cloud by itself.
-    `Refined` meets the completed views first where `views` is given, and the measured ones alone where it is not.
+    Returns
+    -------
+    Reconstruction or Path
+        `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|, NaN for passes where it was not computed;
+        `seconds`. It can be used as an array. With `slab`: the path of the volume.
 
-    Returns a `Reconstruction`: `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|, NaN for passes where it
-    was not computed; `seconds`. It can be used as an array. Raises InputError for a scan or a start that the algorithm cannot
-    use, and where memory does not suffice.
+    Raises
+    ------
+    InputError
+        For a scan or a start that the algorithm cannot use, too little memory, and a file that exists or cannot be written.
 
-        found = lm.reconstruct(data.train, lm.SART(niter=20), start=result)
+    Examples
+    --------
+    ::
+
+        found = lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
         found.volume, found.residuals[-1]
     """
     ensure_variant()
-    scan = scan.train if isinstance(scan, Dataset) else scan
     require_type('scan', scan, (Scan, Dataset))
-    if views is not None:
-        views = whole('views', views, 1)
+    views = None if views is None else whole_number('views', views, 1)
+    slab = None if slab is None else whole_number('slab', slab, 1)
+    path = None if out is None else as_path('out', out)
+    start = _start(start)
+    _check(algorithm, start, views, path, slab)
+    if path is not None:
+        _check_output(path, algorithm, force)
+    truth = scan.volume if isinstance(scan, Dataset) else None
+    scan = scan.train if isinstance(scan, Dataset) else scan
+    require_rays(scan.geometry)
+    require_signal(scan)
+    if slab is None:  # else the slabs are checked
+        seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
+        both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them
+        check_room(scan.geometry, algorithm, seen, mask_images(scan) + both)
+    with nullcontext() if path is None else writing_file(path):
+        scan, algorithm, inputs = _prepared(scan, algorithm, start, views)
+        if path is not None and slab is not None:
+            assert isinstance(algorithm, FDK | Sweeps)  # see `_check`
+            with progress_bar(algorithm, scan, steps=algorithm.slab_steps(scan, slab), shown=progress) as bar:
+                run_in_slabs(scan, algorithm, path, slab, bar)
+            return path
+        with progress_bar(algorithm, scan, shown=progress) as bar:
+            found = run_algorithm(scan, algorithm, progress=bar, **inputs)
+        if path is not None:
+            found.save(path, force=force)
+    return found
+
+
+def _start(start: Any) -> Fit | np.ndarray | None:
+    if start is None or isinstance(start, Fit):
+        return start
     if isinstance(start, str | PathLike):
-        raise InputError(
-            f'start must be the Result of a fit, or a volume, not a path: give lm.load_result({str(start)!r})'
-        )
+        raise InputError(f'start must be a fit, or a volume, not a path: give lm.load_fit({str(start)!r})')
+    return as_numpy(start, 'the start volume', np.float32)
+
+
+def _check(algorithm: Any, start: Fit | np.ndarray | None, views: int | None, path: Path | None, slab: int | None):
+    """Raises InputError for arguments that contradict each other."""
     if not isinstance(algorithm, Algorithm):
         raise InputError(f'algorithm must be an object such as lm.SART(niter=20), not {algorithm!r}')
-    inputs: dict[str, Any] = {}
-    if isinstance(start, Result):
-        cloud, dataset = FittedCloud.of(start.fitted), Dataset(scan)
-        if views is not None:
-            check_scan(scan.geometry, algorithm, views)
-            scan, inputs = prepare_completed(dataset, cloud, views, algorithm)
-        else:
-            if isinstance(algorithm, Refined):
-                algorithm = replace(algorithm, completed_niter=0)
-            scan, inputs = prepare_start(dataset, cloud, algorithm)
-    elif views is not None:
-        raise InputError('views are rendered from a fitted cloud: give the result of a fit as start')
-    elif isinstance(algorithm, Refined):
-        raise InputError('Refined starts from a fitted cloud: give the result of a fit as start')
-    else:
-        if scan.effects is not None:
-            scan = linearised(scan, scan.effects)
-        inputs = {} if start is None else dict(start=as_numpy(start, 'the start volume', np.float32))
-        if isinstance(algorithm, Best):
-            inputs['fit'] = fit_cloud
-    with progress_bar(algorithm, scan) if progress else nullcontext() as bar:
-        return run(scan, algorithm, progress=bar, **inputs)
+    if views is not None and not isinstance(start, Fit):
+        raise InputError('views are rendered from a fitted cloud: give the fit as start')
+    if start is None and isinstance(algorithm, Refined):
+        raise InputError('refined starts from a fitted cloud: give the fit, or its volume, as start')
+    if start is not None and algorithm.no_start and (views is None or isinstance(algorithm, Best)):
+        raise InputError(algorithm.no_start)
+    if slab is None:
+        return
+    if path is None:
+        raise InputError('slab=N writes the volume while it is made: give out=FILE')
+    if not isinstance(algorithm, FDK | Sweeps):
+        raise InputError(
+            f'slab=N is for fdk, sart, os-sart and sirt; {algorithm.name} needs the whole volume: leave it out'
+        )
+    if start is not None and views is None:
+        raise InputError('slab=N starts from an empty volume: leave out start, or slab')
+
+
+def _check_output(path: Path, algorithm: Algorithm, force: bool) -> None:
+    """Raises InputError, before any work, if the volume cannot be written."""
+    with writing(path):
+        check_volume_name(path)
+        for file in (path, *(plan_and_error_map(path) if isinstance(algorithm, Best) else ())):
+            check_new_file(file, force)
+
+
+def _prepared(
+    scan: Scan, algorithm: Algorithm, start: Fit | np.ndarray | None, views: int | None
+) -> tuple[Scan, Algorithm, dict[str, Any]]:
+    """The line integrals that the volume is made of, the algorithm, and what else this one needs."""
+    if isinstance(start, Fit) and views is not None:
+        scan, inputs = prepare_completed(scan, start, views, algorithm)
+        return scan, algorithm, inputs
+    if isinstance(algorithm, Refined):  # there are no completed views
+        algorithm = replace(algorithm, completed_niter=0)
+    if isinstance(start, Fit):
+        scan, inputs = prepare_start(scan, start, algorithm)
+        return scan, algorithm, inputs
+    scan = line_integrals(scan)
+    if isinstance(algorithm, Best):
+        return scan, algorithm, dict(fit=fit_cloud)
+    return scan, algorithm, dict(start=start)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
@@ -28,18 +28,18 @@ def coarse(scan: Scan, pixels: int) -> Scan:
     small = _binned(scan, max(1, round(max(scan.geometry.nDetector) / pixels)))
     g = small.geometry
     at_axis = g.DSO / g.DSD if g.mode == 'cone' else 1.0
-    step = max(g.dDetector[1] * at_axis, min(g.dVoxel[:2]))
+    step = max(g.dDetector[1] * at_axis, min(g.grid.spacing[:2]))
     highest = np.percentile(small.projections, 99.5)
     sides = [small.projections[:, :, [0, -1]], small.projections[:, [0, -1], :]]
     cut = [g.nDetector[k] > 2 and np.percentile(p, 95) > EDGE * highest for k, p in ((1, sides[0]), (0, sides[1]))]
-    size = np.array(g.sVoxel) * np.where([cut[0], cut[0], cut[1]], WIDER, MARGIN)
+    size = np.array(g.grid.size) * np.where([cut[0], cut[0], cut[1]], WIDER, MARGIN)
     if g.mode == 'cone':  # the source stays outside
-        size[:2] = np.minimum(size[:2], max(1.3 * g.DSO, min(g.sVoxel[:2])))
+        size[:2] = np.minimum(size[:2], max(1.3 * g.DSO, min(g.grid.size[:2])))
     count = np.maximum(np.ceil(size / step), 1).astype(int)
     voxel = [step] * 3
-    if g.nVoxel[2] == 1:
-        count[2], voxel[2] = 1, g.dVoxel[2]
-    return replace(small, geometry=g.with_volume(count, voxel), projections=_smoothed(small))
+    if g.grid.shape[2] == 1:
+        count[2], voxel[2] = 1, g.grid.spacing[2]
+    return replace(small.on(Grid(count, voxel, g.grid.centre)), projections=_smoothed(small))
 
 
 def _binned(scan: Scan, factor: int) -> Scan:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
@@ -42,7 +42,7 @@ class Panel:
         # Rx of TIGRE's frame (towards the source, u, up) turns u towards up, and down is -up.
         u, v = step_u * (c * along - s * down), step_v * (s * along + c * down)
         turned = replace(rays, corner=centre - nu / 2 * u - nv / 2 * v, u=u, v=v)
-        return Geometry.from_poses(turned, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+        return Geometry.from_poses(turned, geometry.nDetector, grid=geometry.grid)
 
     def resampled(self, scan: Scan) -> Scan:
         """What the panel of the scan's geometry would have seen, had it been where that says: by cubic splines.

@@ -175,7 +175,7 @@ def _determined(scan, degree):
     """Which numbers a scan tells: of one row neither height nor turn."""
     drifts = range(1, degree + 1)
     names = ['u', *(f'u{k}' for k in drifts)]
-    if min(scan.geometry.nDetector) < 8 or scan.geometry.nVoxel[2] == 1:
+    if min(scan.geometry.nDetector) < 8 or scan.geometry.grid.shape[2] == 1:
         return names
     return [*names, 'yaw', *(f'v{k}' for k in drifts)]
 

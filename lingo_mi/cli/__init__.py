@@ -19,7 +19,7 @@ COMMANDS = {
     'calibrate': 'find where the panel really is: axis off centre, turn in its plane, drift',
     'phantom': 'make a test object and a scan of it',
     'gradcheck': "check the derivatives of a scene's image against differences",
-    'recipes': 'compare recipes: quality against time',
+    'recipes': 'compare methods: quality against time',
     'regret': 'measure how far the choice of best is behind the best fixed setting',
     'peers': 'compare volumes of one scan with those of RTK and MBIRJAX',
     'noise': 'measure what an early stop and weights are worth to a fit of noisy projections',

@@ -1,6 +1,6 @@
 """Fit a cohort: a list of scans, one a row, each into a folder of its own, with a table of all results.
 
-    lingo-mi batch cohort.csv --recipe fast --out out/cohort
+    lingo-mi batch cohort.csv --method fast --out out/cohort
     lingo-mi batch cohort.csv --out out/cohort --cluster local:4
     lingo-mi batch cohort.csv --out out/cohort --cluster tcp://head-node:8786
 
@@ -9,8 +9,8 @@ The list is a CSV file whose first line names its columns; an empty cell is the 
     file       projections, as of `lingo-mi fit --projections`; with a scene in geometry, a CT volume that its scanner scans
     geometry   the geometry file (.yml) of an .npy; or a scene, .xml or a shipped one, whose own object is scanned without a file
     name       of the folder in --out (default: that of the file)
-    recipe, views, seed, mu_water   as of `lingo-mi fit`
-    any setting of the fit, such as iterations or lambda_tv, or parameter of the scene
+    method, views, seed, mu_water   as of `lingo-mi fit`
+    any option of the row's method, such as iterations or lambda_tv, or parameter of its scene
 
 The whole list is checked first: every row that cannot be used gets a line, and nothing is begun. Then each scan is fitted into
 --out/NAME, and results.csv (and results.parquet, with pyarrow) gets a row of every number. A scan that fails is tried once more
@@ -25,7 +25,7 @@ import sys
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, cluster_arguments, runner_of
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, brief
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.storage.file_access import require_writable
 from lingo_mi.storage.folder_lock import locked
@@ -38,10 +38,10 @@ def arguments() -> argparse.Namespace:
     p.add_argument('list', type=Path, metavar='LIST.csv', help='the scans, see above')
     p.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the results')
     p.add_argument(
-        '--recipe',
+        '--method',
         default='fast',
-        metavar='R',
-        help='of rows that name none: RECIPE[:setting=value,...] (default: fast)',
+        metavar='M',
+        help='of rows that name none: METHOD[:option=value,...] (default: fast)',
     )
     cluster_arguments(p)
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
@@ -53,9 +53,9 @@ def main() -> None:
     from lingo_mi.cohort.listing import BadList, read_list
     from lingo_mi.cohort.run import done_already
     from lingo_mi.cohort.table import CSV
-    from lingo_mi.fitting.recipes import settings_of
+    from lingo_mi.fitting.methods.by_name import method_of
 
-    settings_of(args.recipe)
+    method_of(args.method)
     out = args.out
     if out.exists() and not out.is_dir():
         raise InputError(f'{out}: is a file, not a folder; choose another --out')
@@ -63,17 +63,17 @@ def main() -> None:
         raise InputError(f'{args.list}: is the table that this command writes; choose another --out')
     use_variant(args.variant)  # reading scenes needs one
     try:
-        rows = read_list(args.list, args.recipe)
+        rows = read_list(args.list, args.method)
         require_writable(out, out, 'choose another --out')
         with locked(out):
-            run(args, rows, done_already(rows, out))
+            run_batch(args, rows, done_already(rows, out))
     except BadList as error:
         for line in error.lines:
-            print(f'error: {line}', file=sys.stderr)
+            print(f'error: {brief(line)}', file=sys.stderr)
         raise
 
 
-def run(args: argparse.Namespace, rows: list, done: dict) -> None:
+def run_batch(args: argparse.Namespace, rows: list, done: dict) -> None:
     """Fit what is not done, in a folder that no other batch writes to, and say what came of it."""
     from lingo_mi.cohort.run import run_cohort
 

@@ -30,10 +30,11 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.fitting.fitted import Fitted
+    from lingo_mi.fitting.fit import load_fit
+    from lingo_mi.fitting.methods.densities import DensityMethod
     from lingo_mi.studies.benchmarks.step import described, measured
 
-    fitted = Fitted.from_checkpoint(args.checkpoint)
-    if not (fitted.settings.cloud and fitted.settings.volumetric):
+    fit = load_fit(args.checkpoint)
+    if not isinstance(fit.method, DensityMethod):
         raise InputError(f'{args.checkpoint}: is a neural field or composites opacities; its step has other parts')
-    print(described(measured(fitted, args.repeats)))
+    print(described(measured(fit, args.repeats)))

@@ -5,29 +5,36 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import shlex
-import shutil
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
 from lingo_mi.common import parsing
 from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.interrupts import noticed
-from lingo_mi.scene.shipped import scenes
-from lingo_mi.storage.file_access import leftovers, require_writable, write_text
-from lingo_mi.storage.folder_lock import LOCK, locked
-from lingo_mi.storage.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
+from lingo_mi.scene.shipped import scene_path, scenes
+from lingo_mi.storage.file_access import require_writable, write_text
+from lingo_mi.storage.folder_lock import locked
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line, like any other bad input."""
+    """An argument parser whose errors are one line, like any other bad input. `running` is the last one that has parsed, with
+    what it has read."""
+
+    running: ClassVar[tuple[Parser, argparse.Namespace] | None] = None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        found = super().parse_known_args(args, namespace)
+        Parser.running = self, found[0]
+        return found
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'error: {brief(message, 250)} (see --help)\n')
@@ -43,10 +50,12 @@ def guard(main: Callable[[], int | None]) -> None:
     try:
         with noticed(), warnings.catch_warnings():
             warnings.simplefilter('ignore', RuntimeWarning)
-            warnings.showwarning = lambda message, *_: print(f'warning: {brief(message, 1000)}', file=sys.stderr)
+            warnings.showwarning = lambda message, *_: print(
+                f'warning: {brief(with_options(str(message)), 1000)}', file=sys.stderr
+            )
             sys.exit(main() or 0)
     except InputError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {brief(with_options(str(error)))}', file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -61,6 +70,46 @@ def guard(main: Callable[[], int | None]) -> None:
     except KeyboardInterrupt as stop:
         print(f'interrupted{": " + str(stop) if str(stop) else ""}', file=sys.stderr)
         sys.exit(130)
+
+
+# Neither in a call or a path, nor an option already.
+ARGUMENT = re.compile(r"""(?<!-D )(?<!\w\()(?<![\w"'/.=-])([A-Za-z]\w*)=(\([^()]*\)|'[^']*'|[^\s'",;:()]+)""")
+
+
+def with_options(message: str) -> str:
+    """A library's message with the running command's options for Python's arguments: `slab=64` becomes `--slab 64`, `resume=True`
+    `--resume`, and `lambda_tv=0.1` `-D lambda_tv=0.1`."""
+    if Parser.running is None:
+        return message
+    parser, args = Parser.running
+    options = {action.dest: action for action in parser._actions if action.option_strings}
+
+    def written(match: re.Match) -> str:
+        name, value = match[1], match[2].strip("'")
+        parts = [part.strip() for part in value.strip('()').split(',')] if value.startswith('(') else [value]
+        if (option := options.get(name)) is None:
+            known = 'define' in options and name in _settings(args)
+            return f'-D {name}={",".join(parts)}' if known else match[0]
+        if option.nargs == 0:
+            return option.option_strings[-1] if value == 'True' else match[0]
+        several = len(parts) > 1 and option.nargs is None  # in one text, of a form of its own
+        return ' '.join([option.option_strings[-1], *([str(option.metavar)] if several else parts)])
+
+    return ARGUMENT.sub(written, message)
+
+
+def _settings(args: argparse.Namespace) -> set[str]:
+    """The names that -D takes: options of methods and algorithms, and parameters of the scenes that are named."""
+    from lingo_mi.fitting.methods.by_name import METHODS
+    from lingo_mi.reconstruction import ALGORITHMS
+    from lingo_mi.scene.load import defaults
+
+    options = [method.flat() for method in METHODS.values()] + [made().options for made in ALGORITHMS.values()]
+    names = {name for known in options for name in known}
+    for scene in [getattr(args, 'scene', None), *getattr(args, 'scenes', [])]:
+        with suppress(InputError):
+            names |= defaults(scene_path(scene)) if scene else set()
+    return names
 
 
 def command_line(*options: str, without: Collection[str] = ()) -> str:
@@ -269,19 +318,6 @@ def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
     return document, figures
 
 
-@contextmanager
-def writing_file(path: Path) -> Iterator[None]:
-    """Keeps other processes from writing this output file; what a killed one has left of it is removed."""
-    with locked(path.parent, f'{LOCK}-{path.name[-40:]}'):
-        for leftover, target in leftovers(path.parent):
-            if target == path.name[-40:]:
-                leftover.unlink(missing_ok=True)
-        for leftover, target in leftovers(path.parent, folders=True):
-            if target == path.name[-40:]:
-                shutil.rmtree(leftover, ignore_errors=True)
-        yield
-
-
 def definitions(pairs: Iterable[str]) -> dict[str, str]:
     """The NAME=VALUE arguments of -D as a dictionary."""
     out = {}
@@ -291,34 +327,6 @@ def definitions(pairs: Iterable[str]) -> dict[str, str]:
             raise InputError(f'-D {pair}: write it as name=value')
         out[name] = value
     return out
-
-
-def writable_folder(path: Path, force: bool, resume: bool) -> Path:
-    """The folder of a result, which can be made and written to, or an error that refuses to spoil one.
-
-    Leaves nothing behind.
-
-    force, resume   whether a folder with files in it will do
-    """
-    path = Path(path)
-    if path.exists() and not path.is_dir():
-        raise InputError(f'{path}: is a file, not a folder; choose another --out')
-    there = occupants(path) if path.is_dir() else []
-    if resume and CHECKPOINT not in there:
-        mend = 'run without --resume' + (', with --force' if there else '')
-        raise InputError(f'{path / CHECKPOINT}: there is no checkpoint to go on from; {mend}')
-    if there and not (force or resume):
-        what, mend = 'is not empty', '--force to write beside what is there'
-        if METRICS in there:
-            what, mend = 'holds a result already', '--force to replace it'
-        if CHECKPOINT in there:
-            what = what if METRICS in there else 'holds a fit that was not completed'
-            mend = '--resume to go on, --force to replace it'
-        raise InputError(f'{path}: {what}; add {mend}, or choose another --out')
-    require_writable(path, path, 'choose another --out')
-    if path.is_dir():
-        require_ours(path, FILES)
-    return path
 
 
 def writable_file(path: Path, force: bool) -> Path:

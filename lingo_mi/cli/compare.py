@@ -3,9 +3,10 @@
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser, writing_file
+from lingo_mi.cli.common import Parser
 from lingo_mi.common.errors import InputError
 from lingo_mi.storage.file_access import require_writable, write_text
+from lingo_mi.storage.folder_lock import writing_file
 
 EPILOG = """\
 examples:
@@ -37,8 +38,7 @@ def main() -> None:
     parser.add_argument('--force', action='store_true', help='replace an earlier page')
     args = parser.parse_args()
     from lingo_mi.files.volumes import read_volume
-    from lingo_mi.results.compare import compare_page
-    from lingo_mi.results.stored import read_stored
+    from lingo_mi.results.compare import compare_page, load_result
 
     if args.out.suffix.lower() not in ('.html', '.htm'):
         raise InputError(f'{args.out}: a comparison is a page; give a name that ends in .html')
@@ -47,7 +47,7 @@ def main() -> None:
     if args.mu_water is not None and args.truth is None:
         raise InputError('--mu-water goes with --truth')
     require_writable(args.out.parent, args.out)
-    found = [read_stored(path) for path in args.results]
+    found = [load_result(path) for path in args.results]
     page = compare_page(found, read_volume(args.truth, args.mu_water) if args.truth else None, args.title)
     with writing_file(args.out):
         write_text(args.out, page)

@@ -30,7 +30,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument(
         '--with-cloud',
         action='store_true',
-        help='instead: corrections that fits of the recipe fast find with the cloud',
+        help='instead: corrections that fits of the method fast find with the cloud',
     )
     p.add_argument(
         '--correct',
@@ -39,7 +39,7 @@ def arguments() -> argparse.Namespace:
         metavar='KIND',
         help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
     )
-    p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the recipe's)")
+    p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the method's)")
     p.add_argument(
         '--out',
         type=Path,
@@ -74,8 +74,8 @@ def main() -> None:
     folder = args.out / '_'.join([Path(args.scan).stem, *options])
     with locked(folder):
         if args.with_cloud:
-            settings = {} if args.iterations is None else dict(iterations=args.iterations)
-            print(report(list(cloud_rows(dataset, folder, **settings)), folder, 'found with the cloud'))
+            options = {} if args.iterations is None else dict(iterations=args.iterations)
+            print(report(list(cloud_rows(dataset, folder, **options)), folder, 'found with the cloud'))
         else:
             calibration = find(dataset, kinds)
             print('\n'.join(calibration.lines()))

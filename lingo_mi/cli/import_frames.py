@@ -35,7 +35,13 @@ def arguments() -> argparse.Namespace:
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')
     add('--air', type=int, nargs=4, metavar=('V0', 'V1', 'U0', 'U1'), help='pixels without object in every view')
-    add('--air-percentile', type=float, metavar='P', help='instead: a percentile of each view is its air level')
+    add(
+        '--air-percentile',
+        dest='percentile',
+        type=float,
+        metavar='P',
+        help='instead: a percentile of each view is its air level',
+    )
     add('--i0', type=float, metavar='COUNTS', help='instead: the counts of the unattenuated beam above the dark ones')
     add(
         '--exposure',
@@ -90,7 +96,7 @@ def main() -> None:
         except ValueError:
             exposure = read_numbers(args.exposure)
     options = Options(
-        flats=args.flats, darks=args.darks, air=args.air, percentile=args.air_percentile, i0=args.i0, exposure=exposure,
+        flats=args.flats, darks=args.darks, air=args.air, percentile=args.percentile, i0=args.i0, exposure=exposure,
         saturation=args.saturation, crop=args.crop, binning=args.binning, views=chosen_views(args.views), angles=args.angles,
         pixel=args.pixel,
     )  # fmt: skip

@@ -10,7 +10,6 @@ from lingo_mi.cli.common import Parser, writable_file
 from lingo_mi.common.errors import InputError
 
 if TYPE_CHECKING:
-    from lingo_mi.inspection.measure import Findings
     from lingo_mi.scan import Scan
 
 EPILOG = """\
@@ -30,30 +29,33 @@ def main() -> None:
     if out.suffix.lower() != '.png':
         raise InputError(f'{out}: the picture is a PNG; give an --out that ends in .png')
     writable_file(out, args.force)
+    from lingo_mi.cli.findings_text import advice, facts
     from lingo_mi.files.scans import read_scan
-    from lingo_mi.inspection.measure import look
+    from lingo_mi.inspection.measure import measure
     from lingo_mi.inspection.sheet import draw
 
     scan = read_scan(args.scan).train
-    found = look(scan)
+    found = measure(scan)
+    measured, wrong = facts(scan, found), advice(scan, found)
     if not found.misplaced and not found.suspects:
-        _compare_views(scan, found)
-    print('\n'.join(found.facts))
-    print('\nto correct:' if found.advice else '\nnothing to correct was found')
-    for line in found.advice:
+        faults, obstacle = _compare_views(scan)
+        measured, wrong = measured + obstacle, wrong + faults
+    print('\n'.join(measured))
+    print('\nto correct:' if wrong else '\nnothing to correct was found')
+    for line in wrong:
         print(f'- {line}')
     out.parent.mkdir(parents=True, exist_ok=True)
     draw(out, scan, found)
     print(f'\n{out}')
 
 
-def _compare_views(scan: Scan, found: Findings) -> None:
-    """Adds what quick reconstructions say of the views' order, where they can be made."""
+def _compare_views(scan: Scan) -> tuple[list[str], list[str]]:
+    """What quick reconstructions say of the views' order, and why they cannot be made."""
     from lingo_mi.calibration.order import order_faults
     from lingo_mi.common.runtime import ensure_variant
 
     try:
         ensure_variant()
-        found.advice += order_faults(scan)
+        return order_faults(scan), []
     except InputError as error:
-        found.facts.append(f'order of the views: not measured ({error})')
+        return [], [f'order of the views: not measured ({error})']

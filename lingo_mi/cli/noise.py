@@ -4,7 +4,7 @@
     lingo-mi noise --objects foot --photons 1000 --finer 1 2 --settings equal stopped
 
 Simulated scans are cone beams over a full turn, with 4 as the largest line integral, of objects on --finer times as many voxels
-a side as are reconstructed. The recipe is fast: all its steps, with the volume compared with the truth every 50; stopped by views
+a side as are reconstructed. The method is fast: all its steps, with the volume compared with the truth every 50; stopped by views
 that it holds out; and with pixels weighed by the noise's standard deviation. Each fit is stored when it is done; the
 same command goes on after an interruption. The table, as Markdown, is renewed after each, with its provenance.
 """
@@ -29,7 +29,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--settings', nargs='+', metavar='NAME', help='some of equal, stopped, noise (default: all)')
     p.add_argument('--size', type=int, default=64, help='voxels along the longest side (default: 64)')
     p.add_argument('--pixels', type=int, default=64, help='of the panel, a side (default: 64)')
-    p.add_argument('--iterations', type=int, metavar='N', help="steps of a fit, at most (default: the recipe's)")
+    p.add_argument('--iterations', type=int, metavar='N', help="steps of a fit, at most (default: the method's)")
     p.add_argument('--out', type=Path, default=Path('out/noise'), help='folder of the results')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     return p.parse_args()
@@ -49,7 +49,7 @@ def main() -> None:
         if not all(low <= value <= high for value in values):
             raise InputError(f'{name} must be from {low} to {high:g}, not {" ".join(map(str, values))}')
     use_variant(args.variant)
-    from lingo_mi.fitting.recipes import FAST
+    from lingo_mi.fitting.methods.fast import Fast
     from lingo_mi.studies.noise import SETTINGS, Case, Study
     from lingo_mi.studies.tables.objects import available
 
@@ -59,7 +59,7 @@ def main() -> None:
             raise InputError(f'--settings {name}: is unknown; use some of {", ".join(SETTINGS)}')
     names = available(args.objects, print)
     require_writable(args.out, args.out, 'choose another --out')
-    study = Study(args.out, args.size, args.pixels, args.iterations or FAST.iterations)
+    study = Study(args.out, args.size, args.pixels, args.iterations or Fast.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
     with renewed_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
         study.compute_missing(cases, settings, renew)

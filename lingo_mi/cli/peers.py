@@ -21,8 +21,7 @@ from pathlib import Path
 from lingo_mi.cli.common import Parser, check_input, definitions, input_arguments, read_input, renewed_table
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
-from lingo_mi.reconstruction.effects_correction import linearised
-from lingo_mi.scan import Scan
+from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.file_access import require_writable
@@ -42,11 +41,6 @@ def arguments() -> argparse.Namespace:
     return p.parse_args()
 
 
-def _linear(scan: Scan) -> Scan:
-    """A scan's line integrals, as far as its effects are known."""
-    return scan if scan.effects is None else linearised(scan, scan.effects)
-
-
 def main() -> None:
     args = arguments()
     check_input(args)
@@ -58,14 +52,12 @@ def main() -> None:
     methods = installed(args.methods or METHODS, print)
     scene = scene_path(args.scene)
     dataset = read_input(args, load_scene(scene, definitions(args.define)), None)
-    dataset = replace(
-        dataset, train=_linear(dataset.train), test=None if dataset.test is None else _linear(dataset.test)
-    )
+    dataset = replace(dataset, train=line_integrals(dataset.train), test=dataset.test and line_integrals(dataset.test))
     for count in args.counts:
         if not 4 <= count < len(dataset.train):
             raise InputError(f'--views must be from 4 to {len(dataset.train) - 1}, so that some are left, not {count}')
     geometry = dataset.train.geometry
-    folder = args.out / '_'.join([Path(args.projections or scene).stem, *map(str, geometry.nVoxel)])
+    folder = args.out / '_'.join([Path(args.projections or scene).stem, *map(str, geometry.grid.shape)])
     require_writable(folder, folder, 'choose another --out')
     study = Study(dataset, folder)
     with renewed_table(folder / 'peers.md', lambda: study.table(methods, args.counts)) as renew:

@@ -162,7 +162,7 @@ def main() -> None:
     elif args.out:
         from lingo_mi.files.volumes import write_volume
 
-        write_volume(args.out, phantom.data, phantom.spacing, phantom.origin, 'normalised')
+        write_volume(args.out, phantom.data, phantom.grid, 'normalised')
         print(f'{args.out}: {args.name}, {args.size}^3 voxels of {phantom.spacing[0]:g} mm')
     if args.projections:
         from lingo_mi.common.progress import Progress

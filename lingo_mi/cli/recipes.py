@@ -1,10 +1,10 @@
-"""Compare recipes: quality against time, for every scene and method, as curves and a table.
+"""Compare methods: quality against time, for every scene and method, as curves and a table.
 
     lingo-mi recipes x3d_foot chest x3d_engine
     lingo-mi recipes x3d_foot --methods fast r2 --views 25 --iterations 5000
-    lingo-mi recipes x3d_foot --methods lingo r2 lingo:init=r2 r2:init=lingo -D pixels=256 -D pixel_size=2
+    lingo-mi recipes x3d_foot --methods lingo r2 lingo:start=fdk r2:start=masks -D pixels=256 -D pixel_size=2
 
-A method may be followed by settings that differ (`METHOD:name=value,name=value`): so each part of a recipe can be
+A method may be followed by options that differ (`METHOD:name=value,name=value`): so each part of a method can be
 exchanged alone.
 
 Runs `lingo-mi fit` for each combination that has no result yet in --out (an interrupted one goes on where it stopped), then
@@ -16,7 +16,7 @@ import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.fitting.recipes import CLOUDS, METHODS
+from lingo_mi.fitting.methods.by_name import CLOUDS, METHODS
 from lingo_mi.storage.file_access import require_writable, write_text
 
 

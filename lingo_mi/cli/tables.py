@@ -25,7 +25,7 @@ from typing import Any
 from lingo_mi.cli.common import Parser, check_seed, check_threads, cluster_arguments, runner_of
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
-from lingo_mi.fitting.recipes import METHODS, settings_of
+from lingo_mi.fitting.methods.by_name import METHODS, method_of
 from lingo_mi.storage.file_access import leftovers, require_writable
 from lingo_mi.storage.folder_lock import locked
 
@@ -50,7 +50,7 @@ def arguments() -> argparse.Namespace:
         nargs='+',
         default=list(PUBLISHED),
         metavar='METHOD[:name=value,...]',
-        help=f'columns of views and ct: any of {", ".join(METHODS)}, with settings that differ (default: '
+        help=f'columns of views and ct: any of {", ".join(METHODS)}, with options that differ (default: '
         f'{" ".join(PUBLISHED)}, as in the paper)',
     )
     p.add_argument(
@@ -123,7 +123,7 @@ def main() -> None:
     if not 0 < args.longest < 100:
         raise InputError(f'--longest must be above 0 and below 100, not {args.longest:g}')
     for method in args.methods:
-        settings_of(method)
+        method_of(method)
     objects = available(dict.fromkeys(args.objects or scale.objects), print)
     folder = args.out or Path('out/tables') / args.scale
     if folder.exists() and not folder.is_dir():

@@ -12,10 +12,10 @@ from os import PathLike
 from pathlib import Path
 
 from lingo_mi.cohort.row import COLUMNS, Row, scene_of
-from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.errors import InputError, printable, shown
 from lingo_mi.common.parsing import MOST_SEED, nearest
 from lingo_mi.files.scans import load_yaml, reader_of
-from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.scene.load import defaults
 from lingo_mi.storage.file_access import reading
 
@@ -36,13 +36,13 @@ class BadList(InputError):
         self.lines = lines
 
 
-def read_list(path: PathLike | str, recipe: str = 'fast') -> list[Row]:
+def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
     """The rows of a list: CSV in UTF-8, with a byte-order mark or without, separated by commas, semicolons or tabs.
 
-    recipe   of rows that name none
+    method   of rows that name none
 
-    The first line names the columns (`row.COLUMNS`, settings, parameters of scenes); an empty cell is the default. Relative
-    paths begin from the list's folder.
+    The first line names the columns (`row.COLUMNS`, options of methods, parameters of scenes). An empty cell is the default.
+    Relative paths begin from the list's folder.
 
     Raises InputError where the file is no such list, and `BadList` for rows that cannot be used.
 
@@ -56,7 +56,7 @@ def read_list(path: PathLike | str, recipe: str = 'fast') -> list[Row]:
         try:
             if len(cells) != len(header):
                 raise InputError(f'has {len(cells)} cells, but the header has {len(header)}')
-            row = _row(dict(zip(header, map(str.strip, cells))), line, path.parent, recipe)
+            row = _row(dict(zip(header, map(str.strip, cells))), line, path.parent, method)
             where += f' ({row.name})'
             key = unicodedata.normalize('NFC', row.name).casefold()  # some file systems do not tell them apart
             if key in names:
@@ -66,7 +66,7 @@ def read_list(path: PathLike | str, recipe: str = 'fast') -> list[Row]:
             names[key] = line
             _check(row)
         except InputError as error:
-            bad.append(str(InputError(f'{where}: {error}')))
+            bad.append(printable(f'{where}: {error}'))
         else:
             rows.append(row)
     if bad:
@@ -112,7 +112,7 @@ def _check_header(path: Path, header: list[str]) -> None:
             raise InputError(f'{path}: has {header.count(name)} columns {shown(name)}; leave one')
 
 
-def _row(cells: dict[str, str], line: int, folder: Path, recipe: str) -> Row:
+def _row(cells: dict[str, str], line: int, folder: Path, method: str) -> Row:
     given = {name: text for name, text in cells.items() if text}
     own = {name: given.pop(name) for name in COLUMNS if name in given}
     file, geometry = own.get('file', ''), own.get('geometry', '')
@@ -120,12 +120,14 @@ def _row(cells: dict[str, str], line: int, folder: Path, recipe: str) -> Row:
         raise InputError('names neither a file nor a scene')
     scene = scene_of(folder, geometry)
     of_scene = _parameters(scene) if scene else frozenset()
-    recipe = own.get('recipe', recipe)
-    known = METHODS['fast'].flat()
-    for name in given:
-        if name not in known and name not in of_scene:
+    method = own.get('method', method)
+    settings = {name: text for name, text in given.items() if name not in of_scene}
+    known = method_of(method).flat()
+    known |= method_of(method, **{k: v for k, v in settings.items() if k in known}).flat()  # start=masks has its own
+    for name in settings:
+        if name not in known:
             raise InputError(
-                f'{shown(name)} is neither a column of a list ({", ".join(COLUMNS)}) nor a setting of the fit'
+                f'{shown(name)} is neither a column of a list ({", ".join(COLUMNS)}) nor an option of {shown(method)}'
                 + (f' nor a parameter of {geometry}' if scene else '')
                 + nearest(name, [*COLUMNS, *known, *of_scene])
             )
@@ -135,11 +137,11 @@ def _row(cells: dict[str, str], line: int, folder: Path, recipe: str) -> Row:
         folder=str(folder.resolve()),
         file=file,
         geometry=geometry,
-        recipe=recipe,
+        method=method,
         views=_whole('views', own['views'], 1) if 'views' in own else None,
         seed=_whole('seed', own.get('seed', '0'), 0),
         mu_water=_positive('mu_water', own['mu_water']) if 'mu_water' in own else None,
-        settings={name: text for name, text in given.items() if name not in of_scene},
+        settings=settings,
         parameters={name: text for name, text in given.items() if name in of_scene},
     )
 
@@ -154,7 +156,7 @@ def _check(row: Row) -> None:
         )
     if name.casefold() in RESERVED:
         raise InputError('the name is that of a file of the batch; choose another, in a column name')
-    row.fit_settings()
+    row.fit_method()
     path = row.path
     if path is not None:
         with reading(path, folder=path.is_dir()):

@@ -10,15 +10,15 @@ from pathlib import Path
 
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files import scans
-from lingo_mi.fitting.recipes import settings_of
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.method import Method
+from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.scene import outline
 from lingo_mi.scene.shipped import scene_path, scenes
 from lingo_mi.storage.file_access import parsed_json, reading
 from lingo_mi.storage.output_folder import CHECKPOINT, FILES, METRICS, occupants, require_ours
 
-# How columns of a list are read; every other column is a setting of the fit, or a parameter of the row's scene.
-COLUMNS = 'name', 'file', 'geometry', 'recipe', 'views', 'seed', 'mu_water'
+# How columns of a list are read; every other column is an option of the method, or a parameter of the row's scene.
+COLUMNS = 'name', 'file', 'geometry', 'method', 'views', 'seed', 'mu_water'
 CONTENT = 'content of the geometry'  # in a request
 SCAN = 'content of the scan'
 NAMED = 'content of files that the geometry names'
@@ -34,11 +34,11 @@ class Row:
     folder      of the list, which relative paths begin from
     file        projections; with a scene for the geometry, a CT volume for its scanner, or '' for its own objects
     geometry    '', a geometry file, or a scene: its file, or the name of a shipped one
-    recipe      or `recipe:setting=value,...`
+    method      of the fit: `name` or `name:option=value,...`
     views       evenly spaced ones to fit; None: all
     seed        of every random choice
     mu_water    of a CT volume in Hounsfield units, in 1/mm
-    settings    that differ from the recipe's, as text
+    settings    options that differ from the method's, as text
     parameters  of the scene, as text
     """
 
@@ -47,7 +47,7 @@ class Row:
     folder: str
     file: str = ''
     geometry: str = ''
-    recipe: str = 'fast'
+    method: str = 'fast'
     views: int | None = None
     seed: int = 0
     mu_water: float | None = None
@@ -64,16 +64,16 @@ class Row:
         """The file of the scene; None where the geometry is none. Raises InputError where there is no such scene."""
         return scene_of(Path(self.folder), self.geometry)
 
-    def fit_settings(self) -> Settings:
-        """All settings of the fit. Raises InputError for an unknown one, or a value out of its range."""
-        return settings_of(self.recipe, **self.settings)
+    def fit_method(self) -> Method:
+        """The method with the row's options. Raises InputError for an unknown option, or a value out of its range."""
+        return method_of(self.method, **self.settings)
 
     def request(self) -> dict:
         """What a stored result must be the answer to: the file, by its name in the list, its size and the contents of its scan,
         and all else that the numbers depend on."""
         path = self.path
         size = path.stat().st_size if path is not None and path.is_file() else None
-        settings = _asked(self.fit_settings())
+        settings = _asked(self.fit_method())
         kept = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
         geometry = Path(self.folder) / self.geometry
         if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
@@ -113,7 +113,7 @@ def _files(path, geometry):
         return [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
     if path.suffix.lower() != '.npy' or geometry is not None:
         return [path]
-    beside = scans.geometry_of(path)
+    beside = scans.geometry_file_of(path)
     return [path, beside, *scans.named_files(beside)]
 
 
@@ -133,9 +133,9 @@ def _digest_of(files):
     return found.hexdigest()
 
 
-def _asked(settings):
-    """The settings that the numbers depend on."""
-    return {name: value for name, value in settings.flat().items() if name != 'checkpoint_seconds'}
+def _asked(method):
+    """The options that the numbers depend on."""
+    return {name: value for name, value in method.flat().items() if name != 'checkpoint_seconds'}
 
 
 def stored(out: Path, row: Row) -> dict | None:
@@ -158,18 +158,15 @@ def stored(out: Path, row: Row) -> dict | None:
         with reading(folder / METRICS):
             found = parsed_json((folder / METRICS).read_text(encoding='utf-8'))
         files, asked = found['files'], found.get('request')
-        if isinstance(asked, dict):
-            # Settings that the result does not know are newer than it; what they stand at changes nothing.
-            asked = json.loads(json.dumps(asked | dict(settings=_asked(Settings()) | asked['settings'])))
+        before = asked['settings'].items() if isinstance(asked, dict) else ()
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):
         raise InputError(f'{folder}: holds a result that is none of a list; give another name')
     wanted = row.request()
-    known = {k: wanted[k] for k in (CONTENT, SCAN, NAMED) if k in wanted} | asked  # of older results they are not known
-    if changed := [k for k in wanted if known.get(k) != wanted[k]]:
+    if changed := [k for k in wanted if asked.get(k) != wanted[k]]:
         if changed == ['settings']:
-            changed = [k for k, v in wanted['settings'].items() if asked['settings'].get(k) != v]
+            changed = [k for k, v in wanted['settings'].items() if (k, v) not in before]
         raise InputError(
             f'{folder}: holds a result of other values of {", ".join(changed)}; remove it, or give another name'
         )

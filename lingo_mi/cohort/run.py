@@ -10,7 +10,7 @@ from lingo_mi.cohort.listing import BadList
 from lingo_mi.cohort.row import Row, stored
 from lingo_mi.cohort.table import CSV, PARQUET, Log, Table
 from lingo_mi.cohort.work import fit_row
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, printable
 from lingo_mi.jobs.job import Event, Job, Runner, run_all
 from lingo_mi.storage.file_access import leftovers
 
@@ -35,7 +35,7 @@ def done_already(rows: Sequence[Row], out: Path) -> dict[str, dict]:
             if (numbers := stored(out, row)) is not None:
                 found[row.name] = numbers
         except InputError as error:
-            bad.append(str(InputError(f'line {row.line} ({row.name}): {error}')))
+            bad.append(printable(f'line {row.line} ({row.name}): {error}'))
     if bad:
         raise BadList(f'{out}: {len(bad)} of {len(rows)} rows cannot be used, so nothing was begun', bad)
     return found
@@ -69,7 +69,7 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
         table.renew(force=False)
 
     missing = [row for row in rows if row.name not in done]
-    jobs = [Job(row.name, row.fit_settings().iterations, fit_row, (row, str(out.resolve()))) for row in missing]
+    jobs = [Job(row.name, row.fit_method().iterations, fit_row, (row, str(out.resolve()))) for row in missing]
     try:
         failed = run_all(jobs, runner, tell)
     except KeyboardInterrupt:

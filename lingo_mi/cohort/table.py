@@ -14,7 +14,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.storage.file_access import reading, replacing, write_text
 
 CSV, PARQUET, LOG = 'results.csv', 'results.parquet', 'batch.log'
-FIRST = 'name', 'status', 'error', 'file', 'geometry', 'recipe', 'views', 'seed'
+FIRST = 'name', 'status', 'error', 'file', 'geometry', 'method', 'views', 'seed'
 PAUSE = 5.0  # seconds between two renewals while jobs run
 
 
@@ -29,10 +29,10 @@ class Table:
         if path.is_symlink() or path.exists():
             with reading(path), open(path, encoding='utf-8', errors='replace') as file:
                 if path.is_symlink() or not file.readline().startswith(','.join(FIRST)):
-                    raise InputError(f'{path}: is no table of a batch; move it away, or choose another --out')
+                    raise InputError(f'{path}: is no table of a batch; move it away, or choose another folder')
         for other in (out / PARQUET, out / LOG):
             if other.is_symlink() or other.exists() and not (path.exists() and other.is_file()):
-                raise InputError(f'{other}: is not that of a batch; move it away, or choose another --out')
+                raise InputError(f'{other}: is not that of a batch; move it away, or choose another folder')
 
     @staticmethod
     def _asked(row: Row) -> dict:

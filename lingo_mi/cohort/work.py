@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
+from lingo_mi.api.fitting import fit
 from lingo_mi.cohort.row import Row, stored
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.results.fit_into import fit_into
 from lingo_mi.scan import Dataset
 from lingo_mi.scene.checks import check_memory, warn_if_truncated
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import choose_views, take_scan
 from lingo_mi.storage.folder_lock import locked
-from lingo_mi.storage.output_folder import CHECKPOINT, clear_leftovers
+from lingo_mi.storage.output_folder import CHECKPOINT
 
 PATIENCE = 60.0  # seconds: a worker that has lost its scheduler stops after its step, and writes its checkpoint
 
@@ -29,22 +28,21 @@ def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
 
     What is there already is not done again. Raises InputError where the scan cannot be fitted.
     """
-    folder = Path(out) / row.name
-    with _patiently_locked(folder, report):
-        clear_leftovers(folder)
-        if (done := stored(Path(out), row)) is not None:
-            return done
-        return fit_into(
-            folder,
-            read_row(row),
-            row.fit_settings(),
-            row.seed,
-            report,
-            resume=(folder / CHECKPOINT).exists(),
-            title=row.name,
-            method=row.recipe.partition(':')[0],
-            request=row.request(),
-        )
+    folder, scan = Path(out) / row.name, read_row(row)
+    _wait_for_lock(folder, report)
+    if (done := stored(Path(out), row)) is not None:
+        return done
+    return fit(
+        scan,
+        row.fit_method(),
+        seed=row.seed,
+        folder=folder,
+        resume=(folder / CHECKPOINT).exists(),
+        force=True,
+        title=row.name,
+        progress=report,
+        record=dict(request=row.request()),
+    ).record
 
 
 def read_row(row: Row) -> Dataset:
@@ -62,21 +60,15 @@ def read_row(row: Row) -> Dataset:
     return dataset
 
 
-@contextmanager
-def _patiently_locked(folder: Path, report: Callable[..., None]) -> Iterator[None]:
-    """The folder's lock, which a process that is about to stop may still hold."""
+def _wait_for_lock(folder: Path, report: Callable[..., None]) -> None:
+    """Wait until a process that is about to stop has let go of the folder."""
     ends = time.monotonic() + PATIENCE
     while True:
-        lock = locked(folder)
         try:
-            lock.__enter__()
-            break
+            with locked(folder):
+                return
         except InputError:
             if time.monotonic() > ends:
                 raise
         report(0)
         time.sleep(0.2)
-    try:
-        yield
-    finally:
-        lock.__exit__(None, None, None)

@@ -1,18 +1,23 @@
 """The one exception for input that a user can mend, and the one warning of numbers that are not as good as promised."""
 
-LONGEST = 299  # characters of a message
+LONGEST = 299  # characters of a message that a command prints
+
+
+def printable(text: object) -> str:
+    """A text on one line, with control characters as escapes."""
+    line = ' '.join(str(text).split())
+    return ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in line)
 
 
 def brief(text: object, longest: int = LONGEST) -> str:
-    """A text on one line of printable characters, its middle left out where it is longer than `longest`.
+    """A `printable` text, its middle left out if it is longer than `longest`.
 
-    What it names stays at the start and how to mend it at the end, also where a file's own text stands between.
+    What it names stays at the start and how to mend it at the end, even if a file's text stands between.
     """
     text = str(text)
-    if len(text) > 4 * longest:  # before it is looked at character by character
+    if len(text) > 4 * longest:  # before every character is examined
         text = text[: 2 * longest] + text[-2 * longest :]
-    line = ' '.join(text.split())
-    line = ''.join(c if c.isprintable() else c.encode('unicode_escape').decode() for c in line)
+    line = printable(text)
     if len(line) <= longest:
         return line
     end = longest // 3
@@ -31,12 +36,12 @@ def shown(value: object) -> str:
 class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, where, and how to mend it.
 
-    Scripts print it and exit with code 2 (see `lingo_mi.cli.common.guard`). The message is made one line of less than 300
-    characters here, whatever it quotes.
+    It names Python's arguments, as in `force=True`. Commands print it in less than 300 characters, with their options instead
+    (see `lingo_mi.cli.common.guard`), and exit with code 2.
     """
 
     def __init__(self, message: object = ''):
-        super().__init__(brief(message))
+        super().__init__(printable(message))
 
 
 class AccuracyWarning(UserWarning):

@@ -1,4 +1,7 @@
-"""What the CUDA driver says of the GPU that Dr.Jit uses: the first of those that CUDA_VISIBLE_DEVICES names, or of all."""
+"""What the CUDA driver says of the GPU that Dr.Jit uses: the first of those that CUDA_VISIBLE_DEVICES names, or of all.
+
+The driver is asked itself: pynvml knows neither the number of multiprocessors nor CUDA_VISIBLE_DEVICES.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""How much memory this process may take for the arrays that it computes on."""
+"""How much memory this process may take for the arrays that it computes on.
+
+psutil gives the memory of the machine, also in a container, whose limit is that of its control group.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import math
 import numbers
 import operator
 from collections.abc import Iterable
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -75,7 +75,7 @@ def checked(name: str, value: Any, like: Any) -> Any:
     return _plain(value)
 
 
-def whole(name: str, value: Any, least: int) -> int:
+def whole_number(name: str, value: Any, least: int) -> int:
     """A whole number from `least` on. Raises InputError, in the name of `name`."""
     try:
         number = operator.index(value)
@@ -88,7 +88,7 @@ def whole(name: str, value: Any, least: int) -> int:
 
 def seed(value: Any, name: str = 'seed') -> int:
     """A seed that every generator of random numbers takes. Raises InputError, in the name of `name`."""
-    number = whole(name, value, 0)
+    number = whole_number(name, value, 0)
     if number > MOST_SEED:
         raise InputError(f'{name} must be at most {MOST_SEED}, not {shown(value)}')
     return number
@@ -96,12 +96,13 @@ def seed(value: Any, name: str = 'seed') -> int:
 
 def require_ranges(part: Any, **ranges: tuple[float, float]) -> None:
     """Raises InputError unless the fields of a dataclass that have a default are of its kind, and every number in its range.
+    Fields that are dataclasses check themselves.
 
     ranges   (least, most), both of them allowed, of every such field that holds a number or two
 
         require_ranges(self, iterations=(1, 1e9), rate=(0, 1))
     """
-    for f in (f for f in fields(part) if f.default is not MISSING):
+    for f in (f for f in fields(part) if not (f.default is MISSING or is_dataclass(f.default))):
         value = checked(f.name, getattr(part, f.name), f.default)
         if isinstance(value, bool | str):
             continue

@@ -1,1 +1,1 @@
-"""Views that were not measured, rendered from a fitted cloud: the first of the two stages of CT."""
+"""Volumes from a fit: views that were not measured are rendered from it, or its volume is the start."""

@@ -1,4 +1,4 @@
-"""Completion of a scan: the views to add between the measured ones, rendered from a fitted cloud."""
+"""Completion of a scan: the views to add between the measured ones, rendered from a fit."""
 
 from __future__ import annotations
 
@@ -8,30 +8,28 @@ from dataclasses import replace
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.completion.clouds import FittedCloud
-from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.reconstruction.arcs import gaps
-from lingo_mi.reconstruction.effects_correction import corrected
+from lingo_mi.reconstruction.line_integrals import corrected
 from lingo_mi.reconstruction.preconditions import require_circle, require_pixels
-from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.description import MOST_VIEWS
 
 
-def fitted_views(dataset: Dataset, geometry: Geometry) -> Scan:
-    """The measured views of a data set that match the views of `geometry` to a hundredth of a pixel, in its order.
+def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
+    """The measured views of a scan that match the views of `geometry` to a hundredth of a pixel, in its order.
 
     Views are matched by geometry, not by angle: a helix repeats angles at other heights. Among equal views, those that
     `geometry.trajectories.spread` chooses are preferred, then the first unused. Raises InputError if a view is missing.
     """
-    scan = dataset.train
     reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()
     there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
     allowed = 0.01 * min(scan.geometry.dDetector)
     missing = InputError(
-        f'the cloud was fitted to {len(geometry)} views, not all of which are among the '
+        f'the fit saw {len(geometry)} views, not all of which are among the '
         f'{len(scan)} of this scan: give the scan that it was fitted to'
     )
     if len(scan) < len(geometry) or scan.geometry.mode != geometry.mode:
@@ -56,12 +54,12 @@ def _corners(geometry: Geometry, reach: float) -> np.ndarray:
     return np.concatenate([source, f.corner, f.corner + columns * f.u, f.corner + rows * f.v], 1)
 
 
-def as_corrected(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
+def as_corrected(scan: Scan, fit: Fit) -> Scan:
     """The `fitted_views` with the poses that the fit has corrected; unchanged if it has corrected none."""
-    if cloud.corrected is cloud.geometry:
+    if fit.poses is None:
         return scan
     g = scan.geometry
-    return replace(scan, geometry=replace(cloud.corrected, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin))
+    return replace(scan, geometry=fit.geometry.on(g.grid))
 
 
 def missing_angles(geometry: Geometry, views: int) -> np.ndarray:
@@ -80,20 +78,20 @@ def missing_angles(geometry: Geometry, views: int) -> np.ndarray:
     return np.concatenate([angles[i] + g * np.arange(1, k) / k for i, g, k in zip(order, gap, parts)])
 
 
-def without_effects(scan: Scan, cloud: FittedCloud | Fitted) -> Scan:
-    """Line integrals of measured views: without the response that the cloud's fit has found, and `corrected`, with the cloud, for
-    the effects that it has modelled. Without either, the scan itself."""
-    response = cloud.model.response if isinstance(cloud, Fitted) else cloud.response
+def without_effects(scan: Scan, fit: Fit) -> Scan:
+    """Line integrals of measured views: without the response that was fitted, and `corrected`, with the cloud, for the effects
+    that the fit has modelled. Without either, the scan itself."""
+    response, effects, cloud = fit.model.response, fit.model.effects, fit.cloud()
     if response is not None:
-        scan = replace(scan, projections=response.undone(scan.projections, cloud.geometry))
-    if cloud.effects is None or isinstance(cloud, Fitted):  # alpha compositing and fields model none
-        return scan
-    return corrected(scan, cloud.effects, [cloud.gaussians], cloud.extent)
+        scan = replace(scan, projections=response.undone(scan.projections, fit.nominal_geometry))
+    if effects is None or cloud is None:
+        return scan if scan.effects is None else replace(scan, effects=None)
+    return corrected(scan, effects.of_cloud(), [cloud], fit.method.flat()['extent'])
 
 
-def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
+def complete_views(scan: Scan, fit: Fit, views: int) -> Scan:
     """A scan of `views` views: the measured ones (`as_corrected` and `without_effects`), and views between them, rendered from
-    the cloud.
+    the fit.
 
     Raises InputError for fewer views than were measured, for more than a scan may have, and for a scan that is not a circle
     about z.
@@ -101,8 +99,8 @@ def complete(scan: Scan, cloud: FittedCloud | Fitted, views: int) -> Scan:
     require_circle(scan, 'the completion of a scan')
     if views > MOST_VIEWS:
         raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
-    check_memory(scan.geometry.slab(0, 1), views=views)  # of the views: no volume is made here
-    return insert_views(without_effects(as_corrected(scan, cloud), cloud), views, cloud.render, scan.geometry)
+    check_memory(scan.geometry.on(scan.geometry.grid.slab(0, 1)), views=views)  # of the views: no volume is made here
+    return insert_views(without_effects(as_corrected(scan, fit), fit), views, fit.line_integrals, scan.geometry)
 
 
 def insert_views(

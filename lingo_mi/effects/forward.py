@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -156,19 +156,16 @@ class Effects:
         """The effects of a panel of which that many pixels became one, dead ones left out."""
         return replace(self, detector=self.detector and self.detector.binned(pixels))
 
-    def linearised(self, scan: Scan) -> Scan:
-        """A scan's line integrals at the reference energy, corrected pixel by pixel; the result has no effects.
-
-        Beam hardening is inverted for a single material, the first of two (water precorrection, Kachelriess et al., Med. Phys.
-        33, 2006). Blur stays.
-        """
-        projections = scan.projections
-        if self.tube and self.tube.hardens:
-            bands = self.tube.signal(self.tube.fitted()[:1], self.response)
-            projections = np.empty_like(projections)
-            for i, view in enumerate(scan.projections):  # one by one, for memory
-                projections[i] = bands.precorrected(view)
-        return replace(scan, projections=projections, effects=None)
+    def without_hardening(self, projections: np.ndarray) -> np.ndarray:
+        """Projections [view, v, u] at the reference energy: beam hardening is inverted, pixel by pixel, for a single material,
+        the first of two (water precorrection, Kachelriess et al., Med. Phys. 33, 2006)."""
+        if not (self.tube and self.tube.hardens):
+            return projections
+        bands = self.tube.signal(self.tube.fitted()[:1], self.response)
+        out = np.empty_like(projections)
+        for i, view in enumerate(projections):  # one by one, for memory
+            out[i] = bands.precorrected(view)
+        return out
 
     def measured(self, integrals: Any, view: View, seed: int) -> Any:
         """Line integrals as the detector reports them, with noise, from expected ones. Not differentiable."""
@@ -176,6 +173,11 @@ class Effects:
             return integrals
         light = np.exp(-integrals.numpy().astype(float)).reshape(view.height, view.width)
         return mi.Float(self.detector.measure(light, self.index, seed).ravel())
+
+
+def effects_of(scan: Scan) -> Effects | None:
+    """A scan's effects, of which `scan`, in a package below this one, knows only two methods."""
+    return cast('Effects | None', scan.effects)
 
 
 def find_effects(scene: Any, sensor: Any) -> Effects | None:
@@ -187,7 +189,7 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
     if len(tubes) > 1:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
     tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
-    shapes = {shape.id() for shape in scene.shapes()} | {'volume'}  # --volume stands in for the shapes
+    shapes = {shape.id() for shape in scene.shapes()} | {'volume'}  # a scanned volume stands in for the shapes
     if tube is not None and (unknown := sorted(tube.materials.keys() - shapes)):
         raise InputError(
             f'xray_tube {tubes[0].id()!r}: material_{unknown[0]} names none of the shapes {", ".join(sorted(shapes))}'

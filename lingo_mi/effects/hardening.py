@@ -129,13 +129,14 @@ class Tube:
         if not names:
             raise InputError(
                 'xray_tube: without a material a spectrum says nothing: add <string name="material" '
-                'value="water"/>, or leave it out with -D effects=ignore'
+                'value="water"/>, or leave it out '
+                "with effects='ignore'"
             )
         if len(names) > 2 or len(names) == 2 and self.split is None:
             raise InputError(
                 f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
                 + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
-                + ', or leave it out with -D effects=ignore'
+                + ", or leave it out with effects='ignore'"
             )
         if len(names) == 2 and names != self.material:
             names = tuple(sorted(names, key=lambda name: attenuation(name, [self.reference])[0]))

@@ -88,8 +88,7 @@ class Scatter:
 
     def within(self, geometry: Geometry) -> Scatter:
         """The same, but nothing scatters outside a geometry's volume. Raises InputError where the two boxes do not meet."""
-        centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
-        low, high = centre - half, centre + half
+        low, high = geometry.grid.low, geometry.grid.high
         if self.box is not None:
             low, high = np.maximum(low, self.box[0]), np.minimum(high, self.box[1])
         if not (low < high).all():

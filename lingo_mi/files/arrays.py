@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.memory import require_room
 from lingo_mi.storage.file_access import one_line, reading, replacing
 
@@ -37,13 +37,13 @@ def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: 
     return array
 
 
-def load(path: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:
+def read_npy(path: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:
     """The array of a .npy file. Raises InputError if it is missing, damaged, pickled, not finite (unless it need
     not be) or not `ndim`-D (None: any)."""
     return numeric(_numpy_load(path, np.ndarray), path, ndim, finite)
 
 
-def load_many(path: PathLike | str) -> dict[str, np.ndarray]:
+def read_npz(path: PathLike | str) -> dict[str, np.ndarray]:
     """The arrays of a .npz file by name. Raises InputError if it is missing, damaged or holds pickled
     objects."""
     return _numpy_load(path, dict)
@@ -87,17 +87,17 @@ def _claimed(stream: IO[bytes], size: int) -> int:
     shape, _, dtype = _HEADERS[npy.read_magic(stream)](stream)
     claimed = math.prod(shape) * dtype.itemsize
     if min(shape, default=0) < 0 or not dtype.hasobject and claimed > size:
-        raise ValueError(f'its header claims the shape {shape} of {dtype}, which {size} bytes cannot hold')
+        raise ValueError(f'its header claims the shape {shown(shape)} of {dtype}, which {size} bytes cannot hold')
     return claimed
 
 
-def save(path: PathLike | str, array: np.ndarray) -> None:
+def write_npy(path: PathLike | str, array: np.ndarray) -> None:
     """Writes a .npy file, whole or not at all. Raises InputError if that is impossible."""
     with replacing(path) as temporary:
-        write(temporary, array)
+        write_npy_in_place(temporary, array)
 
 
-def write(path: PathLike | str, array: np.ndarray) -> None:
+def write_npy_in_place(path: PathLike | str, array: np.ndarray) -> None:
     """Writes a .npy file in place, whose content is on the disk afterwards."""
     with open(path, 'wb') as stream:
         np.save(stream, array, allow_pickle=False)

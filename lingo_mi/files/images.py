@@ -60,7 +60,8 @@ def read_exr(path: PathLike | str) -> np.ndarray:
             raise InputError(f'{path}: is damaged: its header claims {shape[0]} lines; write it again')
         require_room(shape[0] * shape[1] * pixel * 2, path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        # From a stream: the library refuses names of files that are not text.
+        with open(path, 'rb') as stream, OpenEXR.File(stream, separate_channels=True) as file:
             pixels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # a damaged file fails inside the library in many ways
         raise InputError(f'{path}: is damaged or not an OpenEXR file ({one_line(error)}); write it again') from None

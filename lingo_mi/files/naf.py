@@ -13,7 +13,8 @@ Facts of the format, from the generator and the readers that use it:
 
 A pickle is a program. Here it may only build dictionaries, lists, tuples, strings, numbers and numeric
 arrays. The few NumPy names that it may use are replaced by code of this module, so that not even NumPy's own
-functions run.
+functions run. `find_class` of `pickle.Unpickler` alone is not enough: twenty tuples, each of which holds the one before ten
+times, are hashed for ever as the key of a dictionary.
 """
 
 from __future__ import annotations
@@ -99,70 +100,30 @@ class _Array:
         self.value = _array(shape, dtype, data, 'F' if fortran else 'C')
 
 
-class _Name:
-    """Stands for a global name of the pickle. It has no attributes, so the pickle cannot change it."""
-
-    __slots__ = ()
-
-
-class _ReconstructName(_Name):
-    __slots__ = ()
-
-    def __call__(self, *_):
-        return _Array()
-
-
-class _NdarrayName(_Name):
-    __slots__ = ()
-
-    def __call__(self, shape, dtype, buffer):
-        return _Array(_array(shape, dtype, buffer))
-
-
-class _FrombufferName(_Name):
-    __slots__ = ()
-
-    def __call__(self, buffer, dtype, shape, order):
-        return _Array(_array(shape, dtype, buffer, 'F' if order == 'F' else 'C'))
-
-
-class _ScalarName(_Name):
-    __slots__ = ()
-
-    def __call__(self, dtype, data):
-        return _array((), dtype, data)[()]
-
-
-class _DTypeName(_Name):
-    __slots__ = ()
-
-    def __call__(self, name, *_):
-        return _DType(name)
-
-
-class _EncodeName(_Name):
+def _encoded(text, encoding):
     """_codecs.encode: how protocol 2 writes bytes."""
-
-    __slots__ = ()
-
-    def __call__(self, text, encoding):
-        if not isinstance(text, str) or encoding != 'latin1':
-            raise _Refused('a text encoding other than latin1')
-        return text.encode('latin1')
+    if not isinstance(text, str) or encoding != 'latin1':
+        raise _Refused('a text encoding other than latin1')
+    return text.encode('latin1')
 
 
-_NAMES = {('numpy', 'ndarray'): _NdarrayName(), ('numpy', 'dtype'): _DTypeName(), ('_codecs', 'encode'): _EncodeName()}
+_NAMES = {
+    ('numpy', 'ndarray'): lambda shape, dtype, data: _Array(_array(shape, dtype, data)),
+    ('numpy', 'dtype'): lambda name, *_: _DType(name),
+    ('_codecs', 'encode'): _encoded,
+}
 for _core in ('numpy.core', 'numpy._core'):  # NumPy 1, NumPy 2
-    _NAMES[f'{_core}.multiarray', '_reconstruct'] = _ReconstructName()
-    _NAMES[f'{_core}.multiarray', 'scalar'] = _ScalarName()
-    _NAMES[f'{_core}.numeric', '_frombuffer'] = _FrombufferName()
-
+    _NAMES[f'{_core}.multiarray', '_reconstruct'] = lambda *_: _Array()
+    _NAMES[f'{_core}.multiarray', 'scalar'] = lambda dtype, data: _array((), dtype, data)[()]
+    _NAMES[f'{_core}.numeric', '_frombuffer'] = lambda data, dtype, shape, order: _Array(
+        _array(shape, dtype, data, 'F' if order == 'F' else 'C')
+    )
 
 _PythonUnpickler: Any = getattr(pickle, '_Unpickler')  # noqa: B009 - not declared
 
 
 class _Unpickler(_PythonUnpickler):
-    """In Python: it looks at the keys of dictionaries before they are hashed, which of nested tuples may take for ever."""
+    """In Python: it looks at the keys of dictionaries before they are hashed, and at what a state is set of."""
 
     dispatch: ClassVar[dict] = dict(_PythonUnpickler.dispatch)
 
@@ -171,24 +132,7 @@ class _Unpickler(_PythonUnpickler):
             raise _Refused('a state for something that has none')
         super().load_build()
 
-    def _set_items(self):
-        _plain_keys(self.stack[::2])
-        self.load_setitems()
-
-    def _set_item(self):
-        _plain_keys(self.stack[-2:-1])
-        self.load_setitem()
-
-    def _dict(self):
-        _plain_keys(self.stack[::2])
-        self.load_dict()
-
-    def _set(self):
-        raise _Refused('a set')
-
-    dispatch |= {pickle.BUILD[0]: load_build, pickle.SETITEMS[0]: _set_items, pickle.SETITEM[0]: _set_item}
-    dispatch |= {pickle.DICT[0]: _dict}
-    dispatch |= dict.fromkeys((code[0] for code in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)), _set)
+    dispatch[pickle.BUILD[0]] = load_build
 
     def find_class(self, module, name):
         try:
@@ -198,6 +142,22 @@ class _Unpickler(_PythonUnpickler):
 
     def persistent_load(self, pid):
         raise _Refused('a persistent object')
+
+
+def _with_plain_keys(load, keys):
+    def checked(unpickler):
+        _plain_keys(unpickler.stack[keys])
+        load(unpickler)
+
+    return checked
+
+
+for _code, _keys in (
+    (pickle.SETITEM, slice(-2, -1)),
+    (pickle.SETITEMS, slice(0, None, 2)),
+    (pickle.DICT, slice(0, None, 2)),
+):
+    _Unpickler.dispatch[_code[0]] = _with_plain_keys(_Unpickler.dispatch[_code[0]], _keys)
 
 
 def _plain_keys(keys):
@@ -213,6 +173,8 @@ def _scan(stream):
     for count, (code, argument, _) in enumerate(pickletools.genops(stream)):
         if count > _MOST:
             raise _Refused(f'more than {_MOST} instructions')
+        if code.name in ('EMPTY_SET', 'FROZENSET'):
+            raise _Refused('a set')
         place: Any = argument
         if 'PUT' in code.name and int(place) > count:
             raise _Refused(f'place {argument} of the memo')
@@ -308,7 +270,7 @@ def _as_array(value, label, ndim) -> np.ndarray:
         raise InputError(f'{label} is not an array; store {ndim} dimensions of numbers') from None
 
 
-def read(path: PathLike | str) -> Dataset:
+def read_naf(path: PathLike | str) -> Dataset:
     """Reads a NAF / SAX-NeRF pickle.
 
     Required: DSO, DSD (cone beam), nDetector, dDetector or sDetector, nVoxel, dVoxel or sVoxel (mm), and
@@ -343,7 +305,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write(path: PathLike | str, dataset: Dataset) -> None:
+def write_naf(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
 
     Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v).

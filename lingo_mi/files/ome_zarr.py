@@ -1,11 +1,11 @@
 """OME-Zarr: the finest level of the first image in a folder .ome.zarr. OME-NGFF 0.4 and 0.5, Zarr 2 and 3.
 
-https://ngff.openmicroscopy.org/specifications/0.5/
+https://ngff.openmicroscopy.org/specifications/0.5/ zarr unpacks the values. The metadata are read here: ome-zarr compares
+no shape with the memory, and neither library refuses by its name a codec that runs code.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,15 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.memory import require_room
-from lingo_mi.storage.file_access import optional, reading
+from lingo_mi.storage.file_access import optional, read_json, reading
 
 # What numbers are packed with. Others, such as pickle, can run a stranger's code.
 CODECS = {'bytes', 'transpose', 'sharding_indexed', 'crc32c', 'gzip', 'zlib', 'bz2', 'lzma', 'lz4', 'zstd', 'blosc'}
 MILLIMETRES = {'millimeter': 1.0, 'micrometer': 1e-3, 'nanometer': 1e-6, 'centimeter': 10.0, 'meter': 1e3, None: 1.0}
 SPACE = 'x', 'y', 'z'
-_LONGEST_HEADER = 1 << 20
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """The values [x, y, z], the affine [4, 4] in mm, and a description where the file is of ours, else ''.
 
     Raises InputError where the folder is damaged, another one, or has several values a voxel; and where zarr is missing.
@@ -93,13 +92,8 @@ def _attributes(path):
 
 
 def _json(path, file):
-    with reading(file):
-        text = file.read_bytes()[: _LONGEST_HEADER + 1]
-    try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or len(text) > _LONGEST_HEADER:
+    found = read_json(file)
+    if not isinstance(found, dict):
         raise InputError(f'{path}: {file.name} is damaged; fetch it again')
     return found
 

@@ -1,4 +1,7 @@
-"""YAML of plain data: without aliases, names given twice, deep nesting, and more values than a scan needs."""
+"""YAML of plain data: without aliases, names given twice, deep nesting, and more values than a scan needs.
+
+`yaml.safe_load` alone takes all of these: nine lines of aliases stand for a billion values, and of two equal names one is lost.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,7 @@ class _Loader(yaml.SafeLoader):
         raise InputError(f'line {at.start_mark.line + 1} holds {what}')
 
 
-def load(path: PathLike | str) -> Any:
+def read_yaml(path: PathLike | str) -> Any:
     """The dictionaries, lists, texts and numbers of a file.
 
     Raises InputError where it is missing, no YAML, or holds what the module's title names.

@@ -39,9 +39,9 @@ def read_poses(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == '.xml':
-        return rtk.read(path, nDetector, _needed(dDetector, path))
+        return rtk.read_rtk(path, nDetector, _needed(dDetector, path))
     if suffix == '.npy':
-        values = arrays.load(path, None)
+        values = arrays.read_npy(path, None)
     elif suffix in ('.txt', '.csv'):
         values = _table(path)
     else:

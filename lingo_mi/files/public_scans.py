@@ -22,14 +22,14 @@ _HTC = {'DSO', 'DSD', 'dDetector', 'angles_deg'}
 _WALNUT = {'DSO', 'DSD', 'dDetector', 'angles', 'projections', 'air'}
 
 
-def read(path: PathLike | str, name: str = 'ta') -> Dataset:
+def read_public_scan(path: PathLike | str, name: str = 'ta') -> Dataset:
     """Reads a public scan.
 
     name   which sinogram of the Helsinki Tomography Challenge
 
     Raises InputError if the file is damaged, none of those above, or contradicts itself.
     """
-    data = arrays.load_many(path)
+    data = arrays.read_npz(path)
     if any(key.startswith('sinogram_') for key in data) and data.keys() >= _HTC:
         return _htc(path, data, name)
     if data.keys() >= _WALNUT:

@@ -44,7 +44,7 @@ def _views(meta, split, where):
                 f"{where}: entry {i} of proj_{split} must have a 'file_path' and an 'angle' in radians"
             ) from None
         file = beside(where, name)
-        image = arrays.load(file, 2)
+        image = arrays.read_npy(file, 2)
         if projections and image.shape != projections[0].shape:
             raise InputError(
                 f'{file}: has the shape {image.shape}, but the first view has '
@@ -58,7 +58,7 @@ def _views(meta, split, where):
     return make_scan(geometry, np.stack(projections), where)
 
 
-def read(path: PathLike | str) -> Dataset:
+def read_r2(path: PathLike | str) -> Dataset:
     """Reads an R2-Gaussian folder.
 
     Returns a Dataset; the test views and the volume are None where the folder has none. Raises InputError if
@@ -80,11 +80,11 @@ def read(path: PathLike | str) -> Dataset:
         raise InputError(f"{where}: 'proj_train' lists no views; give at least one")
     volume = meta.get('vol', meta.get('ct'))
     if volume is not None:
-        volume = arrays.load(beside(where, volume), 3)
+        volume = arrays.read_npy(beside(where, volume), 3)
     return make_dataset(train, _views(meta, 'test', where), volume, where)
 
 
-def write(path: PathLike | str, dataset: Dataset) -> None:
+def write_r2(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a new R2-Gaussian folder, whole or not at all; lengths and projections stay in mm.
 
     R2-Gaussian itself cannot read a folder without a volume. Raises InputError if the folder exists and is
@@ -95,19 +95,19 @@ def write(path: PathLike | str, dataset: Dataset) -> None:
     scanner = {
         **from_geometry(geometry, offset_order='uv'),
         'sDetector': list(geometry.sDetector),
-        'sVoxel': list(geometry.sVoxel),
+        'sVoxel': list(geometry.grid.size),
         'filter': None,
         'accuracy': 0.5,
         'totalAngle': total,
         'startAngle': start,
         'noise': False,
     }
-    centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
-    meta = {'scanner': scanner, 'bbox': [(centre - half).tolist(), (centre + half).tolist()]}
+    grid = geometry.grid
+    meta = {'scanner': scanner, 'bbox': [grid.low.tolist(), grid.high.tolist()]}
     with new_folder(path) as folder:
         if dataset.volume is not None:
             meta['vol'] = 'vol_gt.npy'
-            arrays.save(folder / meta['vol'], np.asarray(dataset.volume, np.float32))
+            arrays.write_npy(folder / meta['vol'], np.asarray(dataset.volume, np.float32))
         for split, scan in (('proj_train', dataset.train), ('proj_test', dataset.test)):
             meta[split] = []
             if scan is None:
@@ -115,6 +115,6 @@ def write(path: PathLike | str, dataset: Dataset) -> None:
             (folder / split).mkdir()
             for i, (image, angle) in enumerate(zip(scan.projections, scan.geometry.angles)):
                 name = f'{split}/{split}_{i:04d}.npy'
-                arrays.save(folder / name, image)
+                arrays.write_npy(folder / name, image)
                 meta[split].append({'file_path': name, 'angle': float(angle)})
         (folder / META).write_text(json.dumps(meta, indent=4), encoding='utf-8')

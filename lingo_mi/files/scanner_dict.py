@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
+from lingo_mi.geometry.grid import Grid, grid_of
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix
 from lingo_mi.scan import Dataset, Scan
@@ -182,21 +183,23 @@ def to_geometry(
                 raise InputError(f'{where}: {name} is missing; add the distance from the source, in mm')
             values[name] = 0.0  # puts the panel on the axis, which does not matter for a parallel beam
     d_voxel = _steps(values, 'Voxel', n_voxel, where)
-    sizes: dict[str, Any] = dict(nDetector=n_detector, dDetector=d_detector, nVoxel=n_voxel, dVoxel=d_voxel)
+    voxels: dict[str, Any] = dict(nVoxel=n_voxel, dVoxel=d_voxel)
+    sizes: dict[str, Any] = dict(nDetector=n_detector, dDetector=d_detector)
     try:
         if offset_order == 'vu' and (np.ndim(angles) == 2 or moves(values, len(angles))):
-            return _moving(values, angles, where, mode, sizes)
+            return _moving(values, angles, where, mode, sizes | voxels)
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
     origin, offset = (
         np.zeros(length) if values.get(name) is None else _numbers(values, name, where, length)
         for name, length in (('offOrigin', 3), ('offDetector', 2))
     )
-    sizes |= dict(offOrigin=origin, offDetector=offset[::-1] if offset_order == 'uv' else offset)
+    sizes['offDetector'] = offset[::-1] if offset_order == 'uv' else offset
     try:
         return CircularGeometry(
             DSO=float(_numbers(values, 'DSO', where, 1)[0]),
             DSD=float(_numbers(values, 'DSD', where, 1)[0]),
+            grid=grid_of(voxels | dict(offOrigin=origin)),
             angles=angles,
             mode=mode,
             **sizes,
@@ -230,7 +233,11 @@ def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) ->
         if mode not in ('cone', 'parallel'):
             raise InputError(f"mode must be 'cone' or 'parallel', not {shown(mode)}")
         return Geometry.from_poses(
-            views(n_detector, step, mode == 'parallel', origin), n_detector, n_voxel, d_voxel, origin
+            views(n_detector, step, mode == 'parallel', origin),
+            n_detector,
+            nVoxel=n_voxel,
+            dVoxel=d_voxel,
+            offOrigin=origin,
         )
     except InputError as error:
         raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
@@ -245,11 +252,14 @@ def from_geometry(geometry: CircularGeometry, offset_order: str = 'vu') -> dict:
         'DSO': geometry.DSO,
         'nDetector': list(geometry.nDetector),
         'dDetector': list(geometry.dDetector),
-        'nVoxel': list(geometry.nVoxel),
-        'dVoxel': list(geometry.dVoxel),
-        'offOrigin': list(geometry.offOrigin),
+        **of_grid(geometry.grid),
         'offDetector': list(offset),
     }
+
+
+def of_grid(grid: Grid) -> dict[str, list]:
+    """A voxel grid by TIGRE's names, (x, y, z)."""
+    return {'nVoxel': list(grid.shape), 'dVoxel': list(grid.spacing), 'offOrigin': list(grid.centre)}
 
 
 def angle_range(angles: np.ndarray) -> tuple[float, float]:
@@ -272,10 +282,10 @@ def make_scan(
 def make_dataset(train: Scan, test: Scan | None, volume: np.ndarray | None, where: PathLike | str) -> Dataset:
     """A Dataset with a float32 volume, after a check that the volume [x, y, z] has nVoxel voxels."""
     if volume is not None:
-        if volume.shape != train.geometry.nVoxel:
+        if volume.shape != train.geometry.grid.shape:
             raise InputError(
                 f'{where}: the volume has the shape {volume.shape}, but nVoxel is '
-                f'{train.geometry.nVoxel}; volumes are stored [x, y, z]'
+                f'{train.geometry.grid.shape}; volumes are stored [x, y, z]'
             )
         volume = np.asarray(volume, np.float32)
     return Dataset(train, test, volume)
@@ -305,8 +315,7 @@ def check_one_scanner(dataset: Dataset, where: PathLike | str) -> None:
     if len(circles) == len(geometries):
         known = [from_geometry(g) for g in circles]
     else:
-        names = ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin')
-        known = [{name: getattr(g, name) for name in names} for g in geometries]
+        known = [(g.mode, g.nDetector, g.grid) for g in geometries]
     if known[0] != known[-1]:
         raise InputError(
             f'{where}: this format holds one scanner, but the training and test views have '

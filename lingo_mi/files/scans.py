@@ -63,13 +63,13 @@ from lingo_mi.files.scanner_dict import (
     from_geometry,
     make_dataset,
     make_scan,
+    of_grid,
     to_geometry,
     to_posed,
 )
 from lingo_mi.files.slices import by_number
-from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
-from lingo_mi.geometry import astra
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.files.volumes import read_volume, write_volume
+from lingo_mi.geometry import CircularGeometry, Geometry, astra
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.storage.file_access import beside, new_folder, reading, replacing
@@ -111,7 +111,7 @@ VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 def load_yaml(path: PathLike | str) -> dict:
     """The names of a geometry file. Raises InputError if it is missing, damaged, or has others."""
-    values = plain_yaml.load(path)
+    values = plain_yaml.read_yaml(path)
     if not isinstance(values, dict):
         raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
     unknown = sorted(str(key) for key in values.keys() - _KEYS)
@@ -177,7 +177,7 @@ def _valid(values, shape, where):
     if not isinstance(name, str):
         raise InputError(f'{where}: valid must be the name of a .npy file, not {shown(name)}')
     path = beside(where, name)
-    mask = arrays.load(path, None)
+    mask = arrays.read_npy(path, None)
     if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
         raise InputError(
             f'{path}: must be bool of the shape {shape} or {shape[1:]}, not {mask.dtype} of the shape {mask.shape}'
@@ -215,8 +215,7 @@ def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
         if test is not None:
             values['test_angles'] = np.degrees(test.angles).tolist()
     else:
-        values = {'mode': geometry.mode}
-        values |= {name: list(getattr(geometry, name)) for name in ('nDetector', 'nVoxel', 'dVoxel', 'offOrigin')}
+        values = {'mode': geometry.mode, 'nDetector': list(geometry.nDetector), **of_grid(geometry.grid)}
         values['poses'] = poses or astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
         if test is not None:
             values['test_poses'] = astra.to_vectors(test.rays(), test.nDetector).tolist()
@@ -224,7 +223,7 @@ def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
 
 
-def geometry_of(path: Path, geometry: PathLike | str | None = None) -> Any:
+def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
     """The geometry file of an .npy: the one that is named, else one beside it. Raises InputError where there is none."""
     if geometry is not None:
         return geometry
@@ -247,7 +246,7 @@ def _read_npy(path, geometry):
             raise InputError(
                 f'{geometry}: {name} goes with a folder of EXR views; an .npy holds the views to fit alone'
             )
-    projections = arrays.load(path, 3, finite=values.get('valid') is None)
+    projections = arrays.read_npy(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
     if valid is not None:
         projections = np.where(valid, projections, 1)  # a value with a logarithm
@@ -294,7 +293,7 @@ def _write_npy(path, dataset, history=None):
     # An earlier scan stays whole until all of the new one is on the disk.
     with ExitStack() as files:
         for file, values in content.items():
-            arrays.write(files.enter_context(replacing(file)), values)
+            arrays.write_npy_in_place(files.enter_context(replacing(file)), values)
         _dump_yaml(files.enter_context(replacing(path.with_suffix('.yml'))), geometry, **more)
 
 
@@ -354,7 +353,7 @@ def _write_exr_folder(path, dataset):
                     write_exr(folder / split / f'{i:04d}.exr', image)
         geometry = dataset.train.geometry
         if dataset.volume is not None:
-            write_volume(folder / 'volume.nii.gz', dataset.volume, geometry.dVoxel, first_voxel(geometry))
+            write_volume(folder / 'volume.nii.gz', dataset.volume, geometry.grid)
         _dump_yaml(folder / 'geometry.yml', geometry, dataset.test and dataset.test.geometry, input='line_integral')
 
 
@@ -385,7 +384,7 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
         raise InputError(f'{path}: carries its own geometry; a geometry file goes with .npy projections only')
     if path.is_dir():
         if (path / r2.META).exists():
-            return partial(r2.read, path)
+            return partial(r2.read_r2, path)
         if (path / 'geometry.yml').exists():
             return partial(_read_exr_folder, path)
         raise InputError(
@@ -394,21 +393,21 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
     with reading(path):
         open(path, 'rb').close()
     if suffix in ('.pickle', '.pkl'):
-        return partial(naf.read, path)
+        return partial(naf.read_naf, path)
     if suffix == '.npy':
-        return partial(_read_npy, path, geometry_of(path, geometry))
+        return partial(_read_npy, path, geometry_file_of(path, geometry))
     if suffix == '.npz':
-        return partial(public_scans.read, path, name)
+        return partial(public_scans.read_public_scan, path, name)
     raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
 
 
-_WRITERS = {'naf': naf.write, 'r2': r2.write, 'exr': _write_exr_folder, 'npy': _write_npy}
+_WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy}
 
 
 def history_of(path: PathLike | str) -> Any:
     """What a scan's geometry file says of how it was made; None where it says nothing. Raises InputError as `read_scan` does."""
     path = Path(path)
-    return load_yaml(geometry_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
+    return load_yaml(geometry_file_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
 
 
 def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:

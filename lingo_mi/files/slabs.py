@@ -16,8 +16,8 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.volumes import first_voxel, volume_header
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.files.volumes import volume_header
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import new_folder, optional, replacing
 
 NIFTI, ZARR = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr')
@@ -34,48 +34,53 @@ def plan_and_error_map(path: Path) -> tuple[Path, Path]:
     return path.with_name(f'{name}-plan.json'), path.with_name(f'{name}-error{ending}')
 
 
+def check_volume_name(path: Path) -> None:
+    """Raises InputError unless a volume can be written under this name, with the packages that are installed."""
+    if not path.name.endswith((*NIFTI, *ZARR)):
+        raise InputError(
+            f'{path}: volumes are written as NIfTI or OME-Zarr; give a name that ends in .nii, .nii.gz or .ome.zarr'
+        )
+    if path.name.endswith(ZARR):
+        optional('zarr', 'ome-zarr')
+
+
 def write_slabs(
-    path: PathLike | str, geometry: Geometry, slabs: Iterable[np.ndarray], description: str = 'density per mm'
+    path: PathLike | str, grid: Grid, slabs: Iterable[np.ndarray], description: str = 'density per mm'
 ) -> None:
-    """Write a volume on a geometry's voxels, whole or not at all, holding one slab of it at a time.
+    """Write a volume, whole or not at all, holding one slab of it at a time.
 
     path          .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of
                   2 x 2 x 2 voxels)
-    geometry      of the whole volume
+    grid          of the whole volume
     slabs         float32 [x, y, slices] from the first slice on, together the whole volume
     description   what the values are, as of `write_volume`
 
     Raises InputError for another suffix, values that are not finite, slabs that do not make the volume, and a file that cannot be
     written. Slabs of `THICKNESS` slices make whole chunks of .ome.zarr, which are written fastest.
 
-        write_slabs('foot.ome.zarr', scan.geometry, FDK().slabs(scan, 64))
+        write_slabs('foot.ome.zarr', scan.geometry.grid, FDK().slabs(scan, 64))
     """
     path = Path(path)
-    if path.name.endswith(NIFTI):
-        _write_nifti(path, geometry, slabs, description)
-    elif path.name.endswith(ZARR):
-        _write_zarr(path, geometry, slabs, description)
-    else:
-        raise InputError(
-            f'{path}: volumes are written as NIfTI (.nii, .nii.gz) or OME-Zarr (.ome.zarr); give such a name'
-        )
+    check_volume_name(path)
+    write = _write_nifti if path.name.endswith(NIFTI) else _write_zarr
+    write(path, grid, slabs, description)
 
 
-def _checked(path: Path, geometry: Geometry, slabs: Iterable[np.ndarray]):
+def _checked(path: Path, grid: Grid, slabs: Iterable[np.ndarray]):
     """The slabs, float32, with their first slices."""
     begin = 0
     for slab in slabs:
         slab = np.asarray(numeric(np.asarray(slab), path, 3), np.float32)
-        if slab.shape[:2] != geometry.nVoxel[:2] or begin + slab.shape[2] > geometry.nVoxel[2]:
-            raise InputError(f'{path}: slabs of the shape {slab.shape} do not make {geometry.nVoxel} voxels')
+        if slab.shape[:2] != grid.shape[:2] or begin + slab.shape[2] > grid.shape[2]:
+            raise InputError(f'{path}: slabs of the shape {slab.shape} do not make {grid.shape} voxels')
         yield begin, slab
         begin += slab.shape[2]
-    if begin < geometry.nVoxel[2]:
-        raise InputError(f'{path}: slabs of {begin} slices do not make {geometry.nVoxel} voxels')
+    if begin < grid.shape[2]:
+        raise InputError(f'{path}: slabs of {begin} slices do not make {grid.shape} voxels')
 
 
-def _write_nifti(path, geometry, slabs, description):
-    header = volume_header(path, geometry.nVoxel, geometry.dVoxel, first_voxel(geometry), description)
+def _write_nifti(path, grid, slabs, description):
+    header = volume_header(path, grid, description)
     with ExitStack() as stack:
         temporary = stack.enter_context(replacing(path))
         if path.suffix == '.gz':
@@ -83,13 +88,13 @@ def _write_nifti(path, geometry, slabs, description):
         else:
             file = stack.enter_context(open(temporary, 'wb'))
         file.write(header)
-        for _, slab in _checked(path, geometry, slabs):
+        for _, slab in _checked(path, grid, slabs):
             file.write(slab.astype('<f4', copy=False).tobytes(order='F'))
 
 
-def _write_zarr(path, geometry, slabs, description):
+def _write_zarr(path, grid, slabs, description):
     zarr, writer = optional('zarr', 'ome-zarr'), optional('ome_zarr.writer', 'ome-zarr')
-    shapes = [geometry.nVoxel[::-1]]
+    shapes = [grid.shape[::-1]]
     while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
         shapes.append(tuple(n // 2 for n in shapes[-1]))
     with new_folder(path) as temporary:
@@ -100,9 +105,9 @@ def _write_zarr(path, geometry, slabs, description):
             )
             for i, s in enumerate(shapes)
         ]
-        for begin, slab in _grouped(_checked(path, geometry, slabs), 2 ** (len(levels) - 1)):
+        for begin, slab in _grouped(_checked(path, grid, slabs), 2 ** (len(levels) - 1)):
             _add(levels, begin, slab.transpose(2, 1, 0))
-        _describe(writer, group, geometry, len(levels))
+        _describe(writer, group, grid, len(levels))
         group.attrs['lingo_mi'] = description
 
 
@@ -130,8 +135,8 @@ def _add(levels: list[Any], begin: int, slab: np.ndarray) -> None:
         level[begin:end] = slab[: end - begin]
 
 
-def _describe(writer, group, geometry, levels):
-    corner, step = first_voxel(geometry)[::-1], np.array(geometry.dVoxel)[::-1]
+def _describe(writer, group, grid, levels):
+    corner, step = grid.first_voxel[::-1], np.array(grid.spacing)[::-1]
     datasets = [
         dict(
             path=str(i),

@@ -31,10 +31,12 @@ from numpy.typing import ArrayLike
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import short_repr
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.files import arrays, metaimage, nifti, nrrd, ome_zarr, slices
+from lingo_mi.files import arrays, ome_zarr, slices
 from lingo_mi.files.arrays import numeric
+from lingo_mi.files.itk import read_metaimage, read_nrrd
+from lingo_mi.files.nifti import read_nifti
 from lingo_mi.files.voxels import LPS_TO_RAS, read_voxels
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import reading, replacing
 
 _OURS = 'lingo_mi: '
@@ -75,11 +77,6 @@ def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:
     return affine
 
 
-def first_voxel(geometry: Geometry) -> np.ndarray:
-    """World position [3] of the first voxel's centre: offOrigin - sVoxel / 2 + dVoxel / 2, mm."""
-    return np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2 + np.array(geometry.dVoxel) / 2
-
-
 # ---- values ------------------------------------------------------------------------------------------------
 
 
@@ -93,8 +90,8 @@ def _density(data, path, hu, mu_water):
             if mu_water is None:
                 raise InputError(
                     f'{path}: holds negative values down to {low:g}, which may be Hounsfield units '
-                    'or not; if they are, give --mu-water (in scenes and Python mu_water), else set '
-                    'them to 0; in Python, hu=True or hu=False says which'
+                    'or not; if they are, give mu_water=MU, the attenuation of water in 1/mm, '
+                    'else set them to 0; in Python, hu=True or hu=False says which'
                 )
             hu = True
     if hu:
@@ -104,7 +101,7 @@ def _density(data, path, hu, mu_water):
         return (np.clip(data, -1000, 2000) + 1000) / 3000, 'normalised'
     if mu_water is not None:
         raise InputError(
-            f'{path}: --mu-water (mu_water) was given, but the values ({low:g} to {high:g}) do not '
+            f'{path}: mu_water={mu_water:g} was given, but the values ({low:g} to {high:g}) do not '
             'look like Hounsfield units; leave it out, or in Python say hu=True'
         )
     if not high > 0:
@@ -118,7 +115,7 @@ def _density(data, path, hu, mu_water):
 
 
 def _npz(path):
-    volumes = [a for a in arrays.load_many(path).values() if a.ndim == 3]
+    volumes = [a for a in arrays.read_npz(path).values() if a.ndim == 3]
     if len(volumes) != 1:
         raise InputError(f'{path}: holds {len(volumes)} arrays of 3 dimensions; save exactly one')
     return volumes[0]
@@ -196,19 +193,19 @@ def read_volume(
     if (shape is None) != (dtype is None) and not name.endswith('.raw'):
         raise InputError(f'{path}: the shape and the dtype of raw bytes go together; give both or neither')
     if name.endswith('.zarr'):
-        data, affine, description = ome_zarr.read(path)
+        data, affine, description = ome_zarr.read_ome_zarr(path)
     elif path.is_dir():
         data, affine = slices.read_folder(path)
         hu = True if hu is None and affine is not None else hu  # DICOM's
     elif shape is not None and dtype is not None or name.endswith('.raw'):
         data = _raw(path, shape, dtype)
     elif name.endswith(('.nii', '.nii.gz', '.hdr', '.img')):
-        data, affine, description = nifti.read(path)
+        data, affine, description = read_nifti(path)
     elif name.endswith(('.nrrd', '.nhdr', '.mha', '.mhd')):
-        data, affine = (nrrd if name.endswith(('.nrrd', '.nhdr')) else metaimage).read(path)
+        data, affine = (read_nrrd if name.endswith(('.nrrd', '.nhdr')) else read_metaimage)(path)
         affine = LPS_TO_RAS @ affine
     elif name.endswith('.npy'):
-        data = arrays.load(path, 3)
+        data = arrays.read_npy(path, 3)
     elif name.endswith('.npz'):
         data = _npz(path)
     elif name.endswith(('.tif', '.tiff')):
@@ -244,23 +241,15 @@ def read_volume(
     return Volume(np.ascontiguousarray(density, np.float32), (x, y, z), affine, unit)
 
 
-def write_volume(
-    path: PathLike | str,
-    data: np.ndarray,
-    spacing: ArrayLike,
-    origin: ArrayLike | None = None,
-    description: str = 'normalised',
-) -> None:
+def write_volume(path: PathLike | str, data: np.ndarray, grid: Grid, description: str = 'normalised') -> None:
     """Writes a float32 NIfTI file, whole or not at all, that `read_volume` returns unchanged.
 
     path          .nii or .nii.gz
     data          [x, y, z], finite
-    spacing       voxel size (x, y, z), mm
-    origin        world position of the first voxel's centre, mm (see `first_voxel`); None centres the volume
-                  at 0
+    grid          its voxels
     description   what the values are, for example 'normalised' or '1/mm'; about 65 bytes fit
 
-    Raises InputError for another suffix, a wrong shape, values that are not finite, or a file that cannot be
+    Raises InputError for another suffix, a shape that is not the grid's, values that are not finite, or a file that cannot be
     written.
     """
     import nibabel
@@ -269,7 +258,9 @@ def write_volume(
     if not path.name.endswith(('.nii', '.nii.gz')):
         raise InputError(f'{path}: volumes are written as NIfTI; give a name that ends in .nii or .nii.gz')
     data = numeric(np.asarray(data), path, 3)
-    affine, text = _placed(path, data.shape, spacing, origin, description)
+    if data.shape != grid.shape:
+        raise InputError(f'{path}: values of the shape {data.shape} do not make {grid.shape} voxels')
+    affine, text = _placed(path, grid, description)
     image = nibabel.Nifti1Image(np.asarray(data, np.float32), affine)
     image.header.set_xyzt_units('mm')
     image.header['descrip'] = text
@@ -277,19 +268,17 @@ def write_volume(
         nibabel.save(image, temporary)
 
 
-def volume_header(
-    path: PathLike | str, shape: Sequence[int], spacing: ArrayLike, origin: ArrayLike | None, description: str
-) -> bytes:
+def volume_header(path: PathLike | str, grid: Grid, description: str) -> bytes:
     """What stands before the voxels in the file that `write_volume` writes; these follow as little-endian float32, x fastest.
 
-    shape   of the volume; the other arguments as of `write_volume`, as are the errors
+    The arguments and errors are those of `write_volume`.
     """
     import nibabel
 
-    affine, text = _placed(Path(path), shape, spacing, origin, description)
+    affine, text = _placed(Path(path), grid, description)
     header: Any = nibabel.Nifti1Header(endianness='<')
     header.set_data_dtype(np.float32)
-    header.set_data_shape(shape)
+    header.set_data_shape(grid.shape)
     header.set_qform(affine, 'unknown')
     header.set_sform(affine, 'aligned')
     header.set_xyzt_units('mm')
@@ -298,16 +287,12 @@ def volume_header(
     return header.binaryblock + bytes(4)  # no extensions
 
 
-def _placed(path, shape, spacing, origin, description):
+def _placed(path: Path, grid: Grid, description: str):
     """The affine [4, 4] and the description of a NIfTI file, checked."""
-    if max(shape) > np.iinfo(np.int16).max:
+    if max(grid.shape) > np.iinfo(np.int16).max:
         raise InputError(f'{path}: NIfTI has room for {np.iinfo(np.int16).max} voxels along a side; write .ome.zarr')
-    spacing = np.broadcast_to(np.asarray(spacing, float), 3)
-    if not (np.isfinite(spacing).all() and spacing.min() > 0):
-        raise InputError(f'{path}: the voxel size must be positive, not {tuple(spacing)}')
-    affine = centred_affine(shape, spacing)
-    if origin is not None:
-        affine[:3, 3] = origin
+    affine = np.diag([*grid.spacing, 1.0])
+    affine[:3, 3] = grid.first_voxel
     text = (_OURS + description).encode('utf-8')
     if len(text) > 79:
         raise InputError(f'{path}: the description is {len(text)} bytes long with its prefix; NIfTI has room for 79')

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.memory import require_room
 from lingo_mi.storage.file_access import reading
 
@@ -33,7 +33,7 @@ def require_claim(path: PathLike | str, shape: Sequence[int], dtype: np.dtype, r
     count = math.prod(shape)
     if start + count * dtype.itemsize > os.path.getsize(path) * ratio:
         raise InputError(
-            f'{path}: is truncated or damaged: its header claims the shape {list(shape)} of {dtype}, which its '
+            f'{path}: is truncated or damaged: its header claims the shape {shown(list(shape))} of {dtype}, which its '
             f'{os.path.getsize(path)} bytes cannot hold; fetch it again'
         )
     # Unpacked, as float32, and once more while values become densities.
@@ -41,26 +41,21 @@ def require_claim(path: PathLike | str, shape: Sequence[int], dtype: np.dtype, r
     return count * dtype.itemsize
 
 
-def read_exactly(stream: Any, path: PathLike | str, skip: int, size: int, finish: bool = False) -> bytes:
-    """`size` bytes of an unpacked stream, after `skip` others. Raises InputError where it ends before.
-
-    stream   a file that unpacks what is read of it
-    finish   whether to go on to its end, where gzip's checksum is; what follows must be short
-    """
-    while skip > 0:
-        got = len(stream.read(min(skip, _CHUNK)))
-        if not got:
-            break
-        skip -= got
+def read_exactly(stream: Any, path: PathLike | str, size: int) -> bytes:
+    """`size` bytes of a stream that unpacks what is read of it. Raises InputError where it ends before."""
     content = stream.read(size)
     if len(content) < size:
         raise InputError(f'{path}: is truncated or damaged: its data end too early; fetch it again')
+    return content
+
+
+def require_end(stream: Any, path: PathLike | str) -> None:
+    """Go on to the end of a stream that unpacks, where gzip's checksum is. Raises InputError where more than 1 MiB follow."""
     left = _CHUNK
-    while finish and (got := len(stream.read(_CHUNK))):
+    while got := len(stream.read(_CHUNK)):
         left -= got
         if left < 0:
             raise InputError(f'{path}: is damaged: more data follow than its header says; fetch it again')
-    return content
 
 
 def read_voxels(
@@ -86,14 +81,14 @@ def read_voxels(
                 raise InputError(f'{path}: is truncated or damaged: its data begin after its end; fetch it again')
             with open(path, 'rb') as file:
                 file.seek(start)
-                gzipped = file.read(2) == b'\x1f\x8b'
+                gzipped = packing == 'deflate' and file.read(2) == b'\x1f\x8b'
                 file.seek(start)
-                if packing == 'bzip2':
-                    content = read_exactly(bz2.BZ2File(file), path, 0, size, finish=True)
-                elif gzipped:
-                    content = read_exactly(gzip.GzipFile(fileobj=file), path, 0, size, finish=True)
-                else:
+                if packing == 'deflate' and not gzipped:
                     content = _inflated(file.read(), size)
+                else:
+                    stream = gzip.GzipFile(fileobj=file) if gzipped else bz2.BZ2File(file)
+                    content = read_exactly(stream, path, size)
+                    require_end(stream, path)
         except (EOFError, zlib.error, OSError) as error:
             raise InputError(f'{path}: is damaged: its data cannot be unpacked ({error}); fetch it again') from None
     return np.frombuffer(content, dtype).reshape(tuple(shape), order='F')

@@ -17,6 +17,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -24,73 +25,142 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting.checkpoint_schema import VERSION, require_sound
+from lingo_mi.fitting.checkpoint_schema import PLAIN, VERSION, require_sound
+from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.state import State
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.scene.description import describe
 from lingo_mi.storage.file_access import replacing
 from lingo_mi.storage.output_folder import CHECKPOINT, begin
 
 LONGEST_HEADER = 2**16  # bytes of a .npy's
 
 
-def save(path: PathLike | str, state: State, extra: dict, arrays: dict | None = None) -> None:
-    """Write a state and plain values (`extra`, as JSON) atomically: after a crash, the previous checkpoint is intact.
+@dataclass
+class Checkpoint:
+    """A fit between two steps.
 
-    arrays   further NumPy arrays to store, by name
-
-    One of the name checkpoint.npz is part of the result in its folder (see `output_folder.begin`).
-    Raises InputError if it cannot be written.
+    Attributes
+    ----------
+    method : Method
+        With the limits that the scan sets.
+    geometry : Geometry
+        Of the scan, as given.
+    unit : float
+        The density that the fit counts as 1, in 1/mm.
+    state : State
+        All parameters, their moments, the densification statistic.
+    arrays : dict
+        By name: `initial`, the points that the fit started from, float32 [M, 3]; `order`, the views that come next; the mean of
+        the last steps; and those of the corrections.
+    seed : int
+        Of all random choices.
+    rng : dict
+        State of the generator of the views' order, the total variation's cubes and splits.
+    iteration : int
+        Steps done.
+    seconds : float
+        Spent in steps.
+    history : list of dict
+        Measurements over time.
+    info : dict
+        What the start has measured.
+    scan : dict
+        What tells the scan from others; see `resume.identity`.
+    effects : bool
+        Whether the fit models effects of the scan, which a checkpoint does not hold.
+    search : dict or None
+        What the search for the step to stop at has seen; see `stopping`.
+    seen : int
+        Views that the steps see: all, but for a search.
     """
-    path = Path(path)
-    columns = {f'{group}.{k}': v for group in ('values', 'first', 'second') for k, v in getattr(state, group).items()}
-    content: dict[str, Any] = dict(
-        gradient=state.gradient,
-        seen=state.visits,  # the name of earlier versions
-        born=state.born,
-        extra=np.array(json.dumps(extra | dict(version=VERSION), default=np.generic.item)),
-        **columns,
-        **{f'array.{k}': v for k, v in (arrays or {}).items()},
-    )
-    content['checksum'] = np.array(_checksum((name, _Crc.of(array)) for name, array in content.items()))
-    with replacing(path) as temporary:
-        with open(temporary, 'wb') as file:
-            np.savez(file, **content)
-        if path.name == CHECKPOINT:  # as late as can be: until then an old result in the folder is whole
-            begin(path.parent, [CHECKPOINT])
+
+    method: Method
+    geometry: Geometry
+    unit: float
+    state: State
+    arrays: dict[str, np.ndarray]
+    seed: int
+    rng: dict
+    iteration: int
+    seconds: float
+    history: list[dict]
+    info: dict
+    scan: dict
+    effects: bool
+    search: dict | None
+    seen: int
+
+    @property
+    def searching(self) -> bool:
+        """Whether this is of a search for the step to stop at, and not of the fit itself."""
+        return self.seen < len(self.geometry)
+
+    def save(self, path: PathLike | str) -> None:
+        """Write the file atomically: after a crash, the previous one is intact. Raises InputError if it cannot be written.
+
+        One of the name checkpoint.npz is part of the result in its folder (see `output_folder.begin`).
+        """
+        path, state = Path(path), self.state
+        plain = dict(
+            version=VERSION,
+            method=self.method.name,
+            settings=self.method.flat(),
+            scanner=describe(self.geometry),
+            **{name: getattr(self, name) for name in PLAIN},
+        )
+        groups = ('values', 'first', 'second')
+        content: dict[str, Any] = dict(
+            gradient=state.gradient,
+            visits=state.visits,
+            born=state.born,
+            extra=np.array(json.dumps(plain, default=np.generic.item)),
+            **{f'{group}.{k}': v for group in groups for k, v in getattr(state, group).items()},
+            **{f'array.{k}': v for k, v in self.arrays.items()},
+        )
+        content['checksum'] = np.array(checksum_of((name, _Crc.of(array)) for name, array in content.items()))
+        with replacing(path) as temporary:
+            with open(temporary, 'wb') as file:
+                np.savez(file, **content)
+            if path.name == CHECKPOINT:  # as late as can be: until then an old result in the folder is whole
+                begin(path.parent, [CHECKPOINT])
+
+    @classmethod
+    def load(cls, path: PathLike | str) -> Checkpoint:
+        """The fit in a file.
+
+        Loading never runs code from the file, and takes no more memory than its size tells. Raises InputError if the file is
+        missing or is not a sound checkpoint (see `checkpoint_schema`).
+        """
+        try:
+            data = _read(path)
+            plain = json.loads(_text(data.pop('extra')))
+            method, geometry = require_sound(data, plain)
+        except FileNotFoundError:
+            raise InputError(f'{path}: no such file, so there is no checkpoint to go on from') from None
+        except InputError as error:
+            raise InputError(
+                f'{path}: this is not a checkpoint of a fit, or it is damaged: {error}; start again'
+            ) from None
+        except (OSError, KeyError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, struct.error) as error:
+            what = 'extra is missing' if isinstance(error, KeyError) else type(error).__name__
+            raise InputError(
+                f'{path}: this is not a checkpoint of a fit, or it is damaged: {what}; start again'
+            ) from None
+        names = [k[7:] for k in data if k.startswith('values.')]
+        state = State(
+            *({k: data[f'{group}.{k}'] for k in names} for group in ('values', 'first', 'second')),
+            gradient=data['gradient'],
+            visits=data['visits'],
+            born=data['born'],
+        )
+        arrays = {k[6:]: v for k, v in data.items() if k.startswith('array.')}
+        return cls(method, geometry, state=state, arrays=arrays, **{name: plain[name] for name in PLAIN})
 
 
-def load(path: PathLike | str) -> tuple[State, dict, dict]:
-    """The state, the plain values and the further arrays of a checkpoint.
-
-    Raises InputError if the file is missing or is not a sound checkpoint (see `checkpoint_schema`). Loading never runs code from
-    the file, and takes no more memory than its size tells.
-    """
-    try:
-        data, summed = _read(path)
-        extra = json.loads(_text(data.pop('extra')))
-        require_sound(data, extra)
-        if not summed and 'version' in extra:
-            raise InputError('checksum is missing')
-    except FileNotFoundError:
-        raise InputError(f'{path}: no such file, so there is no checkpoint to go on from') from None
-    except InputError as error:
-        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged: {error}; start again') from None
-    except (OSError, KeyError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, struct.error) as error:
-        what = 'extra is missing' if isinstance(error, KeyError) else type(error).__name__
-        raise InputError(f'{path}: this is not a checkpoint of a fit, or it is damaged: {what}; start again') from None
-    extra.pop('version', None)
-    names = [k[7:] for k in data if k.startswith('values.')]
-    state = State(
-        *({k: data[f'{group}.{k}'] for k in names} for group in ('values', 'first', 'second')),
-        gradient=data['gradient'],
-        visits=data['seen'],
-        born=data['born'],
-    )
-    return state, extra, {k[6:]: v for k, v in data.items() if k.startswith('array.')}
-
-
-def _read(path: PathLike | str) -> tuple[dict[str, np.ndarray], bool]:
-    """The entries but for the checksum, by name, and whether there is one. What they claim to hold is compared with the size of
-    the file before memory is taken."""
+def _read(path: PathLike | str) -> dict[str, np.ndarray]:
+    """The entries but for the checksum, by name. What they claim to hold is compared with the size of the file before memory is
+    taken."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise InputError('it is no regular file')
@@ -103,9 +173,11 @@ def _read(path: PathLike | str) -> tuple[dict[str, np.ndarray], bool]:
         raise InputError('an entry is there twice')
     stored, sums = data.pop('checksum', None), {e.filename.removesuffix('.npy'): e.CRC for e in entries}
     sums.pop('checksum', None)
-    if stored is not None and _text(stored) != _checksum(sums.items()):
+    if stored is None:
+        raise InputError('its checksum is missing')
+    if _text(stored) != checksum_of(sums.items()):
         raise InputError('its checksum is wrong')
-    return data, stored is not None
+    return data
 
 
 def _text(array: np.ndarray) -> str:
@@ -137,7 +209,7 @@ def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
     return values.reshape(shape, order='F' if columns_first else 'C')
 
 
-def _checksum(sums: Iterable[tuple[str, int]]) -> str:
+def checksum_of(sums: Iterable[tuple[str, int]]) -> str:
     """One sum over those of all entries, by name."""
     return hashlib.blake2b(json.dumps(sorted(sums)).encode(), digest_size=16).hexdigest()
 

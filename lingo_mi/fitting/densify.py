@@ -6,7 +6,7 @@ smaller by 1.6. R2 gives them half the density too, so three quarters of the mas
 not room for all, those with the largest gradients go first (R2-Gaussian stops). Afterwards faint and stray Gaussians are
 removed. Each Gaussian keeps its Adam moments; new ones start at zero.
 
-With birth='halve' (own), every chosen Gaussian is instead cut in two along its longest axis. Mass, mean and covariance stay,
+With `Halve`, every chosen Gaussian is instead cut in two along its longest axis. Mass, mean and covariance stay,
 so images hardly change. Both halves keep the moments.
 
 Alpha compositing follows 3DGS: clones and halves keep the opacity. Faint Gaussians are removed, later also large ones;
@@ -20,8 +20,8 @@ from dataclasses import replace
 import numpy as np
 
 from lingo_mi.fitting.activations import inverse_scale, inverse_sigmoid
-from lingo_mi.fitting.models import forward_model
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.models.forward import ForwardModel
+from lingo_mi.fitting.options.densification import Clone, Densify, Halve
 from lingo_mi.fitting.state import State, activate, within
 
 RESET = 0.01  # 3DGS: largest opacity after `reset_opacity`
@@ -31,7 +31,8 @@ SHRINK = 1.6  # R2-Gaussian (after 3DGS): scale of the halves of a split over th
 
 def densify(
     state: State,
-    settings: Settings,
+    control: Densify,
+    forward: ForwardModel,
     half: np.ndarray,
     rng: np.random.Generator,
     flat: bool = False,
@@ -44,37 +45,39 @@ def densify(
     flat      True for a fan beam: all Gaussians, also new ones, lie in the plane z = 0
     largest   alpha compositing: Gaussians with a larger standard deviation are removed
     """
-    control = settings.densification
     mean = np.divide(state.gradient, state.visits, out=np.zeros_like(state.gradient), where=state.visits > 0)
     strong = mean >= control.densify_threshold
     room = max(control.max_gaussians - len(state), 0)  # each adds one
     strong[np.argsort(-mean, kind='stable')[room:]] = False
-    if control.birth == 'halve':
-        return prune(halve(state, strong, settings, flat), settings, half, largest)
-    large = activate(state, settings)[1].max(1) > control.split_size
-    state = split(
-        clone(state, strong & ~large, settings),
-        np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
-        settings,
-        rng,
-        flat,
-    )
-    return prune(state, settings, half, largest)
+    if isinstance(control, Halve):
+        state = halve(state, strong, forward, flat)
+    elif isinstance(control, Clone):
+        large = activate(state, forward)[1].max(1) > control.split_size
+        state = split(
+            clone(state, strong & ~large, forward),
+            np.append(strong & large, np.zeros((strong & ~large).sum(), bool)),
+            forward,
+            rng,
+            flat,
+        )
+    return prune(state, control, forward, half, largest)
 
 
-def clone(state: State, chosen: np.ndarray, settings: Settings) -> State:
+def clone(state: State, chosen: np.ndarray, forward: ForwardModel) -> State:
     """Copy the chosen Gaussians [N] to the end; original and copy get half the density each, or keep the opacity."""
-    halved = _shared(state, chosen, 0.5, settings)
+    halved = _shared(state, chosen, 0.5, forward)
     return _append(halved, _fresh(halved, np.flatnonzero(chosen)))
 
 
-def split(state: State, chosen: np.ndarray, settings: Settings, rng: np.random.Generator, flat: bool = False) -> State:
+def split(
+    state: State, chosen: np.ndarray, forward: ForwardModel, rng: np.random.Generator, flat: bool = False
+) -> State:
     """Replace each chosen Gaussian [N] by two smaller ones, at positions drawn from it."""
     parents = np.flatnonzero(chosen).repeat(2)
-    low, high = settings.bounds.scale_min, settings.bounds.scale_max
-    centre, scale, rotation, _ = activate(state, settings)
+    low, high = forward.bounds.scale_min, forward.bounds.scale_max
+    centre, scale, rotation, _ = activate(state, forward)
     shrink = np.array([SHRINK, SHRINK, 1.0 if flat else SHRINK])
-    children = _fresh(_shared(state, chosen, 0.5, settings), parents)
+    children = _fresh(_shared(state, chosen, 0.5, forward), parents)
     offset = rng.normal(size=(len(parents), 3)) * scale[parents]
     if flat:
         offset[:, 2] = 0
@@ -84,14 +87,14 @@ def split(state: State, chosen: np.ndarray, settings: Settings, rng: np.random.G
     return _append(_take(state, ~chosen), children)
 
 
-def halve(state: State, chosen: np.ndarray, settings: Settings, flat: bool = False) -> State:
+def halve(state: State, chosen: np.ndarray, forward: ForwardModel, flat: bool = False) -> State:
     """Replace each chosen Gaussian [N] by two, side by side along its longest axis. The pair has its mass and covariance."""
     parents = np.flatnonzero(chosen)
-    low, high = settings.bounds.scale_min, settings.bounds.scale_max
-    centre, scale, rotation, _ = (x[parents] for x in activate(state, settings))
+    low, high = forward.bounds.scale_min, forward.bounds.scale_max
+    centre, scale, rotation, _ = (x[parents] for x in activate(state, forward))
     axis = np.eye(3)[scale[:, : 2 if flat else 3].argmax(1)]
     shrink = np.where(axis > 0, np.sqrt(1 - APART**2), 1)
-    children = _take(_shared(state, chosen, 0.5 / np.sqrt(1 - APART**2), settings), parents.repeat(2))
+    children = _take(_shared(state, chosen, 0.5 / np.sqrt(1 - APART**2), forward), parents.repeat(2))
     offset = _rotate(rotation, APART * axis * scale)
     children.values['centre'] = np.stack([centre + offset, centre - offset], 1).reshape(-1, 3).astype(np.float32)
     smaller = within(scale * shrink, low * 1.01, high * 0.99)
@@ -100,12 +103,12 @@ def halve(state: State, chosen: np.ndarray, settings: Settings, flat: bool = Fal
     return _append(_take(state, ~chosen), children)
 
 
-def prune(state: State, settings: Settings, half: np.ndarray, largest: float = np.inf) -> State:
+def prune(state: State, control: Densify, forward: ForwardModel, half: np.ndarray, largest: float = np.inf) -> State:
     """Remove faint Gaussians (density or opacity below `prune_density`) and stray ones: centre outside the volume or, for alpha
     compositing, a scale above `largest`. Clear the statistic."""
-    centre, scale, _, amount = activate(state, settings)
-    stays = forward_model(settings).may_stay(centre, scale, half, largest)
-    keep = (amount >= settings.densification.prune_density) & stays
+    centre, scale, _, amount = activate(state, forward)
+    stays = forward.may_stay(centre, scale, half, largest)
+    keep = (amount >= control.prune_density) & stays
     kept = _take(state, keep)
     kept.gradient[:], kept.visits[:] = 0, 0
     return kept
@@ -127,9 +130,9 @@ def reset_opacity(state: State) -> State:
     )
 
 
-def _shared(state, chosen, factor, settings):
+def _shared(state, chosen, factor, forward):
     """The state with the chosen densities multiplied by `factor`, if the forward model has densities."""
-    values = forward_model(settings).shared(state.values, chosen, factor)
+    values = forward.shared(state.values, chosen, factor)
     return replace(state, values=values)
 
 

@@ -8,8 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.fitting.models import forward_model
-from lingo_mi.fitting.settings import Settings
 from lingo_mi.fitting.state import State
 from lingo_mi.projectors.upload import uploaded
 
@@ -49,10 +47,6 @@ class DeviceState:
             self.visits.numpy(),
             self.born,
         )
-
-    def gaussians(self, settings: Settings) -> tuple:
-        """The Gaussians as the forward model takes them (see `models.base.ForwardModel.gaussians`). Differentiable."""
-        return forward_model(settings).gaussians(self.values)
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""

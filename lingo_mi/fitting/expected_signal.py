@@ -9,11 +9,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.common.interpolation import trilinear
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import hardened, second_share
-from lingo_mi.fitting.scattered_light import ScatteredLight
+from lingo_mi.fitting.corrections.scattered_light import ScatteredLight
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.lingo.density import trilinear
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
@@ -36,8 +36,8 @@ class ExpectedSignal:
     def __init__(self, effects: Effects, geometry: Geometry, unit: float):
         """effects: of the scan, in mm. unit: the fit's unit of density, 1/mm. Raises InputError for effects that a fit
         cannot model."""
-        self.effects = effects.scaled(geometry.scale)
-        self.factor = dr.opaque(mi.Float, unit / geometry.scale)
+        self.effects = effects.scaled(geometry.grid.scale)
+        self.factor = dr.opaque(mi.Float, unit / geometry.grid.scale)
         self.bands, self.split = None, None
         self.scattered = None
         if effects.tube and effects.scatter:

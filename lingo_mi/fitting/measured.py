@@ -6,21 +6,19 @@ import numpy as np
 from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting.settings import Settings
-from lingo_mi.reconstruction import effects_correction as corrections
+from lingo_mi.effects.forward import Effects, effects_of
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.scan import Scan
 
 
-def modelled_effects(scan: Scan, settings: Settings) -> Effects | None:
-    """The scan's effects that the fit models. None if the scan has none or the settings ignore them: the fit then treats
-    projections as line integrals."""
-    effects = scan.effects if settings.model.effects == 'model' else None
-    return None if effects is None or effects.ideal else effects
+def modelled_effects(scan: Scan, effects: str) -> Effects | None:
+    """The scan's effects that a fit models. None if the scan has none, or if the fit ignores them and takes projections for line
+    integrals. effects: of the method, 'model' or 'ignore'."""
+    modelled = effects_of(scan) if effects == 'model' else None
+    return None if modelled is None or modelled.ideal else modelled
 
 
-def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
+def weights_of(scan: Scan, weights: str) -> np.ndarray | None:
     """Factors of the pixels before comparison, float32 [view, v, u]; None: no weighting.
 
     A weight is 1 / (standard deviation of the pixel's noise), so that all weighted pixels have the same noise. (Its square is
@@ -30,39 +28,35 @@ def weights_of(scan: Scan, settings: Settings) -> np.ndarray | None:
 
     Raises InputError for a scan with neither a photon count nor a bit depth.
     """
-    if settings.loss.weights == 'equal':
+    if weights == 'equal':
         return None
-    detector = scan.effects.detector if scan.effects else None
+    effects = effects_of(scan)
+    detector = effects.detector if effects else None
     if not (detector and (detector.photons or detector.bits)):
         raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
-    weights = np.empty_like(scan.projections)
+    factors = np.empty_like(scan.projections)
     for i, p in enumerate(scan.projections):  # view by view, for memory
         valid = np.ones(p.shape) if scan.valid is None else scan.valid[i].astype(float)
         light, share = (ndimage.uniform_filter(a, 3, mode='nearest') for a in (np.exp(-p.astype(float)) * valid, valid))
-        weights[i] = 1 / detector.deviation(light / np.maximum(share, 0.1))
-    weighted = max((w * p).max() for w, p in zip(weights, scan.projections))
-    weights *= scan.projections.max() / weighted
-    return weights
+        factors[i] = 1 / detector.deviation(light / np.maximum(share, 0.1))
+    weighted = max((w * p).max() for w, p in zip(factors, scan.projections))
+    factors *= scan.projections.max() / weighted
+    return factors
 
 
 def knows_noise(scan: Scan) -> bool:
     """Whether the photons of a pixel in the open beam are known."""
-    return bool(scan.effects and scan.effects.detector and scan.effects.detector.photons)
+    effects = effects_of(scan)
+    return bool(effects and effects.detector and effects.detector.photons)
 
 
-def trusted(scan: Scan, settings: Settings) -> Scan:
+def trusted(scan: Scan, effects: str) -> Scan:
     """The scan without the detector's known dead pixels."""
-    effects = scan.effects if settings.model.effects == 'model' else None
-    return scan if effects is None else effects.masked(scan)
+    known = effects_of(scan) if effects == 'model' else None
+    return scan if known is None else known.masked(scan)
 
 
-def linearised(scan: Scan, settings: Settings) -> Scan:
-    """Line integrals at the reference energy, for methods without a model of effects: initial clouds, FDK."""
-    effects = scan.effects if settings.model.effects == 'model' else None
-    return scan if effects is None else corrections.linearised(scan, effects)
-
-
-def density_unit(scan: Scan, settings: Settings) -> float:
-    """A fit's unit of density, 1/mm; see the setting `normalise`. Raises InputError for an empty scan."""
+def density_unit(scan: Scan, normalise: bool) -> float:
+    """The density that a fit counts as 1, in 1/mm; see `CloudMethod.normalise`. Raises InputError for an empty scan."""
     require_signal(scan, 'fit')
-    return float(scan.projections.max()) * scan.geometry.scale if settings.model.normalise else 1.0
+    return float(scan.projections.max()) * scan.geometry.grid.scale if normalise else 1.0

@@ -1,4 +1,4 @@
-"""Checks whether a fit may continue from a checkpoint."""
+"""Checks whether a fit may go on from a checkpoint."""
 
 from __future__ import annotations
 
@@ -9,20 +9,31 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.effects.forward import effects_of
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.method import Method
 from lingo_mi.scan import Scan
+from lingo_mi.scene.description import describe
 
 
-def extensible(settings: Settings, scatters: bool = False) -> bool:
-    """Whether a longer fit repeats the steps of a shorter one, so that it can continue from its checkpoint.
+def identity(scan: Scan) -> dict:
+    """What tells a scan from others of the same geometry, as plain values: number of views, mean and moments of the projections,
+    digests of the valid pixels and of the effects."""
+    e = effects_of(scan)
+    named = None
+    if e is not None:
+        named = [e.tube and e.tube.given, e.spot and vars(e.spot), e.scatter and e.scatter.given]
+        named.append(e.detector and vars(e.detector))
+    return dict(
+        views=len(scan),
+        signal=float(scan.projections.mean(dtype=float)),
+        moments=_moments(scan.projections),
+        valid=None if scan.valid is None else hashlib.sha256(np.packbits(scan.valid).tobytes()).hexdigest(),
+        effects=None if named is None else hashlib.sha256(json.dumps(named, default=str).encode()).hexdigest(),
+    )
 
-    scatters   whether the fit models scattered light, which is renewed at shares of the iterations
-    """
-    plain = settings.coarse_share == 0 and settings.adam.average == 0 and settings.stopping.stop == 'off'
-    return plain and settings.decay_steps > 0 and not settings.calibration.responds and not scatters
 
-
-def moments(projections: np.ndarray) -> list[float]:
+def _moments(projections: np.ndarray) -> list[float]:
     """Means of the projections times the view's, the row's and the column's number, from 0 to 1: they tell apart what has one
     mean."""
     p = (
@@ -33,51 +44,43 @@ def moments(projections: np.ndarray) -> list[float]:
     return [float(np.mean(x * np.linspace(0, 1, len(x)))) for x in p]
 
 
-def traits(scan: Scan) -> dict[str, str | None]:
-    """Tells scans of the same projections apart: digests of the valid pixels and of the effects, as plain values."""
-    e = scan.effects
-    named = None
-    if e is not None:
-        named = [e.tube and e.tube.given, e.spot and vars(e.spot), e.scatter and e.scatter.given]
-        named.append(e.detector and vars(e.detector))
-    return dict(
-        valid=None if scan.valid is None else hashlib.sha256(np.packbits(scan.valid).tobytes()).hexdigest(),
-        effects=None if named is None else hashlib.sha256(json.dumps(named, default=str).encode()).hexdigest(),
-    )
+def require_same_fit(stored: Checkpoint, method: Method, scan: Scan, seed: int, path: Path) -> None:
+    """Raise InputError if a checkpoint is of another fit.
 
-
-def require_same_fit(
-    extra: dict, settings: Settings, scanned: dict, seed: int, path: Path, scatters: bool = False
-) -> None:
-    """Raise InputError if a checkpoint, by its plain values, belongs to another fit. scatters: as of `extensible`."""
-    now = settings.flat()
-    # Settings that the checkpoint does not know are newer than it; what they stand at changes nothing.
-    before = Settings().flat() | {k: tuple(v) if isinstance(v, list) else v for k, v in extra['settings'].items()}
+    method   with the limits that the scan sets
+    path     of the checkpoint, for the message
+    """
+    before, now = stored.method.flat(), method.flat()
     free = {'checkpoint_seconds'}
-    if extensible(settings, scatters) and extra['iteration'] <= settings.iterations:
+    # Scattered light is estimated after shares of the iterations.
+    scatters = stored.effects and (e := effects_of(scan)) is not None and e.scatter is not None
+    if method.extensible and not scatters and stored.iteration <= method.iterations:
         free.add('iterations')
-    changed = [k for k in now if before.get(k) != now[k] and k not in free]
-    if extra['seed'] != seed:
+    changed = ['the method'] if stored.method.name != method.name else []
+    if not changed:
+        changed += [k for k in now if before.get(k) != now[k] and k not in free]
+    if stored.seed != seed:
         changed.append('seed')
-    if extra['views'] != scanned['views']:
+    was, is_now = stored.scan, identity(scan)
+    if was['views'] != is_now['views']:
         changed.append('views')
-    elif extra['scanner'] != json.loads(json.dumps(scanned['scanner'], default=np.generic.item)):
+    elif _plain(describe(stored.geometry)) != _plain(describe(scan.geometry)):
         changed.append('the geometry')
     elif not np.allclose(
-        [extra['signal'], *extra.get('moments', scanned['moments'])],  # earlier checkpoints have no moments
-        [scanned['signal'], *scanned['moments']],
+        [was['signal'], *was['moments']],
+        [is_now['signal'], *is_now['moments']],
         rtol=1e-4,  # simulated anew, their last digits may differ
-        atol=1e-4 * abs(scanned['signal']),
+        atol=1e-4 * abs(is_now['signal']),
     ):
         changed.append('the projections')
-    known = extra.get('traits', scanned['traits'])  # earlier checkpoints have none
-    changed += [
-        what
-        for name, what in dict(valid='the valid pixels', effects='the effects of the scan').items()
-        if known[name] != scanned['traits'][name]
-    ]
+    names = dict(valid='the valid pixels', effects='the effects of the scan')
+    changed += [what for name, what in names.items() if was[name] != is_now[name]]
     if changed:
         raise InputError(
             f'{path}: the checkpoint was made with other values of {", ".join(changed)}; resume with the same '
             'settings, or remove it and start again'
         )
+
+
+def _plain(values: dict) -> dict:
+    return json.loads(json.dumps(values, default=np.generic.item))

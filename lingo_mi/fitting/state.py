@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lingo_mi.fitting.activations import inverse_scale, sigmoid
-from lingo_mi.fitting.models import forward_model
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.models.forward import ForwardModel
 
 
 @dataclass
@@ -34,20 +33,20 @@ class State:
         return len(self.born)
 
 
-def start(points: np.ndarray, spacing: np.ndarray, density: np.ndarray | None, settings: Settings) -> State:
+def start(points: np.ndarray, spacing: np.ndarray, density: np.ndarray | None, forward: ForwardModel) -> State:
     """The state at the start of a fit: isotropic Gaussians, unrotated, with zero moments.
 
     points [N, 3]; spacing [N], standard deviations; density [N] at the centres, in the fit's unit (None for alpha
     compositing). All in the normalised frame.
     """
-    low, high = settings.bounds.scale_min, settings.bounds.scale_max
+    low, high = forward.bounds.scale_min, forward.bounds.scale_max
     n = len(points)
     scale = within(spacing, low + 1e-5, high - 1e-5)[:, None].repeat(3, 1)
     values = dict(
         centre=np.asarray(points),
         scale=inverse_scale(scale, low, high),
         rotation=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
-        **forward_model(settings).initial(n, density),
+        **forward.initial(n, density),
     )
     values = {k: np.ascontiguousarray(v, np.float32) for k, v in values.items()}
     zeros = {k: np.zeros_like(v) for k, v in values.items()}
@@ -61,15 +60,15 @@ def start(points: np.ndarray, spacing: np.ndarray, density: np.ndarray | None, s
     )
 
 
-def activate(state: State, settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def activate(state: State, forward: ForwardModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Centres, standard deviations, unit quaternions (x, y, z, w) and densities or opacities, float64 [N, ...].
 
     Scales are a sigmoid between the bounds (R2-Gaussian). The forward model gives densities or opacities.
     """
-    low, high = settings.bounds.scale_min, settings.bounds.scale_max
+    low, high = forward.bounds.scale_min, forward.bounds.scale_max
     centre, scale, rotation = (state.values[k].astype(float) for k in ('centre', 'scale', 'rotation'))
     rotation = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
-    return centre, low + (high - low) * sigmoid(scale), rotation, forward_model(settings).amount(state.values)
+    return centre, low + (high - low) * sigmoid(scale), rotation, forward.amount(state.values)
 
 
 def within(scale: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -10,47 +10,49 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fitting import losses
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.options.loss import Loss
 from lingo_mi.fitting.view_loss import evaluate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.view import vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 
 FAR = 1e6  # in the normalised frame, where a scan's volume has about the size 1
 
 
 def random_cube_variation(
-    gaussians: Sequence, geometry: Geometry, settings: Settings, rng: np.random.Generator, factor: Any = None
+    gaussians: Sequence, geometry: Geometry, loss: Loss, extent: float, rng: np.random.Generator, factor: Any = None
 ) -> Any:
     """Total variation of a randomly placed cube of samples.
 
     Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
 
     gaussians   centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame
+    loss        its weight of the variation, and the cube's samples
+    extent      cut-off in standard deviations
     geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
     factor      on the loss (`loss_scale`), Float [1], which the gradient has and the value has not; None: 1
     """
-    s, half, extent = settings.loss, geometry.half, settings.model.extent
-    voxel, between = 2 * half / geometry.nVoxel, np.array(geometry.nVoxel) - 1
-    shape = tuple(int(min(s.tv_size, n // s.tv_stride + 1)) for n in between)
-    room = between - (np.array(shape) - 1) * s.tv_stride
-    corner = -half + (0.5 - 0.5 * s.tv_stride + rng.random(3) * room) * voxel
-    voxel = voxel * s.tv_stride
+    half = geometry.grid.half
+    voxel, between = 2 * half / geometry.grid.shape, np.array(geometry.grid.shape) - 1
+    shape = tuple(int(min(loss.tv_size, n // loss.tv_stride + 1)) for n in between)
+    room = between - (np.array(shape) - 1) * loss.tv_stride
+    corner = -half + (0.5 - 0.5 * loss.tv_stride + rng.random(3) * room) * voxel
+    voxel = voxel * loss.tv_stride
     low, high, step = vector64(corner), vector64(corner + shape * voxel), vector64(voxel)
-    settled = dict(shape=shape, extent=extent, weight=s.lambda_tv)
+    settled = dict(shape=shape, extent=extent, weight=loss.lambda_tv)
     if dr.backend_v(mi.Float) == dr.JitBackend.CUDA:
-        loss, gradients = _REPLAY(*gaussians, low, high, step, factor, **settled)
+        value, gradients = _REPLAY(*gaussians, low, high, step, factor, **settled)
         for x, gradient in zip(gaussians, gradients):
             dr.accum_grad(x, gradient)
-        return loss
+        return value
     index: Any = dr.compress(_near(gaussians, low, high, extent))
     if dr.width(index) == 0:
         return mi.Float(0)
     chosen = [dr.gather(type(x), x, index, mode=dr.ReduceMode.NoConflicts) for x in gaussians]
-    loss = _differentiated(chosen, low, step, factor, **settled)
+    value = _differentiated(chosen, low, step, factor, **settled)
     evaluate(gaussians)
-    return loss
+    return value
 
 
 def _near(gaussians, low, high, extent):
@@ -62,7 +64,7 @@ def _near(gaussians, low, high, extent):
 
 def _differentiated(gaussians, corner, step, factor, shape, extent, weight):
     """The value for a cube of samples, whose gradient it adds to the Gaussians'."""
-    cube = voxelize(*gaussians, grid=Grid(corner, step, shape), extent=extent)
+    cube = voxelize(*gaussians, grid=Lattice(corner, step, shape), extent=extent)
     loss = weight * losses.tv(cube, shape[::-1])
     dr.backward(loss if factor is None else factor * loss)
     return dr.detach(loss)

@@ -11,10 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.fitting import losses
-from lingo_mi.fitting.loss_scale import loss_scale
-from lingo_mi.fitting.models import forward_model
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.measured import weights_of
+from lingo_mi.fitting.models.forward import ForwardModel
+from lingo_mi.fitting.options.loss import ImageLoss
+from lingo_mi.lingo.loss_scale import loss_scale
 from lingo_mi.projectors.backprop import Cuts, leaves
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.replay import Replay
@@ -24,7 +24,7 @@ from lingo_mi.scan import Scan
 
 
 @dataclass
-class Target:
+class MeasuredView:
     """A measured view on the device.
 
     view       its rays
@@ -43,11 +43,11 @@ class Target:
     scattered: Any = None
 
     @staticmethod
-    def of(scan: Scan, index: int, unit: float, weights: np.ndarray | None = None) -> Target:
+    def of(scan: Scan, index: int, unit: float, weights: np.ndarray | None = None) -> MeasuredView:
         """View `index` of a scan; weights float32 [view, v, u] or None."""
         height, width = scan.geometry.nDetector
         rays = scan.geometry.normalised_rays()[[index]]
-        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.scale / unit)
+        pixels = scan.projections[index].ravel() * np.float32(scan.geometry.grid.scale / unit)
         valid = on_device = None
         if weights is not None:
             own = weights[index].ravel()
@@ -55,7 +55,7 @@ class Target:
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)
-        return Target(View.of(rays, 0, height, width), uploaded(pixels), on_device, valid, rays)
+        return MeasuredView(View.of(rays, 0, height, width), uploaded(pixels), on_device, valid, rays)
 
     def masked(self, image: Any) -> Any:
         """The image prepared for comparison: weighted, invalid pixels zero (as in `pixels`).
@@ -67,20 +67,34 @@ class Target:
         return image if self.valid is None else dr.select(self.valid, image, 0)
 
 
+def targets_of(scan: Scan, unit: float, weights: str = 'equal') -> list[MeasuredView]:
+    """All views of a scan. unit: of density; weights: as of `ImageLoss`."""
+    factors = weights_of(scan, weights)
+    return [MeasuredView.of(scan, i, unit, factors) for i in range(len(scan))]
+
+
 def differentiate(
-    gaussians: tuple, target: Target, settings: Settings, batch: int, signal: Any = None, share: Any = None
+    gaussians: tuple,
+    target: MeasuredView,
+    loss: ImageLoss,
+    forward: ForwardModel,
+    batch: int,
+    signal: Any = None,
+    share: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
 
-    batch   views per step; the loss is their mean
-    signal  `ExpectedSignal` of the detector; None: line integrals
-    share   of the second of two materials in every Gaussian, Float [N]; None: one material
+    loss     what is compared, and how
+    forward  the model of the Gaussians
+    batch    views per step; the loss is their mean
+    signal   `ExpectedSignal` of the detector; None: line integrals
+    share    of the second of two materials in every Gaussian, Float [N]; None: one material
 
     Returns the view's part of the loss, Float [1], without the factor; of the densification statistic, Float [N] each: the norm
     of the gradient by the projected centre, and 1 if the Gaussian is visible; and of the factor on the loss, Float [1], or
     None where there is none.
     """
-    s, view, forward = settings.loss, target.view, forward_model(settings)
+    view = target.view
     bundles = []  # of rays: one, or several if the signal is a mean over them
 
     def image_along(rays):
@@ -92,24 +106,24 @@ def differentiate(
 
     image = image_along(view)[0] if signal is None else signal.image(image_along, view, target.scattered)
     compared = target.masked(image), target.pixels, view.height, view.width
-    loss = losses.combined(*compared, s.lambda_ssim, s.lambda_gradient, s.lambda_l1)
-    factor = loss_scale(dr.detach(image)) if s.loss_scale != 'none' else mi.Float(1)
-    weight = (factor if s.loss_scale == 'dynamic' else mi.Float(1)) * (1 / batch)
+    value = loss.value(*compared)
+    factor = loss_scale(dr.detach(image)) if loss.loss_scale != 'none' else mi.Float(1)
+    weight = (factor if loss.loss_scale == 'dynamic' else mi.Float(1)) * (1 / batch)
     # Bundles share the graph from the pose, so its edges must be kept until the last bundle.
     flags = dr.ADFlag.Default if len(bundles) == 1 else dr.ADFlag.ClearVertices
-    dr.backward(loss * weight, flags=flags)
+    dr.backward(value * weight, flags=flags)
     # Outside `suspend_grad`, where gradients read as zero.
     gx, gy = functools.reduce(_sum, [(dr.grad(leaf[-2]), dr.grad(leaf[-1])) for _, leaf, _ in bundles])
     footprints = bundles[len(bundles) // 2][0]
     with dr.suspend_grad():
         norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
-        norm = norm * factor if s.loss_scale == 'statistic' else norm
+        norm = norm * factor if loss.loss_scale == 'statistic' else norm
         visible = dr.select(footprints.visible, mi.Float(1), 0)
     for footprints, leaf, cut in bundles:  # one by one: a single kernel for all would take long to compile
         with full_float64():
             cut.pass_on(footprints.values, map(dr.grad, leaf), flags)
         evaluate((*gaussians, view.source, view.corner, view.u, view.v))
-    return dr.detach(loss) * (1 / batch), norm, visible, weight if s.loss_scale == 'dynamic' else None
+    return dr.detach(value) * (1 / batch), norm, visible, weight if loss.loss_scale == 'dynamic' else None
 
 
 def _sum(a, b):
@@ -118,10 +132,12 @@ def _sum(a, b):
     return total
 
 
-def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings, batch: int) -> list:
+def differentiate_replayed(
+    gaussians: tuple, target: MeasuredView, loss: ImageLoss, forward: ForwardModel, batch: int
+) -> list:
     """`differentiate` for plain line integrals, replayed from a recording. The view's pose is constant."""
     view = target.view
-    *found, gradients = _REPLAY(
+    *results, gradients = _REPLAY(
         *gaussians,
         view.source,
         view.corner,
@@ -133,19 +149,20 @@ def differentiate_replayed(gaussians: tuple, target: Target, settings: Settings,
         height=view.height,
         width=view.width,
         parallel=view.parallel,
-        settings=settings,
+        loss=loss,
+        forward=forward,
         batch=batch,
     )
     for x, gradient in zip(gaussians, gradients):
         dr.accum_grad(x, gradient)
-    return found
+    return results
 
 
-def _differentiated(*arrays, height, width, parallel, settings, batch):
+def _differentiated(*arrays, height, width, parallel, loss, forward, batch):
     *gaussians, source, corner, u, v, pixels, weights, valid = arrays
     dr.enable_grad(gaussians)
-    target = Target(View(source, corner, u, v, width, height, parallel), pixels, weights, valid)
-    return *differentiate(tuple(gaussians), target, settings, batch), [dr.grad(x) for x in gaussians]
+    target = MeasuredView(View(source, corner, u, v, width, height, parallel), pixels, weights, valid)
+    return *differentiate(tuple(gaussians), target, loss, forward, batch), [dr.grad(x) for x in gaussians]
 
 
 _REPLAY = Replay(_differentiated)

@@ -3,7 +3,7 @@ r"""The exact forward operators of a cloud of Gaussians, on whatever arrays the 
     sigma(x) = sum_i density_i exp(-1/2 |diag(1/scale_i) R_i^T (x - mean_i)|^2)
 
 `project` integrates sigma along the rays of a scan, in closed form (`projectors.footprint`); `voxelize` samples it at the
-centres of the scan's voxels. What comes out is of the caller's kind, with the caller's automatic differentiation:
+centres of voxels. What comes out is of the caller's kind, with the caller's automatic differentiation:
 
     NumPy, lists, anything with __array__ or __dlpack__ -> NumPy
     Dr.Jit arrays and tensors -> TensorXf
@@ -28,7 +28,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.common.memory import room
 from lingo_mi.functional.frameworks import call
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
 from lingo_mi.projectors.cloud import line_integrals
@@ -89,29 +89,31 @@ def project(
 
 
 def voxelize(
-    means: Any, scales: Any, quaternions: Any, density: Any, geometry: Geometry, *, extent: float = cutoff.RENDER
+    means: Any, scales: Any, quaternions: Any, density: Any, grid: Grid | Geometry, *, extent: float = cutoff.RENDER
 ) -> Any:
-    """Densities of a cloud of Gaussians at the centres of the scan's voxels: a grid [x, y, z], float32, of the caller's kind.
+    """Densities of a cloud of Gaussians at the voxel centres of a grid: [x, y, z], float32, of the caller's kind.
 
-    Arguments and errors are those of `project`. Differentiable in all four arrays, in reverse mode.
+    grid   or a geometry, whose grid it is
 
-        grid = voxelize(means, scales, quaternions, density, geometry)
+    The other arguments, and errors, are those of `project`. Differentiable in all four arrays, in reverse mode.
+
+        volume = voxelize(means, scales, quaternions, density, Grid(128, 2.0))
     """
-    require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
-    shape = geometry.nVoxel
-    corner = np.array(geometry.offOrigin, float) - np.array(geometry.sVoxel) / 2
+    require_type('grid', grid, (Grid, Geometry), 'of a scan give scan.geometry.grid')
+    grid = grid.grid if isinstance(grid, Geometry) else grid
+    corner, step, shape = grid.low, grid.spacing, grid.shape
     extent = _extent(extent)
     _require_room(shape, 'voxelize')
 
-    def grid(*gaussians):
-        cells = voxels.Grid(vector64(corner), vector64(geometry.dVoxel), shape)
+    def volume(*gaussians):
+        cells = voxels.Lattice(vector64(corner), vector64(step), shape)
         values = voxels.voxelize(*gaussians, grid=cells, extent=extent, deep=True)
         i, (nx, ny, nz) = dr.arange(mi.UInt32, math.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
         # [z, y, x] to [x, y, z]. Every voxel is read once, so the derivative needs no atomics.
         x, rest = i // (ny * nz), i % (ny * nz)
         return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
 
-    return call(_checked(grid, 'voxelize'), (means, scales, quaternions, density), shape, 'voxelize')
+    return call(_checked(volume, 'voxelize'), (means, scales, quaternions, density), shape, 'voxelize')
 
 
 def _checked(function, name: str):

@@ -1,13 +1,17 @@
-"""Where a scan's rays are: scanners in TIGRE's terms, poses, and what other packages call them. Needs no Mitsuba."""
+"""Where a scan's rays and voxels are: scanners in TIGRE's terms, poses, and what other packages call them. Needs no Mitsuba."""
 
-from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.circle import CircularGeometry
+from lingo_mi.geometry.grid import Grid
+from lingo_mi.geometry.posed import PosedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, scanner_rays, spread
 
 __all__ = [
     'CircularGeometry',
     'Geometry',
+    'Grid',
     'PosedGeometry',
     'Rays',
     'camera_matrices',

@@ -15,16 +15,59 @@ ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.cre
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.circle import CircularGeometry
+from lingo_mi.geometry.grid import Grid, Voxels, grid_of
 from lingo_mi.geometry.rays import Rays
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 CIRCLES = {'cone': 'cone', 'parallel3d': 'parallel'}  # ASTRA's types of scans on a circle, and their beams
 VECTORS = {'cone_vec': 'cone', 'parallel3d_vec': 'parallel'}  # of scans with a pose for every view
+
+
+def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]) -> Geometry:
+    """The scan that geometries of the ASTRA toolbox describe.
+
+    ASTRA's arrays are [v, view, u] with rows that run up, and volumes [z, y, x]: `sinogram.transpose(1, 0, 2)[:, ::-1]` and
+    `volume.T` go with the result.
+
+    Parameters
+    ----------
+    proj_geom : dict
+        Of the type 'cone', 'cone_vec', 'parallel3d' or 'parallel3d_vec'; lengths as they are.
+    vol_geom : dict
+        Of `astra.create_vol_geom` in three dimensions.
+    **voxels
+        Instead of vol_geom: either grid, or nVoxel, dVoxel and offOrigin, as of `Geometry.cone`.
+
+    Raises
+    ------
+    InputError
+        For other types, and if a number is missing or makes no scan.
+
+    Examples
+    --------
+    ::
+
+        proj = astra.create_proj_geom('cone', 1.0, 1.0, 256, 256, np.linspace(0, 2 * np.pi, 90, False), 1000, 500)
+        Geometry.from_astra(proj, astra.create_vol_geom(128, 128, 128))
+    """
+    if (vol_geom is None) == (not voxels):
+        raise InputError('an ASTRA geometry needs its voxels: give either vol_geom, or grid, or both nVoxel and dVoxel')
+    voxel_grid = grid_of(voxels) if vol_geom is None else grid(vol_geom)
+    if kind_of(proj_geom) in CIRCLES:
+        return CircularGeometry(**circle(proj_geom), grid=voxel_grid)
+    rays, nDetector = views(proj_geom)
+    return Geometry.from_poses(rays, nDetector, grid=voxel_grid)
 
 
 def to_vectors(rays: Rays, nDetector: tuple[int, int]) -> np.ndarray:
@@ -45,7 +88,7 @@ def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool)
     return Rays(source, corner, u, v, parallel).checked()
 
 
-def circle(proj_geom: dict) -> dict:
+def circle(proj_geom: dict) -> dict[str, Any]:
     """The scanner of a dict of the types `CIRCLES`, as the numbers of a `CircularGeometry`; ASTRA's rows reversed.
 
     Raises InputError where a number is missing.
@@ -83,10 +126,10 @@ def views(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     return Rays(source, rays.corner - nDetector[0] * v, rays.u, v, rays.parallel), nDetector
 
 
-def grid(vol_geom: dict) -> dict:
-    """The voxel grid of a dict of `astra.create_vol_geom`: nVoxel, dVoxel and offOrigin, (x, y, z).
+def grid(vol_geom: dict) -> Grid:
+    """The voxels of a dict of `astra.create_vol_geom`.
 
-    Raises InputError where it has two dimensions only, or a number is missing.
+    Raises InputError if it has two dimensions only, or a number is missing or makes no grid.
     """
     if not isinstance(vol_geom, Mapping) or 'GridSliceCount' not in vol_geom:
         raise InputError('the ASTRA volume has no GridSliceCount: give one of three dimensions')
@@ -95,7 +138,7 @@ def grid(vol_geom: dict) -> dict:
     low, high = (np.array([_number(window, f'Window{end}{axis}') for axis in 'XYZ']) for end in ('Min', 'Max'))
     if not np.all(counts >= 1):
         raise InputError(f'the counts of an ASTRA volume must be positive, not {shown(counts.tolist())}')
-    return dict(nVoxel=counts, dVoxel=(high - low) / counts, offOrigin=(low + high) / 2)
+    return Grid(counts, (high - low) / counts, (low + high) / 2)
 
 
 def kind_of(proj_geom: dict) -> str:

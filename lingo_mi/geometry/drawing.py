@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.grid import Grid
+from lingo_mi.geometry.rays import Rays
 
 SOURCE, PANEL, VOLUME, INK = '#c2570c', '#1a7f5a', '#3b76c4', '#7a8694'  # seen on white and on black
 WIDTH, HEIGHT, MARGIN, MOST = 300, 230, 16, 360
 
 
-def drawing(geometry: Geometry) -> str:
-    """Sources, the panel of the first view and its outermost rays, and the volume, seen along z and along y. Lengths to scale.
+def drawing(rays: Rays, nDetector: tuple[int, int], grid: Grid) -> str:
+    """Sources, the panel of the first view and its outermost rays, and the volume, seen along z and along y: `<svg ...`.
 
-    drawing(scan.geometry)   # '<svg ...'
+    rays        of all views; nDetector: the panel's pixels, (v, u)
+    grid        the volume
     """
-    rays, (rows, columns) = geometry.rays(), geometry.nDetector
+    rows, columns = nDetector
     chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST)).astype(int))
-    low = np.asarray(geometry.offOrigin) - np.asarray(geometry.sVoxel) / 2
-    high = np.asarray(geometry.offOrigin) + np.asarray(geometry.sVoxel) / 2
     sources = rays.source[chosen]
     if rays.parallel:
-        sources = np.asarray(geometry.offOrigin) - 1.3 * float(np.max(geometry.sVoxel)) * sources
+        sources = np.asarray(grid.centre) - 1.3 * max(grid.size) * sources
     corner, u, v = rays.corner[0], columns * rays.u[0], rows * rays.v[0]
     panel = np.array([corner, corner + u, corner + u + v, corner + v])
     starts = panel - np.dot(panel - sources[0], rays.source[0])[:, None] * rays.source[0] if rays.parallel else None
     parts = [
-        _seen(across, up, sources, panel, starts, low, high, WIDTH * i)
+        _seen(across, up, sources, panel, starts, grid.low, grid.high, WIDTH * i)
         for i, (across, up) in enumerate(((0, 1), (0, 2)))
     ]
     return (

@@ -45,6 +45,39 @@ def angles(name: str, value: ArrayLike) -> np.ndarray:
     return array
 
 
+def vector(name: str, value: ArrayLike, length: int) -> tuple:
+    """`length` floats, lengths of any sign; one number may stand for all. Raises InputError for anything else."""
+    array = np.atleast_1d(numbers(name, value)).ravel()
+    if len(array) == 1:
+        array = np.repeat(array, length)
+    if len(array) != length or not np.all(np.isfinite(array)):
+        raise InputError(
+            f'{name} must be {"one finite number" if length == 1 else f"{length} finite numbers"}, not {shown(value)}'
+        )
+    return tuple(float(x) for x in lengths(name, array))
+
+
+def sizes(name: str, value: ArrayLike, length: int) -> tuple:
+    """`length` positive lengths, as `vector` takes them."""
+    found = vector(name, value, length)
+    if min(found) <= 0:
+        raise InputError(f'{name} must be positive, not {found}')
+    return found
+
+
+def counts(name: str, value: ArrayLike, length: int) -> tuple:
+    """`length` whole numbers from 1 to `MOST_COUNT`, as `vector` takes them."""
+    found = vector(name, value, length)
+    if any(x % 1 for x in found):
+        raise InputError(f'{name} must be whole numbers, not {shown(value)}')
+    found = tuple(map(int, found))
+    if min(found) <= 0:
+        raise InputError(f'{name} must be positive, not {found}')
+    if max(found) > MOST_COUNT:
+        raise InputError(f'{name} must be at most {MOST_COUNT} along an axis, not {shown(found)}')
+    return found
+
+
 def require_proportions(long: Iterable[float], short: Iterable[float]) -> None:
     """Raises InputError where the longest length of a scan is too many times the shortest. Zeros do not count."""
     longest, shortest = (max(map(abs, long)), min(map(abs, short)))

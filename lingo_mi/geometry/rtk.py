@@ -19,17 +19,24 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.common.errors import InputError, shown
+from lingo_mi.geometry import limits
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.grid import Voxels
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import rotation
 from lingo_mi.storage.file_access import one_line, reading, replacing
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 ROOT = 'RTKThreeDCircularGeometry'
 _NUMBERS = (
@@ -48,7 +55,39 @@ _IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', '
 _AXES = [2, 0, 1]  # our x, y, z in RTK's
 
 
-def read(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, float]) -> Rays:
+def scan(
+    source: str | PathLike | Any, *, nDetector: ArrayLike, dDetector: ArrayLike, **voxels: Unpack[Voxels]
+) -> Geometry:
+    """The scan that a geometry of RTK describes.
+
+    RTK says neither the panel's pixels nor the voxels. Its images are taken as centred. RTK's axes (x, y, z) are this package's
+    (y, z, x), and its rows run up: `stack[:, ::-1]` goes with the result.
+
+    Parameters
+    ----------
+    source : path or itk.RTK.ThreeDCircularProjectionGeometry
+        Of RTK's XML file, or its object.
+    nDetector, dDetector
+        Pixels and pixel size in mm, (v, u).
+    **voxels
+        Either grid, or nVoxel, dVoxel and offOrigin, as of `Geometry.cone`.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or another one, and for cylindrical panels.
+
+    Examples
+    --------
+    ::
+
+        Geometry.from_rtk('geometry.xml', nDetector=256, dDetector=1.0, grid=Grid(128, 1.0))
+    """
+    nDetector, dDetector = limits.counts('nDetector', nDetector, 2), limits.sizes('dDetector', dDetector, 2)
+    return Geometry.from_poses(read_rtk(source, nDetector, dDetector), nDetector, **voxels)
+
+
+def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, float]) -> Rays:
     """The views of RTK's geometry, in mm, rows down.
 
     source                 the path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`
@@ -78,7 +117,7 @@ def read(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, float]
         raise InputError(f'{where}: {error}') from None
 
 
-def write(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> None:
+def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
 
     Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between

@@ -1,4 +1,4 @@
-"""TIGRE's geometry for Python as the numbers of `Geometry.per_view`.
+"""Scans of TIGRE for Python.
 
 TIGRE's arrays are C-ordered and its names follow them: nVoxel, dVoxel, sVoxel and offOrigin are (z, y, x), nDetector, dDetector,
 sDetector and offDetector (v, u), rotDetector turns about (x, y, z). TIGRE repeats DSO, DSD, offOrigin, offDetector, rotDetector
@@ -16,15 +16,36 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.circle import CircularGeometry
+from lingo_mi.geometry.grid import grid_of
 
 
-def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
-    """What `geo` says, in this package's order and by its names, with the angles; and whether a view leaves the circle.
+def scan(geo: Any, angles: ArrayLike) -> Geometry:
+    """The scan that a geometry of TIGRE for Python describes.
 
-    geo      an object or a dict with TIGRE's names, lengths in mm
-    angles   [n] radians or [n, 3] Euler angles
+    TIGRE's rows run up, this package's down, and its volumes are [z, y, x]: `projections[:, ::-1]` and `volume.T` go with the
+    result.
 
-    Raises InputError where a number is missing, or has neither one value nor one for every view.
+    Parameters
+    ----------
+    geo : tigre.geometry or dict
+        An object or a dict with TIGRE's names, in TIGRE's order, which is turned round. Lengths in mm; DSO, DSD, offOrigin,
+        offDetector, rotDetector and COR once or for every view.
+    angles : [n] or [n, 3]
+        Radians, or Euler angles, as `tigre.Ax` takes them.
+
+    Raises
+    ------
+    InputError
+        If a number is missing, has neither one value nor one for every view, or makes no scan.
+
+    Examples
+    --------
+    ::
+
+        geo = tigre.geometry_default(high_resolution=False)
+        scan = Scan(Geometry.from_tigre(geo, angles), tigre.Ax(image, geo, angles)[:, ::-1])
     """
     given = geo.get if isinstance(geo, Mapping) else lambda name: getattr(geo, name, None)
     angles = np.atleast_1d(limits.angles('angles', angles))
@@ -62,20 +83,24 @@ def numbers(geo: Any, angles: ArrayLike) -> tuple[dict, bool]:
     if not isinstance(mode, str):
         raise InputError(f"mode of the TIGRE geometry must be 'cone' or 'parallel', not {shown(mode)}")
     far = 0.0 if mode == 'parallel' else None  # of a parallel beam they only place the panel
-    scan = dict(
+    voxels: dict[str, Any] = dict(
+        nVoxel=each('nVoxel', 3)[..., ::-1],
+        dVoxel=steps('Voxel', 3)[..., ::-1],
+        offOrigin=each('offOrigin', 3, np.zeros(3))[..., ::-1],
+    )
+    numbers: dict[str, Any] = dict(
         mode=mode,
         DSO=each('DSO', 1, far),
         DSD=each('DSD', 1, far),
         nDetector=each('nDetector', 2),
         dDetector=steps('Detector', 2),
-        nVoxel=each('nVoxel', 3)[..., ::-1],
-        dVoxel=steps('Voxel', 3)[..., ::-1],
         angles=angles,
-        offOrigin=each('offOrigin', 3, np.zeros(3))[..., ::-1],
         offDetector=each('offDetector', 2, np.zeros(2)),
     )
     # TIGRE's angles about x, y, z are this package's yaw, pitch and roll.
-    motion = dict(rotDetector=each('rotDetector', 3, np.zeros(3))[..., ::-1], COR=each('COR', 1, 0.0))
+    motion: dict[str, Any] = dict(rotDetector=each('rotDetector', 3, np.zeros(3))[..., ::-1], COR=each('COR', 1, 0.0))
     plain = dict(DSO=0, DSD=0, offOrigin=1, offDetector=1, angles=1)  # dimensions of what no view changes
-    moves = any(np.ndim(scan[name]) > n for name, n in plain.items()) or any(np.any(x) for x in motion.values())
-    return scan | motion if moves else scan, moves
+    moves = any(np.ndim((numbers | voxels)[name]) > n for name, n in plain.items())
+    if moves or any(np.any(x) for x in motion.values()):
+        return Geometry.per_view(**numbers, **motion, **voxels)
+    return CircularGeometry(**numbers, grid=grid_of(voxels))

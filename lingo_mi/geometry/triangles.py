@@ -38,7 +38,9 @@ def add_lengths(
             part[inside] += np.sign(along) * t
 
 
-def voxelize(triangles: np.ndarray, low: ArrayLike, step: ArrayLike, shape: tuple[int, int, int]) -> np.ndarray:
+def voxelize_triangles(
+    triangles: np.ndarray, low: ArrayLike, step: ArrayLike, shape: tuple[int, int, int]
+) -> np.ndarray:
     """The share of every voxel that lies inside closed meshes of triangles [n, 3, 3]: float32 [x, y, z].
 
     low [3], step [3]   corner of the grid and voxel size, the unit of the triangles

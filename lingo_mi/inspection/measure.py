@@ -1,12 +1,13 @@
-"""What a scan says of itself: numbers with their units, and what to correct."""
+"""What a scan says of itself: numbers, and which of them call for a correction. Nothing is changed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry.circle import CircularGeometry
 from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.raw.line_integrals import photons_of_images
@@ -16,184 +17,271 @@ COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
 VIEWS = 40  # of the plane: the time goes with its square
 CLEAR = 0.01  # a disagreement that is more than discretisation
 UNSTEADY = 0.5  # pixels of jitter that blur a volume
+AIR_OFF = 0.01  # relative to the highest line integral
 UNEQUAL_AIR = 0.01  # relative to the highest line integral
 HALF_TURN = 175  # degrees: views of less do not tell the axis
 WIDE = 2  # half a panel over its distance from the source, which no panel has
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
 
 
-@dataclass
-class Findings:
-    """What `look` has measured.
+# Why the consistency of the views is not measured: the scanner leaves the circle, the panel does not see the plane of the source
+# or has gaps there, the object reaches over its edge, too few views show anything, or too few see the object from beside.
+Obstacle = Literal['orbit', 'panel', 'gaps', 'truncation', 'empty', 'aside']
 
-    facts      sentences with numbers
-    advice     sentences: what to correct, and how; empty for a sound scan
-    air        level beside the object, nan where none is seen
-    mass       [n] mean line integral of every view, air subtracted
-    suspects   views that are black, doubled or out of order
-    misplaced  whether advice says that angles or distances are wrong
+
+@dataclass(frozen=True)
+class Border:
+    """What the pixels at the edges of the panel show.
+
+    Attributes
+    ----------
+    air : float or None
+        Line integral beside the object, 0 in a scan without error; None if the object fills the panel.
+    air_spread : float or None
+        Standard deviation of the views' air levels, a line integral; None if too few views show air.
+    cut_sides, cut_ends : int
+        Number of views in which the object reaches over the left or right, and over the upper or lower edge.
     """
 
-    facts: list[str] = field(default_factory=list)
-    advice: list[str] = field(default_factory=list)
-    air: float = np.nan
-    mass: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    suspects: list[int] = field(default_factory=list)
-    misplaced: bool = False
-
-    def misplace(self, advice: str) -> None:
-        self.advice.append(advice)
-        self.misplaced = True
+    air: float | None
+    air_spread: float | None
+    cut_sides: int
+    cut_ends: int
 
 
-def look(scan: Scan) -> Findings:
-    """Measures a scan; nothing is changed."""
-    found = Findings()
-    geometry, p = scan.geometry, scan.projections
-    n, (nv, nu) = len(scan), geometry.nDetector
+@dataclass(frozen=True)
+class Orbit:
+    """What the views say of angles, order and axis; by default, nothing was measured.
+
+    Attributes
+    ----------
+    turn : float or None
+        Radians from the first view to one after the last; 0 if all views have the same angle, None if they are no circle.
+    unit : {'radians', 'degrees'} or None
+        The unit that the angles seem to have instead of the right one.
+    obstacle : Obstacle or None
+        Why the numbers below are not measured.
+    disagreement : float or None
+        Root mean square disagreement of the views with the geometry of the scan: relative to their mass, or in a parallel beam
+        to half the width of the panel.
+    shift : float
+        Shift of the axis on the panel along u, in mm, that lets the views agree best.
+    shifted : float or None
+        Disagreement with that shift.
+    reversed : float or None
+        Disagreement with that shift and reversed angles, if these fit much better.
+    swapped : tuple of int, or None
+        Two views that fit better in each other's place.
+    off_axis : bool
+        Whether the shift lets the views agree so much better that the axis is off.
+    """
+
+    turn: float | None = None
+    unit: Literal['radians', 'degrees'] | None = None
+    obstacle: Obstacle | None = None
+    disagreement: float | None = None
+    shift: float = 0.0
+    shifted: float | None = None
+    reversed: float | None = None
+    swapped: tuple[int, int] | None = None
+    off_axis: bool = False
+
+    @property
+    def short(self) -> bool:
+        """Whether the views span too little to measure the axis."""
+        return self.turn is not None and np.degrees(self.turn) < HALF_TURN
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What `measure` has measured.
+
+    Attributes
+    ----------
+    invalid : float
+        Share of the pixels that are left out.
+    high, highest : float
+        99.5th percentile and maximum of the line integrals.
+    negative : bool
+        Whether the line integrals look like ln(I / I0) instead of ln(I0 / I).
+    border : Border or None
+        None if no pixel at the left or right edge is valid.
+    photons : float or None
+        Photons of a pixel in air, from the noise; None without noise.
+    clipped : float or None
+        Share of the pixels that have exactly the highest value; None if there are few.
+    mass : ndarray of shape (n,)
+        Mean line integral of every view, air subtracted.
+    mass_spread : float or None
+        Relative standard deviation of the masses of the views of a parallel beam; None if they need not be equal.
+    black, doubled : list of int
+        Views without an object, and views equal to the one before.
+    jitter : tuple of float
+        Standard deviation of the outline's place from view to view, in pixels along rows and columns; nan if not measured.
+    wide : float or None
+        Width of the panel over its distance from the source, if that is too wide.
+    orbit : Orbit
+        Angles, order and axis.
+    """
+
+    invalid: float
+    high: float
+    highest: float
+    negative: bool
+    border: Border | None
+    photons: float | None
+    clipped: float | None
+    mass: np.ndarray
+    mass_spread: float | None
+    black: list[int]
+    doubled: list[int]
+    jitter: tuple[float, float]
+    wide: float | None
+    orbit: Orbit
+
+    @property
+    def suspects(self) -> list[int]:
+        """Views that are black, doubled or out of order."""
+        return [*self.black, *self.doubled, *(self.orbit.swapped or ())]
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether angles or distances are wrong."""
+        o = self.orbit
+        return bool(self.wide or o.turn == 0 or o.unit or o.reversed is not None or o.off_axis)
+
+    @property
+    def air_is_off(self) -> bool:
+        air = self.border and self.border.air
+        return air is not None and abs(air) > AIR_OFF * self.high
+
+    @property
+    def air_differs(self) -> bool:
+        """Whether the views have different air levels."""
+        spread = self.border and self.border.air_spread
+        return spread is not None and spread > UNEQUAL_AIR * self.high
+
+    @property
+    def mass_differs(self) -> bool:
+        return self.mass_spread is not None and self.mass_spread > UNEQUAL
+
+    @property
+    def unsteady(self) -> bool:
+        """Whether the object or the panel moves from view to view."""
+        return any(x > UNSTEADY for x in self.jitter)
+
+
+def measure(scan: Scan) -> Findings:
+    """Measure what a scan says of air, noise, truncation, order, angles and axis.
+
+    Parameters
+    ----------
+    scan : Scan
+        Line integrals [view, v, u].
+
+    Returns
+    -------
+    Findings
+        Numbers, and what they say about the scan.
+
+    Examples
+    --------
+    >>> measure(scan).orbit.off_axis
+    False
+    """
+    p = scan.projections
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
-    found.facts.append(
-        f'{n} views of {nv} x {nu} pixels of {geometry.dDetector[0]:.4g} x {geometry.dDetector[1]:.4g} mm, {geometry.mode} beam'
-        + (f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else '')
-        + f'; {1 - valid.mean():.2%} of the pixels are left out'
-    )
-    top = float(np.percentile(p[valid], 99.5))
-    if -np.percentile(p[valid], 0.5) > 2 * max(top, 0):
-        found.advice.append(
-            'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
-            'views (import with --exposure, or --air)'
-        )
-    _air_and_truncation(found, p, valid, top)
+    high, highest = float(np.percentile(p[valid], 99.5)), float(p[valid].max())
+    border = _border(p, valid, high)
+    air = (border and border.air) or 0.0
     photons = photons_of_images(p, scan.valid)
-    if np.isfinite(photons) and photons < 1e8:
-        found.facts.append(
-            f'noise: {photons**-0.5:.2g} rms in air from column to column, as of {photons:.2g} photons a pixel'
-        )
-    else:
-        found.facts.append('noise: none that could be measured')
-    highest = float(p[valid].max())
     clipped = float((p[valid] == highest).mean())
-    if clipped > 1e-3 and clipped * valid.sum() > 2 * n and highest > 0:
-        found.facts.append(f'saturation: {clipped:.2%} of the pixels have exactly the highest value, {highest:.3g}')
-        found.advice.append(
-            'pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)'
-        )
-    air = 0.0 if np.isnan(found.air) else found.air
-    found.mass = np.array([(p[i][valid[i]].mean() - air) if valid[i].any() else 0.0 for i in range(n)])
-    _views(found, p - air, valid)
-    _masses(found, scan, valid)
-    _jitter(found, scan, air)
-    _angles(found, scan, air)
-    return found
+    many = clipped > 1e-3 and clipped * valid.sum() > 2 * len(scan) and highest > 0
+    mass = np.array([(view[known].mean() - air) if known.any() else 0.0 for view, known in zip(p, valid)])
+    black, doubled = _black_and_doubled(p - air, valid, mass)
+    suspects = [*black, *doubled]
+    truncated = border is not None and (border.cut_sides or border.cut_ends)
+    return Findings(
+        invalid=float(1 - valid.mean()),
+        high=high,
+        highest=highest,
+        negative=bool(-np.percentile(p[valid], 0.5) > 2 * max(high, 0)),
+        border=border,
+        photons=photons if np.isfinite(photons) and photons < 1e8 else None,
+        clipped=clipped if many else None,
+        mass=mass,
+        mass_spread=None if truncated else _mass_spread(scan, np.delete(mass, suspects)),
+        black=black,
+        doubled=doubled,
+        jitter=(np.nan, np.nan) if suspects else _jitter(scan, air),
+        wide=_too_wide(scan),
+        orbit=_orbit(scan, air, suspects),
+    )
 
 
-def _air_and_truncation(found, p, valid, top):
+def _border(p, valid, high):
     nu = p.shape[2]
     edge = max(1, nu // 64)
     sides = np.concatenate([p[:, :, :edge][valid[:, :, :edge]], p[:, :, -edge:][valid[:, :, -edge:]]])
     if not sides.size:
-        return
+        return None
     low = np.percentile(sides, 5)
-    near = sides[sides <= low + 0.1 * (top - low)]
-    even = low < 0.5 * top and near.size > 0.9 * sides.size  # all around: air, but not at 0
-    if low > 0.2 * top and not even:
-        found.facts.append('air: none beside the object, which fills the panel')
-    else:
-        found.air = float(np.median(near))
-        found.facts.append(f'air: {found.air:.4g} beside the object (line integral; 0 without error)')
-        if abs(found.air) > 0.01 * top:
-            found.advice.append(
-                f'air is {found.air:.3g} instead of 0: import again with --air, or subtract it from the projections'
-            )
-        _air_of_views(found, p, valid, edge, low, top)
-    limit = (0.0 if np.isnan(found.air) else found.air) + 0.1 * top
-    cut = {}
-    for name, part in (('left or right', np.s_[:, :, [0, -1]]), ('upper or lower', np.s_[:, [0, -1], :])):
-        inside = (p[part] > limit) & valid[part]
-        cut[name] = int(inside.any((1, 2)).sum())
-    if p.shape[1] < 3:
-        cut.pop('upper or lower')
-    for name, views in cut.items():
-        if views:
-            found.facts.append(f'truncation: the object reaches over the {name} edge of the panel in {views} views')
-            found.advice.append(
-                f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object'
-            )
+    near = sides[sides <= low + 0.1 * (high - low)]
+    even = low < 0.5 * high and near.size > 0.9 * sides.size  # all around: air, but not at 0
+    air = spread = None
+    if low <= 0.2 * high or even:
+        air = float(np.median(near))
+        spread = _air_spread(p, valid, edge, low + 0.1 * (high - low))
+    limit = (air or 0.0) + 0.1 * high
+
+    def cut(part):
+        return int(((p[part] > limit) & valid[part]).any((1, 2)).sum())
+
+    return Border(air, spread, cut(np.s_[:, :, [0, -1]]), cut(np.s_[:, [0, -1], :]) if p.shape[1] >= 3 else 0)
 
 
-def _air_of_views(found, p, valid, edge, low, top):
-    """How much the air level of the views differs."""
+def _air_spread(p, valid, edge, limit):
+    """Standard deviation of the views' air levels, those of pixels near the sides that are below the limit."""
     near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2)
     near = np.where(np.concatenate([valid[:, :, :edge], valid[:, :, -edge:]], 2), near, np.inf).reshape(len(p), -1)
-    levels = [
-        np.median(view[view < low + 0.1 * (top - low)]) for view in near if (view < low + 0.1 * (top - low)).sum() > 8
-    ]
-    if len(levels) < len(p) / 2:
-        return
-    spread = float(np.std(levels))
-    found.facts.append(f'air of the views: differs by {spread:.2g} rms')
-    if spread > UNEQUAL_AIR * top:
-        found.advice.append(
-            f'the air level of the views differs by {spread:.2g} rms: import again with --air, which scales every view by its '
-            'own air, or fit with -D fit_air=view'
-        )
+    levels = [np.median(view[view < limit]) for view in near if (view < limit).sum() > 8]
+    return None if len(levels) < len(p) / 2 else float(np.std(levels))
 
 
-def _views(found, p, valid):
-    """Black and doubled views."""
-    typical = np.median(found.mass)
-    n = len(p)
-    black = [
-        i for i in range(n) if not valid[i].any() or np.ptp(p[i][valid[i]]) == 0 or abs(found.mass[i]) < 0.1 * typical
-    ]
-    if black:
-        found.suspects += black
-        found.advice.append(f'{_named(black)} black or empty: drop with --views of import, or lm.Scan.subset')
+def _black_and_doubled(p, valid, mass):
+    n, typical = len(p), np.median(mass)
+    black = [i for i in range(n) if not valid[i].any() or np.ptp(p[i][valid[i]]) == 0 or abs(mass[i]) < 0.1 * typical]
+    doubled = []
     if n >= 4:
         doubled = [i for i in range(1, n) if i not in black and i - 1 not in black and np.array_equal(p[i], p[i - 1])]
-        if doubled:
-            found.suspects += doubled
-            found.advice.append(
-                f'{_named(doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
-            )
+    return black, doubled
 
 
-def _masses(found, scan, valid):
+def _mass_spread(scan, mass):
     """The views of a parallel beam all have the object's mass."""
-    mass = np.delete(found.mass, found.suspects)
-    if scan.geometry.mode != 'parallel' or not valid.all() or len(mass) < 3 or not mass.mean() > 0:
-        return
-    if any(fact.startswith('truncation') for fact in found.facts):
-        return
-    spread = mass.std() / mass.mean()
-    found.facts.append(f'mass: equal in all views to {spread:.2%} rms')
-    if spread > UNEQUAL:
-        found.advice.append(
-            f'the mass of the views differs by {spread:.1%} rms: the beam or the exposure drifts; import again with --air, which '
-            'scales every view by its own air'
-        )
+    if scan.geometry.mode != 'parallel' or scan.valid is not None or len(mass) < 3 or not mass.mean() > 0:
+        return None
+    return float(mass.std() / mass.mean())
 
 
-def _jitter(found, scan, air):
-    """Unsteady motion along columns and rows."""
-    if not isinstance(scan.geometry, CircularGeometry) or found.suspects or scan.valid is not None:
-        return
-    values = outline_jitter(scan.projections - air, scan.geometry.angles)
-    known = [(x, name) for x, name in zip(values[::-1], ('rows', 'columns')) if np.isfinite(x)]
-    if known:
-        found.facts.append('jitter of the outline: ' + ', '.join(f'{x:.2g} pixels along {name}' for x, name in known))
-    if any(x > UNSTEADY for x, _ in known):
-        found.advice.append(
-            'the object or the panel moves from view to view: fit with -D rate_pose=2e-3,2e-4, and keep it if the held-out views '
-            'get better; of a slow drift lingo-mi calibrate --drift 3 tells the course'
-        )
+def _jitter(scan, air):
+    if not isinstance(scan.geometry, CircularGeometry) or scan.valid is not None:
+        return np.nan, np.nan
+    columns, rows = outline_jitter(scan.projections - air, scan.geometry.angles)
+    return rows, columns
 
 
-def _plane(scan, air):
-    """The plane of the source, or a sentence why there is none."""
+def _too_wide(scan):
+    geometry = scan.geometry
+    ratio = max(geometry.sDetector) / geometry.DSD if geometry.mode == 'cone' else 0.0
+    return ratio if ratio > 2 * WIDE else None
+
+
+def _plane(scan: Scan, air: float) -> Plane | Obstacle:
+    """The plane of the source, or why there is none."""
     geometry = scan.geometry
     if not isinstance(geometry, CircularGeometry):
-        return 'the scanner leaves the circle'
+        return 'orbit'
     (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
     p = scan.projections.astype(float) - air
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
@@ -203,13 +291,13 @@ def _plane(scan, air):
     else:
         middle = nv / 2 - 0.5 + geometry.offDetector[0] / dv
         if not -0.5 <= middle <= nv - 0.5:
-            return 'the panel does not see the plane of the source'
+            return 'panel'
         first = min(max(int(np.floor(middle)), 0), nv - 1)
         last = min(first + 1, nv - 1)
         part = min(max(middle - first, 0.0), 1.0)
         row, known = (1 - part) * p[:, first] + part * p[:, last], valid[:, first] & valid[:, last]
     if (~known[:, :-1] & ~known[:, 1:]).any():  # a gap that a mean of neighbours does not fill
-        return 'pixels side by side in the plane of the source are not valid'
+        return 'gaps'
     row = np.stack([_bridged(*line) for line in zip(row, known)])
     by = max(1, nu // COLUMNS)
     columns = nu // by
@@ -217,7 +305,7 @@ def _plane(scan, air):
     u = (np.arange(columns) + 0.5) * by * du - nu * du / 2 + geometry.offDetector[1]
     peak = np.percentile(row, 99.5)
     if row[:, [0, -1]].max() > 0.15 * peak:
-        return 'the object reaches over the edge of the panel'
+        return 'truncation'
     return Plane(row, geometry.angles, u, geometry.DSD if geometry.mode == 'cone' else 0.0)
 
 
@@ -227,83 +315,45 @@ def _bridged(values, known):
     return values if known.all() or not known.any() else np.interp(place, place[known], values[known])
 
 
-def _angles(found, scan, air):
+def _orbit(scan, air, suspects):
     """Unit and sense of the angles, the axis, and views out of order."""
     geometry, n = scan.geometry, len(scan)
-    turn = 0.0
-    if geometry.mode == 'cone' and max(geometry.sDetector) > 2 * WIDE * geometry.DSD:
-        found.misplace(
-            f'the panel of {max(geometry.sDetector):.4g} mm is {max(geometry.sDetector) / geometry.DSD:.2g} times as wide as its '
-            'distance from the source: give DSO, DSD and the size of the pixels in mm'
-        )
-    if n >= 2 and isinstance(geometry, CircularGeometry):
-        span = np.ptp(geometry.angles)
-        if span <= 2 * np.pi:  # those of poses jump from pi to -pi
-            span = min(span, np.ptp(np.unwrap(geometry.angles)))
-        turn = span * n / (n - 1)
-        if not turn:
-            found.misplace('all views have the same angle: give the angle of each')
-            return
-    if n >= 4 and isinstance(geometry, CircularGeometry):
-        found.facts.append(f'angles: {np.degrees(turn):.4g} degrees in all')
+    turn = _turn(geometry) if n >= 2 and isinstance(geometry, CircularGeometry) else None
+    if turn == 0:
+        return Orbit(turn)
+    if turn is not None and n >= 4:
         for whole in (np.pi, 2 * np.pi):
             if abs(np.degrees(turn) / whole - 1) < 0.02:
-                found.misplace(
-                    f'the angles span {np.degrees(turn):.3g} degrees: they look like radians; a .yml takes degrees'
-                )
-                return
+                return Orbit(turn, 'radians')
             if abs(turn / np.degrees(whole) - 1) < 0.02:
-                found.misplace(
-                    f'the angles span {turn:.4g} radians: they look like degrees; give numpy.radians(angles)'
-                )
-                return
+                return Orbit(turn, 'degrees')
     plane = _plane(scan, air)
     if isinstance(plane, str):
-        found.facts.append(
-            f'consistency of the views: not measured, as {plane}; lingo-mi calibrate finds an axis off centre all the same'
-        )
-        return
-    index = np.array([i for i in range(n) if i not in found.suspects], int)
+        return Orbit(turn, obstacle=plane)
+    index = np.array([i for i in range(n) if i not in suspects], int)
     if len(index) < 2:
-        found.facts.append('consistency of the views: not measured, as too few of them show anything')
-        return
+        return Orbit(turn, obstacle='empty')
     index = index[:: max(1, -(-len(index) // VIEWS))]
     plane = plane.subset(index)
-    shift, best = best_shift(plane, plane.angles, 0.08 * np.ptp(plane.u))
+    reach = 0.08 * np.ptp(plane.u)
+    shift, best = best_shift(plane, plane.angles, reach)
     given = disagreement(plane, plane.angles)[0]
     if not np.isfinite(given) or not np.isfinite(best):
-        found.facts.append('consistency of the views: not measured, as too few of them see the object from beside')
-        return
-    what = 'of the half-width of the panel' if not plane.DSD else 'of their mass'
-    found.facts.append(f'consistency of the views: they disagree by {given:.2%} rms {what}')
-    _, other = best_shift(plane, -plane.angles, 0.08 * np.ptp(plane.u)) if plane.DSD else (0.0, np.inf)
+        return Orbit(turn, obstacle='aside')
+    found = Orbit(turn, disagreement=given, shift=shift, shifted=best)
+    _, other = best_shift(plane, -plane.angles, reach) if plane.DSD else (0.0, np.inf)
     if best > CLEAR and other < 0.4 * best:
-        found.misplace(
-            f'with reversed angles the views disagree by {other:.2%} instead of {best:.2%}: change the sign of the angles, or '
-            'mirror the columns'
-        )
-        return
+        return replace(found, reversed=other)
     pair = swapped(plane, plane.angles, shift) if best > 0.2 * CLEAR else None
     if pair is not None:
-        views = [int(index[i]) for i in pair]
-        found.suspects += views
-        found.advice.append(
-            f"views {views[0]} and {views[1]} fit better in each other's place: check the order of the frames"
-        )
-        return
-    if np.degrees(turn) < HALF_TURN:
-        found.facts.append('axis: not measured, as the views span less than half a turn')
-        return
+        return replace(found, swapped=(int(index[pair[0]]), int(index[pair[1]])))
     pixel = geometry.dDetector[1]
-    if abs(shift) > 0.5 * pixel and best < 0.7 * given:
-        found.facts.append(
-            f'axis: {shift:+.3g} mm on the panel ({shift / pixel:+.2g} pixels) lets them agree to {best:.2%}'
-        )
-        found.misplace(
-            f'the axis is off: add {shift:+.3g} mm to the second number of offDetector, or run lingo-mi calibrate'
-        )
+    return replace(found, off_axis=not found.short and abs(shift) > 0.5 * pixel and best < 0.7 * given)
 
 
-def _named(views):
-    text = ', '.join(map(str, views[:6])) + (', ...' if len(views) > 6 else '')
-    return f'view {text} is' if len(views) == 1 else f'views {text} are'
+def _turn(geometry):
+    """Radians from the first view to one after the last."""
+    span = np.ptp(geometry.angles)
+    if span <= 2 * np.pi:  # those of poses jump from pi to -pi
+        span = min(span, np.ptp(np.unwrap(geometry.angles)))
+    return float(span * len(geometry) / (len(geometry) - 1))

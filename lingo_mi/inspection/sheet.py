@@ -40,8 +40,8 @@ def _geometry(axes, scan):
     """Sources (or directions), panels of the first and the middle view, and the volume; mm."""
     geometry, rays = scan.geometry, scan.geometry.rays()
     nv, nu = geometry.nDetector
-    size = np.array(geometry.sVoxel) / 2
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size + geometry.offOrigin
+    size = np.array(geometry.grid.size) / 2
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size + geometry.grid.centre
     for a in range(8):
         for bit in (1, 2, 4):
             if not a & bit:

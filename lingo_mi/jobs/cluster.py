@@ -41,7 +41,7 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
     distributed = optional('distributed', 'cluster')
     local = re.fullmatch(r'local:(\d{1,9})', address)
     if re.match('local(:|$)', address) and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
-        raise InputError(f'--cluster {address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
+        raise InputError(f'cluster={address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
     with ExitStack() as stack:
         import dask.config
 
@@ -53,14 +53,14 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
             where: dict[str, Any] = dict(address=stack.enter_context(_local(distributed, count)))
         elif address.endswith('.json'):
             if not Path(address).is_file():
-                raise InputError(f'--cluster {address}: there is no such file of a scheduler; check the path')
+                raise InputError(f'cluster={address}: there is no such file of a scheduler; check the path')
             where = dict(scheduler_file=address)
         else:
             where = dict(address=address)
         try:
             client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
         except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
-            raise InputError(f'--cluster {address}: no scheduler answers ({brief(error, 120)}); check it') from None
+            raise InputError(f'cluster={address}: no scheduler answers ({brief(error, 120)}); check it') from None
         yield Cluster(client, Path(folder).resolve(), threads, variant)
 
 
@@ -124,7 +124,7 @@ class Cluster:
             self.client.wait_for_workers(1, timeout=PATIENCE)
         except TIMED_OUT:
             raise InputError(
-                f'--cluster: no worker came within {PATIENCE:.0f} s; start some, with --nthreads 1'
+                f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
         for found in self.client.run(describe_worker, self.folder).values():
             require_fit(found, self.folder)

@@ -30,7 +30,7 @@ def require_fit(found: dict, folder: str) -> None:
         raise InputError(f'{who}: has lingo_mi {found["version"]}, not {ours}; install the same there')
     if found['tasks'] != 1:
         raise InputError(
-            f'{who}: runs {found["tasks"]} tasks at once, which would share one Dr.Jit; start it with --nthreads 1'
+            f'{who}: runs {found["tasks"]} tasks at once, which would share one Dr.Jit; start it by `dask worker --nthreads 1`'
         )
     if not found['sees']:
         raise InputError(

@@ -1,1 +1,1 @@
-"""LINGO's initial cloud, after section III of the paper, and its measure IPSD."""
+"""What section III of the paper says: masks, the filter of all views, voxel scaling, mean pixel, loss scale."""

@@ -15,7 +15,7 @@ def occupancy(
     rays: Rays,
     masks: Masks,
     half: np.ndarray,
-    nVoxel: Sequence[int],
+    shape: Sequence[int],
     resolution: int = 16,
     misses: int = 0,
     outside: str = 'invalid',
@@ -25,7 +25,7 @@ def occupancy(
     An axis with fewer than V voxels keeps them (a single slice stays one cell thick), and the count is
     divided by the actual number of cells. The other arguments are those of `valid_voxels`.
     """
-    coarse = np.minimum(resolution, nVoxel)
+    coarse = np.minimum(resolution, shape)
     low, _ = valid_voxels(rays, masks, coarse, half, misses, outside)
     return len(low) / float(np.prod(coarse))
 
@@ -35,7 +35,7 @@ def scale_factor(P: float, V_S: float = 20.0) -> float:
     return max(P * V_S, 1.0)
 
 
-def scaled_grid(nVoxel: Sequence[int], S: float, smallest: int = 8) -> tuple[int, int, int]:
+def scaled_grid(shape: Sequence[int], S: float, smallest: int = 8) -> tuple[int, int, int]:
     """V_ds = V_d / S, rounded to whole cells, at least `smallest` (or all cells, if they are fewer)."""
-    x, y, z = (max(int(n / S + 0.5), min(smallest, int(n))) for n in nVoxel)
+    x, y, z = (max(int(n / S + 0.5), min(smallest, int(n))) for n in shape)
     return x, y, z

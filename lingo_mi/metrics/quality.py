@@ -166,21 +166,6 @@ def ssim_map(a: np.ndarray, b: np.ndarray, axes: Sequence[int] = (0, 1)) -> np.n
     return (2 * mab + C1) * (2 * (blur(a * b) - mab) + C2) / ((mm + C1) * (blur(a * a + b * b) - mm + C2))
 
 
-def current_names(numbers: dict) -> dict:
-    """Stored numbers, or an entry of a fit's history, with today's names.
-
-    Before, `psnr_3d`, `ssim_3d` and `ssim_2d` were R2-Gaussian's forms, and the others were called `psnr_3d_absolute` and so on.
-    Numbers with today's names come back as they are.
-
-        current_names(dict(psnr_3d=30.0, psnr_3d_absolute=28.0))   # psnr_3d_r2=30.0, psnr_3d=28.0
-    """
-    new = {}
-    for name in 'psnr_3d', 'ssim_3d', 'ssim_2d':
-        if f'{name}_r2' not in numbers:
-            new |= {name: f'{name}_r2', f'{name}_absolute': name}
-    return {new.get(name, name): value for name, value in numbers.items()}
-
-
 def _pair(a, b, what, axes):
     """Both arrays, checked."""
     a, b = (np.asarray(x) for x in (a, b))

@@ -21,7 +21,7 @@ import numpy as np
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import short_repr
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 
 _NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
 
@@ -56,9 +56,9 @@ class Phantom:
         return notebook.box(repr(self), notebook.slices(self.data, self.spacing, unit=''))
 
     @property
-    def origin(self) -> tuple[float, float, float]:
-        """World position of the centre of the first voxel, mm."""
-        return tuple(-s * (n - 1) / 2 for s, n in zip(self.spacing, self.data.shape))
+    def grid(self) -> Grid:
+        """Its voxels."""
+        return Grid(self.data.shape, self.spacing)
 
 
 def names() -> tuple[str, ...]:

@@ -16,18 +16,18 @@ from scipy.interpolate import PchipInterpolator
 
 from lingo_mi.phantoms.solids import (
     Blend,
-    Block,
     Branching,
     Cone,
+    Cube,
     Cylinder,
     Ellipsoid,
-    Grid,
+    RoundedBox,
     Texture,
     branches,
-    refine,
     rotation,
     smooth_max,
     smooth_min,
+    subdivide,
     tube,
     union,
 )
@@ -46,7 +46,7 @@ LUNG, FAT, WATER, BLOOD, MUSCLE, LIVER, CARTILAGE = (float(density(hu)) for hu i
 
 
 @dataclass(frozen=True)
-class Stack:
+class Torso:
     """A body with an elliptic cross-section at every height: rows of (z, half width, half depth, y)."""
 
     rows: tuple
@@ -65,7 +65,7 @@ class Stack:
         return (k - 1) * np.sqrt(x * x + y * y) / np.maximum(k, np.float32(1e-3))
 
 
-_CAGE = Stack(
+_CAGE = Torso(
     (
         (-190, 128, 88, 4),
         (-90, 136, 95, 6),
@@ -76,7 +76,7 @@ _CAGE = Stack(
         (132, 38, 30, -22),
     )
 )
-_TRUNK = Stack(
+_TRUNK = Torso(
     (
         (-190, 160, 112, 0),
         (-90, 164, 117, 2),
@@ -158,10 +158,10 @@ def _front(z):
 def _girdle():
     """Sternum, clavicles, scapulae and humeri."""
     out = [
-        Blend((Block((0, _front(78), 82), (25, 6, 22), 5, rotation(pitch=22)),), 0),
+        Blend((RoundedBox((0, _front(78), 82), (25, 6, 22), 5, rotation(pitch=22)),), 0),
         Blend(
             (
-                Block((0, _front(12), 12), (17, 5.5, 44), 5, rotation(pitch=7)),
+                RoundedBox((0, _front(12), 12), (17, 5.5, 44), 5, rotation(pitch=7)),
                 Cone((0, _front(-32), -30), (0, _front(-52) - 3, -54), 6, 3.5),
             ),
             5.0,
@@ -259,7 +259,7 @@ def _trees(rng, is_lung):
 def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     """Data float32 [size]^3 in [0, 1], side in mm, and no analytic form (see `phantoms.make`)."""
     rng = np.random.default_rng(seed)
-    grid, coarse = (Grid(n, SIDE, np.full(3, -SIDE / 2)) for n in (size, _COARSE))
+    grid, coarse = (Cube(n, SIDE, np.full(3, -SIDE / 2)) for n in (size, _COARSE))
     step = SIDE / _COARSE
     texture = Texture(rng, 60.0, 1.5, (1.3, 1.3, 1.6))
     flesh = Texture(rng, 190.0, 2.5, (4.0, 4.0, 5.0))
@@ -294,8 +294,8 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     fat = np.float32(FAT) + np.float32(0.004) * mottle
     tissue += np.clip((skin + np.float32(8)) / 3, 0, 1) * (fat - tissue)  # under the skin
 
-    image, skin, fine_lung = refine(tissue, grid), refine(skin, grid), refine(lung, grid)
-    air = np.float32(LUNG) + np.float32(0.006) * refine(mottle, grid) + np.float32(0.006) * texture(grid)
+    image, skin, fine_lung = subdivide(tissue, grid), subdivide(skin, grid), subdivide(lung, grid)
+    air = np.float32(LUNG) + np.float32(0.006) * subdivide(mottle, grid) + np.float32(0.006) * texture(grid)
     image += grid.cover(fine_lung) * (air - image)
 
     def is_lung(p):

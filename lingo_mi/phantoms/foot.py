@@ -22,18 +22,18 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.phantoms.solids import (
     Blend,
-    Block,
     Cone,
+    Cube,
     Cut,
     Cylinder,
     Ellipsoid,
-    Grid,
+    RoundedBox,
     Texture,
     branches,
-    refine,
     rotation,
     smooth_max,
     smooth_min,
+    subdivide,
     tube,
     union,
 )
@@ -132,7 +132,7 @@ def bones() -> list[Bone]:
                 (  # tibia
                     Cone((-4, 66, 285), (-4, 66, 140), 12.5, 11.5),
                     Cone((-4, 66, 140), (-4, 67, 112), 11.5, 16),
-                    Block((-4, 67, 98), (19, 18, 13), 8, rotation(yaw=8)),
+                    RoundedBox((-4, 67, 98), (19, 18, 13), 8, rotation(yaw=8)),
                     Cone((-20, 66, 98), (-23.5, 67, 77), 9.5, 6),
                 ),
                 7.0,
@@ -168,7 +168,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # cuboid: medially longest
-                    Block((17, 110, 32), (10, 17, 11), 7.5, rotation(yaw=-8, pitch=-8, roll=18)),
+                    RoundedBox((17, 110, 32), (10, 17, 11), 7.5, rotation(yaw=-8, pitch=-8, roll=18)),
                     Ellipsoid((25, 108, 29), (9, 12, 10), rotation(yaw=-18)),
                     Cone((12, 106, 23), (26, 112, 21), 5, 4),
                 ),
@@ -180,7 +180,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (
-                    Block((-22, 138, 44), (6.5, 12, 12), 6, rotation(yaw=4, roll=16)),
+                    RoundedBox((-22, 138, 44), (6.5, 12, 12), 6, rotation(yaw=4, roll=16)),
                     Ellipsoid((-23, 137, 34), (8.5, 11.5, 8.5)),
                 ),
                 6.0,
@@ -189,7 +189,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # intermediate: a wedge
-                    Block((-6, 133, 53), (7.5, 9, 7), 5),
+                    RoundedBox((-6, 133, 53), (7.5, 9, 7), 5),
                     Ellipsoid((-5.5, 133, 44), (5, 8, 8)),
                 ),
                 5.0,
@@ -198,7 +198,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # lateral: a wedge
-                    Block((8, 135, 48), (7.5, 11, 7.5), 5.5, rotation(yaw=-5, roll=8)),
+                    RoundedBox((8, 135, 48), (7.5, 11, 7.5), 5.5, rotation(yaw=-5, roll=8)),
                     Ellipsoid((8, 134, 38), (5.5, 9, 8.5)),
                 ),
                 5.0,
@@ -245,7 +245,7 @@ def bones() -> list[Bone]:
     return out
 
 
-def _skin(grid: Grid) -> np.ndarray:
+def _skin(grid: Cube) -> np.ndarray:
     """Signed distance to the skin."""
     parts = [
         # shin
@@ -378,13 +378,13 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     """Data float32 [size]^3 in [0, 1], side in mm, and no analytic form (see `phantoms.make`)."""
     rng = np.random.default_rng(seed)
     side = SIDE / _SCALE
-    grid = Grid(size, side, _CENTRE - side / 2)
+    grid = Cube(size, side, _CENTRE - side / 2)
     step = side / 256
     trabecular = Texture(rng, 72 * step, step, (0.55, 0.95, 0.55))
     flesh = Texture(rng, 64 * 2 * step, 2 * step, (2.2, 3.2, 2.8))
 
     # Soft tissue varies slowly: a lattice of fixed 2 mm keeps it cheap and independent of the size.
-    coarse = Grid(128, side, grid.origin)
+    coarse = Cube(128, side, grid.origin)
     skin = _skin(coarse)
     mottle = flesh(coarse)
     tissue = np.float32(FAT) + np.float32(0.006) * mottle
@@ -393,7 +393,7 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     # The fat under the skin is never muscle.
     fat = np.float32(FAT) + np.float32(0.008) * mottle
     tissue += np.clip((skin + np.float32(4.5)) / 3, 0, 1) * (fat - tissue)
-    image, skin = refine(tissue, grid), refine(skin, grid)
+    image, skin = subdivide(tissue, grid), subdivide(skin, grid)
     for t in _tendons():
         grid.paint(image, t, TENDON)
     for v in _vessels(rng):

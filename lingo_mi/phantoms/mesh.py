@@ -19,7 +19,7 @@ import trimesh
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.geometry.triangles import add_lengths, voxelize
+from lingo_mi.geometry.triangles import add_lengths, voxelize_triangles
 from lingo_mi.phantoms.solids import rotation
 
 SIDE = 256.0  # mm
@@ -148,4 +148,4 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:
     used."""
     analytic = Mesh(flange())
     step = SIDE / size
-    return voxelize(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size, size, size)), SIDE, analytic
+    return voxelize_triangles(analytic.mesh.triangles, [-SIDE / 2] * 3, [step] * 3, (size, size, size)), SIDE, analytic

@@ -39,7 +39,7 @@ TABLE = np.array(
 
 
 @dataclass(frozen=True)
-class Ellipsoids:
+class UniformEllipsoids:
     """A sum of constant ellipsoids.
 
     density  float64 [n]
@@ -79,7 +79,7 @@ class Ellipsoids:
         return float((self.density * 4 / 3 * np.pi / np.linalg.det(self.whiten)).sum())
 
 
-def ellipsoids() -> Ellipsoids:
+def ellipsoids() -> UniformEllipsoids:
     """The ten ellipsoids in the world frame, mm."""
     angle = np.radians(TABLE[:, 7])
     c, s = np.cos(angle), np.sin(angle)
@@ -88,7 +88,7 @@ def ellipsoids() -> Ellipsoids:
     whiten[:, 0, 1], whiten[:, 1, 0], whiten[:, 2, 2] = s, -s, 1
     half = SIDE / 2
     whiten /= (TABLE[:, 1:4] * half)[:, :, None]
-    return Ellipsoids(TABLE[:, 0].copy(), TABLE[:, 4:7] * half, whiten)
+    return UniformEllipsoids(TABLE[:, 0].copy(), TABLE[:, 4:7] * half, whiten)
 
 
 def build(size: int, seed: int) -> tuple[np.ndarray, float, Any]:

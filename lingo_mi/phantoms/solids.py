@@ -77,7 +77,7 @@ class Ellipsoid:
 
 
 @dataclass(frozen=True)
-class Block:
+class RoundedBox:
     """A box with half sides `half` (rounding included) and edges rounded by the radius `edge`."""
 
     centre: Point
@@ -205,7 +205,7 @@ def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndar
     return (about_z @ about_x @ about_y).T
 
 
-class Grid:
+class Cube:
     """Voxel centres of a cube of `size`^3 voxels whose side `side` starts at `origin` (anatomical
     coordinates)."""
 
@@ -252,7 +252,7 @@ class Grid:
         image[where] += c * ((value(where) if callable(value) else np.float32(value)) - image[where])
 
 
-def union(grid: Grid, solids: Iterable, k: float, pad: float) -> np.ndarray:
+def union(grid: Cube, solids: Iterable, k: float, pad: float) -> np.ndarray:
     """Smooth union of many solids over a whole grid, each evaluated within `pad` of its bounds; `pad`
     elsewhere."""
     d = np.full(grid.shape, pad, np.float32)
@@ -278,7 +278,7 @@ def _resampling(n, step, start, h, size, wrap):
     return sparse.csr_matrix((weights.astype(np.float32), (rows, columns)), (size, n))
 
 
-def refine(coarse: np.ndarray, grid: Grid) -> np.ndarray:
+def subdivide(coarse: np.ndarray, grid: Cube) -> np.ndarray:
     """A smooth field given on a coarser or finer cubic grid over the same cube, at the voxels of `grid`
     (linear)."""
     n = coarse.shape[0]
@@ -309,7 +309,7 @@ class Texture:
         noise = fine - ndimage.gaussian_filter(fine, 1.8 * sigma, mode='wrap', truncate=3)
         self.noise = noise / noise.std()
 
-    def __call__(self, grid: Grid, where: Sequence[slice] | None = None) -> np.ndarray:
+    def __call__(self, grid: Cube, where: Sequence[slice] | None = None) -> np.ndarray:
         out = self.noise
         where = where or (slice(0, grid.size),) * 3
         for axis, s in enumerate(where):

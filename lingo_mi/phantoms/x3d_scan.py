@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.phantoms import Phantom
 from lingo_mi.scan import Dataset, Scan
@@ -28,24 +28,25 @@ def default_geometry(phantom: Phantom, angles: ArrayLike, pixels: int = PIXELS) 
         DSD=1500.0,
         nDetector=(pixels, pixels),
         dDetector=(pixel, pixel),
-        nVoxel=phantom.data.shape,
-        dVoxel=phantom.spacing,
         angles=np.asarray(angles, float),
+        grid=phantom.grid,
     )
 
 
-def simulate(phantom: Phantom, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+def project_phantom(
+    phantom: Phantom, geometry: Geometry, progress: Callable[[int, int], None] | None = None
+) -> np.ndarray:
     """Noise-free line integrals, float32 [view, v, u], density times mm.
 
     Exact projections of the object if the phantom has them and the grid is its own, of its size about the origin; else exact
     projections of its voxels on the geometry's grid, trilinear, which need an active Mitsuba variant.
     progress: called as progress(views done, views) after every view.
     """
-    own = np.allclose(geometry.dVoxel, phantom.spacing, rtol=1e-6) and not any(geometry.offOrigin)
+    own = np.allclose(geometry.grid.spacing, phantom.spacing, rtol=1e-6) and not any(geometry.grid.centre)
     if phantom.analytic is None or not own:
         from lingo_mi.projectors import grid
 
-        return grid.project(phantom.data, geometry, progress)
+        return grid.project_volume(phantom.data, geometry, progress)
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
     for i in range(len(geometry)):
         out[i] = phantom.analytic.project(geometry.subset([i]))[0]
@@ -70,5 +71,5 @@ def scan(
         raise InputError(f'a scan needs at least one view, not {views}')
     angles = np.concatenate([circular(views, 180.0), np.sort(np.random.default_rng(seed).uniform(0, np.pi, views))])
     geometry = default_geometry(phantom, angles, pixels)
-    both = Scan(geometry, simulate(phantom, geometry, progress))
+    both = Scan(geometry, project_phantom(phantom, geometry, progress))
     return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)

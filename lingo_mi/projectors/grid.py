@@ -9,7 +9,7 @@ Both points of a segment share the eight corner fetches.
 The transpose scatters the same corner weights, so it is the adjoint to rounding. Nothing is stored between
 the two.
 
-`line_integrals` is a differentiable function of the volume; `project` and `backproject` run a whole scan.
+`line_integrals` is a differentiable function of the volume; `project_volume` and `backproject` run a whole scan.
 """
 
 from __future__ import annotations
@@ -252,7 +252,7 @@ def view_table(geometry: Geometry) -> np.ndarray:
     pixel along u and v; the direction and its steps; last, the smallest t. The origins lie on a plane through
     the volume's centre and are computed in float64, so a distant source costs no float32 precision.
     """
-    rays, centre = geometry.rays(), np.array(geometry.offOrigin)
+    rays, centre = geometry.rays(), np.array(geometry.grid.centre)
     corner, source = rays.corner - centre, rays.source
     normal = np.cross(rays.u, rays.v)
     zero = np.zeros_like(corner)
@@ -304,8 +304,10 @@ def _occupied(volume):
 
 def pixel_walk(geometry: Geometry, rows: Any, x: Any, y: Any, view: Any = 0) -> tuple[Walk, Any]:
     """The `Walk` along `pixel_rays` through the whole volume, and the length of a unit of t, in mm."""
-    half = mi.Vector3f(*(s / 2 for s in geometry.sVoxel))
-    return _walk(geometry.nVoxel, -half, half, Lines(*pixel_rays(rows, x, y, view)), *whole_box(geometry.nVoxel))
+    half = mi.Vector3f(*(s / 2 for s in geometry.grid.size))
+    return _walk(
+        geometry.grid.shape, -half, half, Lines(*pixel_rays(rows, x, y, view)), *whole_box(geometry.grid.shape)
+    )
 
 
 def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, Any]:
@@ -313,14 +315,16 @@ def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, 
 
     row is one row of `view_table` as an evaluated mi.Float [19].
     """
-    half = mi.Vector3f(*(s / 2 for s in geometry.sVoxel))
-    return _walk(geometry.nVoxel, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
+    half = mi.Vector3f(*(s / 2 for s in geometry.grid.size))
+    return _walk(geometry.grid.shape, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
 
 
-def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+def project_volume(
+    volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int], None] | None = None
+) -> np.ndarray:
     """Projections of a voxel volume along the rays of all pixel centres, exact for its trilinear interpolant.
 
-    volume     [x, y, z], of shape `geometry.nVoxel`; densities per mm
+    volume     [x, y, z], of shape `geometry.grid.shape`; densities per mm
     progress   called as progress(views done, views) after every view
 
     Returns float32 [view, v, u], density times mm. A cone beam starts at the source. Rays do not end at the
@@ -330,8 +334,10 @@ def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int
     Raises InputError if the shapes disagree or the volume is not finite.
     """
     volume = np.ascontiguousarray(volume, np.float32)
-    if volume.shape != geometry.nVoxel:
-        raise InputError(f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    if volume.shape != geometry.grid.shape:
+        raise InputError(
+            f'the volume has the shape {volume.shape}, but the geometry says nVoxel = {geometry.grid.shape}'
+        )
     if not np.isfinite(volume).all():
         raise InputError('the volume contains NaN or infinity: replace those voxels first')
     out = np.zeros((len(geometry), *geometry.nDetector), np.float32)
@@ -343,7 +349,7 @@ def project(volume: np.ndarray, geometry: Geometry, progress: Callable[[int, int
     data = mi.Float(volume.ravel())
     for i, row in enumerate(view_table(geometry)):
         walk, length = view_walk(geometry, mi.Float(row), low, high)
-        out[i] = (length * gather(data, geometry.nVoxel, walk)).numpy().reshape(geometry.nDetector[::-1]).T
+        out[i] = (length * gather(data, geometry.grid.shape, walk)).numpy().reshape(geometry.nDetector[::-1]).T
         if progress:
             progress(i + 1, len(geometry))
     return out

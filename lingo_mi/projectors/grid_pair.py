@@ -32,7 +32,7 @@ class GridPair(Stack):
     def of_slab(self, slab: Geometry) -> GridPair:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out._rays = slab, slab.nVoxel, uploaded(view_table(slab))
+        out.geometry, out.size, out._rays = slab, slab.grid.shape, uploaded(view_table(slab))
         return out
 
     def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:

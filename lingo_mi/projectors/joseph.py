@@ -42,8 +42,8 @@ def column_table(geometry: Geometry) -> np.ndarray:
     source, in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
     """
     rays, n_u = geometry.rays(), geometry.nDetector[1]
-    voxel = np.array(geometry.dVoxel[:2])
-    first = np.array(geometry.offOrigin[:2]) + (voxel - geometry.sVoxel[:2]) / 2
+    voxel = np.array(geometry.grid.spacing[:2])
+    first = np.array(geometry.grid.centre[:2]) + (voxel - geometry.grid.size[:2]) / 2
     column = np.arange(n_u)[:, None] + 0.5
     pixel = rays.corner[:, None, :2] + column * rays.u[:, None, :2]  # [view, u, 2], mm
     source = rays.source[:, None, :2]
@@ -63,7 +63,7 @@ def column_table(geometry: Geometry) -> np.ndarray:
     b = other(step) * e
     a = other(np.broadcast_to(index, step.shape)) + other(step) * c
     path = main(np.broadcast_to(voxel, step.shape)) / main(direction)
-    g, h = path**2 * (direction**2).sum(-1), (path * geometry.dVoxel[2]) ** 2
+    g, h = path**2 * (direction**2).sum(-1), (path * geometry.grid.spacing[2]) ** 2
     if rays.parallel:
         c, e, h = np.ones_like(c), np.zeros_like(c), np.zeros_like(c)
     return np.stack([a, b, c, e, g, h, along_y, np.zeros_like(a)], -1).astype(np.float32)
@@ -71,8 +71,8 @@ def column_table(geometry: Geometry) -> np.ndarray:
 
 def row_table(geometry: Geometry) -> np.ndarray:
     """Heights of the source, of the first row over it, and between rows, in voxels: float32 [view, 3]."""
-    rays, voxel = geometry.rays(), geometry.dVoxel[2]
-    first = geometry.offOrigin[2] + (voxel - geometry.sVoxel[2]) / 2
+    rays, voxel = geometry.rays(), geometry.grid.spacing[2]
+    first = geometry.grid.centre[2] + (voxel - geometry.grid.size[2]) / 2
     source = 0.0 * rays.v[:, 2] if rays.parallel else (rays.source[:, 2] - first) / voxel
     top = (rays.corner[:, 2] + rays.v[:, 2] / 2 - first) / voxel
     return np.stack([source, top - source, rays.v[:, 2] / voxel], -1).astype(np.float32)
@@ -84,7 +84,7 @@ def _is_upright(geometry: Geometry) -> bool:
     pixel = np.minimum(np.linalg.norm(rays.u, axis=1), np.linalg.norm(rays.v, axis=1))
     off = np.abs(rays.u[:, 2]) * n_u + np.linalg.norm(rays.v[:, :2], axis=1) * n_v
     if rays.parallel:
-        off = off + np.abs(rays.source[:, 2]) * np.linalg.norm(geometry.sVoxel[:2])
+        off = off + np.abs(rays.source[:, 2]) * np.linalg.norm(geometry.grid.size[:2])
     return bool((off < TILT * pixel).all())
 
 
@@ -94,14 +94,14 @@ def _rows_of_voxel(geometry):
     nearest = _nearest(rays, geometry)
     if nearest <= 0:
         return np.inf
-    return np.ceil(2 * geometry.dVoxel[2] / (nearest * np.abs(rays.v[:, 2]).min()) + 1e-3)
+    return np.ceil(2 * geometry.grid.spacing[2] / (nearest * np.abs(rays.v[:, 2]).min()) + 1e-3)
 
 
 def _nearest(rays: Rays, geometry):
     """The smallest share of the way from the source to the panel at which a voxel lies; parallel: 1."""
     if rays.parallel:
         return 1.0
-    half, middle = np.array(geometry.sVoxel[:2]) / 2, np.array(geometry.offOrigin[:2])
+    half, middle = np.array(geometry.grid.size[:2]) / 2, np.array(geometry.grid.centre[:2])
     corners = middle + half * [(-1, -1), (-1, 1), (1, -1), (1, 1)]
     normal = np.cross(rays.u, rays.v)[:, :2]
     to_panel = ((rays.corner - rays.source)[:, :2] * normal).sum(1)
@@ -141,7 +141,7 @@ class Joseph(Gathered):
     def of_slab(self, slab: Geometry) -> Joseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out.rows = slab, slab.nVoxel, uploaded(row_table(slab))
+        out.geometry, out.size, out.rows = slab, slab.grid.shape, uploaded(row_table(slab))
         return out
 
     def _column_matrix(self):

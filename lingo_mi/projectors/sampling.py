@@ -15,7 +15,7 @@ from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.objects import Ellipsoids, GridInCube, HomogeneousMesh
 from lingo_mi.projectors.rotation import rows_of
 from lingo_mi.projectors.view import vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 
 
 def on_grid(
@@ -36,13 +36,13 @@ def on_grid(
     """
     nx, ny, nz = shape
     if isinstance(thing, Ellipsoids):
-        cells = Grid(vector64(corner), vector64(step), (nx, ny, nz))
+        cells = Lattice(vector64(corner), vector64(step), (nx, ny, nz))
         return cells.volume(
             voxelize(thing.centre, thing.scale, thing.rotation, thing.density, cells, extent, deep=True)
         )
     if isinstance(thing, HomogeneousMesh):
         sigma = np.ravel(thing.sigma)[0] * np.ravel(thing.scale)[0]
-        return triangles.voxelize(thing.triangles(), corner, step, shape) * np.float32(sigma)
+        return triangles.voxelize_triangles(thing.triangles(), corner, step, shape) * np.float32(sigma)
     values = grid_values(thing)
     low, high = _box(thing)
     own = (high - low) / values.shape

@@ -59,7 +59,7 @@ class Stack:
     SETTINGS: tuple[str, ...] = ('size', 'panel')  # Python's
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
-        self.geometry, self.size, self.panel = geometry, geometry.nVoxel, geometry.nDetector
+        self.geometry, self.size, self.panel = geometry, geometry.grid.shape, geometry.nDetector
         if self.voxels >= 2**32:
             raise InputError(f'{self.voxels} voxels are too many for one volume: lower nVoxel')
         self.valid = None if valid is None else self.images(valid)

@@ -30,9 +30,9 @@ def ray_table(geometry: Geometry) -> np.ndarray:
     In threes: the origin and its steps per pixel along u and v; the direction and its steps; the size of a voxel, mm. See
     `grid.view_table`, whose rays these are.
     """
-    threes = view_table(geometry)[:, :18].astype(float).reshape(-1, 6, 3) / geometry.dVoxel
-    threes[:, 0] += (np.array(geometry.nVoxel) - 1) / 2
-    voxel = np.broadcast_to(geometry.dVoxel, (len(threes), 1, 3))
+    threes = view_table(geometry)[:, :18].astype(float).reshape(-1, 6, 3) / geometry.grid.spacing
+    threes[:, 0] += (np.array(geometry.grid.shape) - 1) / 2
+    voxel = np.broadcast_to(geometry.grid.spacing, (len(threes), 1, 3))
     return np.concatenate([threes, voxel], 1).reshape(-1, RAY).astype(np.float32)
 
 
@@ -59,16 +59,16 @@ class TiltedJoseph(Gathered):
         """Whether it can project a scan: all of the volume, and a voxel around it, must lie before the source."""
         if geometry.mode == 'parallel':
             return True
-        rays, half = geometry.rays(), np.array(geometry.sVoxel) / 2 + geometry.dVoxel
+        rays, half = geometry.rays(), np.array(geometry.grid.size) / 2 + geometry.grid.spacing
         signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 1, 3)
         normal = np.cross(rays.u, rays.v)
-        ahead = ((geometry.offOrigin + half * signs - rays.source) * normal).sum(-1)
+        ahead = ((geometry.grid.centre + half * signs - rays.source) * normal).sum(-1)
         return bool((ahead / ((rays.corner - rays.source) * normal).sum(-1) > 0).all())
 
     def of_slab(self, slab: Geometry) -> TiltedJoseph:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size = slab, slab.nVoxel
+        out.geometry, out.size = slab, slab.grid.shape
         out._place(slab)
         return out
 

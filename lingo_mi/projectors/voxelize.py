@@ -44,8 +44,8 @@ NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s
 
 
 @dataclass
-class Grid:
-    """A voxel grid.
+class Lattice:
+    """The voxels of a grid on the device.
 
     corner    Vector3d, opaque: the outer corner of the first voxel
     step      Vector3d, opaque: the voxel size
@@ -64,7 +64,7 @@ class Grid:
 
 
 def voxelize(
-    centre: Any, scale: Any, rotation: Any, density: Any, grid: Grid, extent: float, deep: bool = False
+    centre: Any, scale: Any, rotation: Any, density: Any, grid: Lattice, extent: float, deep: bool = False
 ) -> Any:
     """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
 

@@ -52,8 +52,8 @@ class Beam:
             raise InputError('air, percentile and i0 all say the air level; give one of them')
         if flats is None and i0 is None and without_air:
             raise InputError(
-                f'{path}: there are no flat frames; give --flats, or the air level: --air V0 V1 U0 U1 (a region without object), '
-                '--air-percentile P, or --i0 COUNTS'
+                f'{path}: there are no flat frames; give flats=FILE, or the air level: air=(v0, v1, u0, u1), a region without '
+                'object, percentile=P, or i0=COUNTS'
             )
         if i0 is not None and not i0 > 0:
             raise InputError(f'i0 must be positive, not {i0:g}')

@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import scanner_dict
 from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry, Grid
 from lingo_mi.raw.frames import Frames
 from lingo_mi.raw.nikon import read_numbers, read_xtekct
 from lingo_mi.raw.options import Options
@@ -56,7 +56,7 @@ def geometry_of(
             raise InputError('angles must be a list of numbers, in degrees, or the name of a file of them') from None
     if angles is not None and not np.isfinite(angles).all():
         raise InputError(
-            f'{frames.where}: angle {int(np.argmin(np.isfinite(angles)))} is no finite number; give --angles'
+            f'{frames.where}: angle {int(np.argmin(np.isfinite(angles)))} is no finite number; give angles=FILE'
         )
     if angles is not None and len(angles) != n:
         raise InputError(f'{frames.where}: there are {len(angles)} angles for {n} views; these must agree')
@@ -71,7 +71,7 @@ def geometry_of(
     grid: dict[str, Any] = dict(nVoxel=[shape[1], shape[1], shape[0]], dVoxel=1.0)
     if suffix == '.xml':
         if options.pixel is None:
-            raise InputError(f"{path}: RTK's geometry says no size of pixels; give --pixel, in mm")
+            raise InputError(f"{path}: RTK's geometry says no size of pixels; give pixel=MM")
         found = Geometry.from_rtk(path, nDetector=shape, dDetector=options.pixel, **grid)
         if len(found) != n:
             raise InputError(f'{path}: describes {len(found)} views, but there are {n} frames; these must agree')
@@ -84,7 +84,8 @@ def geometry_of(
         for name, wrong in dict(valid=True, I0=True, input=values.get('input') == 'intensity').items():
             if wrong and values.get(name) is not None:
                 raise InputError(
-                    f'{path}: {name} describes projections, not raw frames; take it out, and give --flats, --i0 or --air'
+                    f'{path}: {name} describes projections, not raw frames; take it out, and give flats=FILE, i0=COUNTS '
+                    'or air=(v0, v1, u0, u1)'
                 )
     else:
         raise InputError(f'{path}: is no geometry file; give .yml, .xtekct or .xml (RTK)')
@@ -101,7 +102,7 @@ def geometry_of(
         values['angles'] = np.asarray(angles).tolist()
     elif free:
         raise InputError(
-            f'{path}: no angles: neither here nor with the frames; add angles or totalAngle, or give --angles'
+            f'{path}: no angles: neither here nor with the frames; add angles or totalAngle, or give angles=FILE'
         )
     if nikon:
         if len(values['angles']) != n:
@@ -122,7 +123,7 @@ def placed(geometry: Geometry, crop: tuple[int, int, int, int]) -> Geometry:
         return replace(geometry, nDetector=(v1 - v0, u1 - u0), offDetector=offset)
     rays = geometry.rays()
     rays = replace(rays, corner=rays.corner + u0 * rays.u + v0 * rays.v)
-    return Geometry.from_poses(rays, (v1 - v0, u1 - u0), geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+    return Geometry.from_poses(rays, (v1 - v0, u1 - u0), grid=geometry.grid)
 
 
 def own_grid(geometry: Geometry) -> Geometry:
@@ -138,5 +139,5 @@ def own_grid(geometry: Geometry) -> Geometry:
     seen = start - along * ((start * across).sum(-1) / (along * across).sum(-1))[..., None]
     low, high = seen[..., 2].min(), seen[..., 2].max()
     side, height = (max(1, int(np.ceil(x / step - 1e-6))) for x in (2 * np.hypot(*seen[..., :2].T).max(), high - low))
-    middle = geometry.offOrigin if any(geometry.offOrigin) else (0.0, 0.0, (low + high) / 2)
-    return replace(geometry, nVoxel=(side, side, height), dVoxel=(step,) * 3, offOrigin=middle)
+    middle = geometry.grid.centre if any(geometry.grid.centre) else (0.0, 0.0, (low + high) / 2)
+    return geometry.on(Grid((side, side, height), (step,) * 3, middle))

@@ -15,7 +15,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.raw.beam import Beam
 from lingo_mi.raw.frame_geometry import geometry_of, grid_given, own_grid, placed
 from lingo_mi.raw.frames import open_recording
-from lingo_mi.raw.line_integrals import line_integrals, photons_of_images
+from lingo_mi.raw.line_integrals import counts_to_line_integrals, photons_of_images
 from lingo_mi.raw.options import Options, chosen_views, exposures, region_of
 from lingo_mi.scan import Scan
 
@@ -68,7 +68,9 @@ def import_raw(
         for k, i in enumerate(chosen):
             frame = views[i]
             levels[k] = beam.level(frame, float(exposure[i]))  # of the whole frame: air may lie outside the crop
-            p[k], valid[k] = line_integrals(kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit)
+            p[k], valid[k] = counts_to_line_integrals(
+                kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit
+            )
             light[k] = np.exp(np.minimum(-p[k][valid[k]], 50)).sum() / valid[k].size  # no overflow
             highest = frame.max()
             if highest < beam.limit and _full_range(highest) and (frame == highest).mean() > CLIPPED:
@@ -111,26 +113,26 @@ def _check_views(path, chosen, p, valid, clipped):
         raise InputError(f'{path}: no view is brighter than the dark frames; are the right dark frames given?')
     if black:
         warnings.warn(
-            f'{path}: {_list(black)} without counts, or with hardly any (black): left out by the mask; use --views to drop '
-            'them',
+            f'{path}: {_list(black)} without counts, or with hardly any (black): left out by the mask; drop them with '
+            'views=(first, end, step)',
             stacklevel=4,
         )
     if valid.mean() < 0.5:
         warnings.warn(
-            f'{path}: {1 - valid.mean():.2%} of the pixels are left out: are the flats, the darks and --saturation right?',
+            f'{path}: {1 - valid.mean():.2%} of the pixels are left out: are the flats, the darks and the saturation right?',
             stacklevel=4,
         )
     if clipped:
         highest = max(clipped.values())
         warnings.warn(
             f'{path}: {_list(list(clipped))} saturated: many pixels have exactly the highest count of {highest:g}; give '
-            f'--saturation {highest:g}',
+            f'saturation={highest:g}',
             stacklevel=4,
         )
     if above:
         warnings.warn(
             f'{path}: {_list(above)} more than 10 % brighter than the air level in {OFTEN:.0%} of the pixels: flats of another '
-            'exposure? Give --exposure, or --air',
+            'exposure? Give exposure=X, or air=(v0, v1, u0, u1)',
             stacklevel=4,
         )
 

@@ -74,7 +74,7 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
         if (counts >= saturation).mean() > FULL:
             raise InputError(
                 f'{flats.where}: nearly all pixels of flat {i} reach the saturation, {saturation:g} counts; give flats of '
-                'a shorter exposure and the --exposure of the views, or --air'
+                'a shorter exposure and exposure=X of the views over theirs, or air=(v0, v1, u0, u1)'
             )
         bright[i] = np.median(frame[np.isfinite(frame)]) if np.isfinite(frame).any() else 0.0
         if not bright[i] > 0:
@@ -106,7 +106,7 @@ def _near(dark, signal):
     return off <= np.maximum(HOT * np.median(signal), 12 * 1.4826 * np.median(off) + 1)
 
 
-def line_integrals(
+def counts_to_line_integrals(
     view: np.ndarray, known: Fields, bins: tuple[int, int], exposure: float = 1.0, saturation: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line integrals of one view [v, u], and the mask of its valid pixels [v, u].

@@ -57,9 +57,7 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
     if top != bottom:
         unread.append('the slope between CentreOfRotationTop and CentreOfRotationBottom')
     if unread:
-        warnings.warn(
-            f'{path}: {", ".join(unread)} is not read; `lingo-mi inspect` measures an axis offset', stacklevel=2
-        )
+        warnings.warn(f'{path}: {", ".join(unread)} is not read: calibrate the scan if its axis is off', stacklevel=2)
     values = dict(
         DSO=DSO,
         DSD=DSD,

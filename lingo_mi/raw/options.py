@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.parsing import checked, whole
+from lingo_mi.common.parsing import checked, whole_number
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Options:
         for name in 'percentile', 'i0', 'saturation', 'pixel':
             if getattr(self, name) is not None:
                 checked(name, getattr(self, name), 0.0)
-        whole('binning', self.binning, 1)
+        whole_number('binning', self.binning, 1)
         try:
             first, end, step = (0, None, 1) if self.views is None else self.views
             for value in (first, 0 if end is None else end, step):

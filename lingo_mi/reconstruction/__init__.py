@@ -1,12 +1,10 @@
 """Volumes on voxels: filtered backprojection, iterative algorithms, and the refinement of a cloud's volume.
 
-    from lingo_mi.reconstruction import SART, reconstruct
-    found = reconstruct(scan, SART(niter=5))
+    found = lm.reconstruct(scan, lm.SART(niter=5))
     found.volume, found.residuals, found.seconds
 
-An algorithm is an object with its options, which are checked when it is created. Its `run` reconstructs a scan and returns a
-`Reconstruction`. `reconstruct` does the same, after it has checked that rays meet the volume and that there is enough memory.
-A Mitsuba variant must be active.
+An algorithm is an object with its options, which are checked when it is created. `lm.reconstruct` runs it. Code that has line
+integrals and an active Mitsuba variant calls `run_algorithm`.
 """
 
 from lingo_mi.reconstruction.algorithm import Algorithm, Reconstruction
@@ -15,7 +13,7 @@ from lingo_mi.reconstruction.best import Best
 from lingo_mi.reconstruction.cgls import CGLS
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.refined import Refined
-from lingo_mi.reconstruction.run import check_scan, progress_bar, reconstruct
+from lingo_mi.reconstruction.run import progress_bar, run_algorithm
 from lingo_mi.reconstruction.sart import OSSART, SART, SIRT
 
 ALGORITHMS: dict[str, type[Algorithm]] = {
@@ -34,7 +32,6 @@ __all__ = [
     'Best',
     'Reconstruction',
     'Refined',
-    'check_scan',
     'progress_bar',
-    'reconstruct',
+    'run_algorithm',
 ]

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
-from lingo_mi.files.volumes import first_voxel, write_volume
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.files.volumes import write_volume
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.metrics.quality import compared
 from lingo_mi.scan import Scan
 from lingo_mi.storage.file_access import as_path, new_file, writing
@@ -37,21 +37,20 @@ class Reconstruction:
     residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN where it was not computed; none for
                 FDK
     seconds     wall-clock time
-    geometry    of the scan; its voxels are those of the volume
+    grid        of the volume
     """
 
     volume: np.ndarray
     residuals: list[float]
     seconds: float
-    geometry: Geometry
+    grid: Grid
 
     __repr__ = short_repr
 
     def _repr_html_(self) -> str:
         """For a notebook: slices, each with a slider."""
-        geometry = self.geometry
         return notebook.box(
-            f'Reconstruction, {self.seconds:.1f} s', notebook.slices(self.volume, geometry.dVoxel, geometry.offOrigin)
+            f'Reconstruction, {self.seconds:.1f} s', notebook.slices(self.volume, self.grid.spacing, self.grid.centre)
         )
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
@@ -75,38 +74,34 @@ class Reconstruction:
 
         Raises InputError for another suffix, a file that is there already, or one that cannot be written.
         """
-        path, geometry = as_path('path', path), self.geometry
+        path = as_path('path', path)
         with writing(path):
             new_file(path, force)
             if path.name.endswith(ZARR):
-                write_slabs(path, geometry, (self.volume[:, :, a:b] for a, b in geometry.slabs(THICKNESS)))
+                write_slabs(path, self.grid, (self.volume[:, :, a:b] for a, b in self.grid.slabs(THICKNESS)))
             else:
-                write_volume(path, self.volume, geometry.dVoxel, first_voxel(geometry), 'density per mm')
+                write_volume(path, self.volume, self.grid, 'density per mm')
         return path
 
 
 class Algorithm(ABC):
-    """A reconstruction method: a frozen dataclass with its options as fields.
+    """A reconstruction method: a frozen dataclass with its options as fields, for `lm.reconstruct`.
 
-    The scan and the start volume are arguments of `run`, so one object serves any number of scans. Options are checked when the
-    object is created.
+    One object serves any number of scans. Options are checked when the object is created.
 
-    name   on the command line and in `ALGORITHMS`
+    `lm.reconstruct` is the public way to run an algorithm; code below it calls `run.run_algorithm`, which checks memory and
+    signal, and only modules of this package call `_run`.
+
+    name       on the command line and in `ALGORITHMS`
+    no_start   why it takes no volume to start from; empty if it takes one
     """
 
     name: ClassVar[str]
+    no_start: ClassVar[str] = ''
 
     @abstractmethod
-    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
-        """Reconstruct the volume of a scan.
-
-        scan       projections, treated as line integrals, and geometry
-        start      volume [x, y, z] to start from, density per mm: an array or another `Reconstruction` (default: zero)
-        progress   called as progress(steps done, `steps`, residual) after every step
-
-        Does not check memory or projections; `reconstruct` does. Raises InputError for a start that does not fit the geometry,
-        and if the result is not finite.
-        """
+    def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
+        """Reconstruct the volume of a scan, without the checks of `run_algorithm`, which describes the arguments."""
 
     @property
     def options(self) -> dict[str, Any]:
@@ -117,6 +112,6 @@ class Algorithm(ABC):
         """The largest number of steps, for `progress`."""
         return self.options['niter']
 
-    def grid(self, geometry: Geometry) -> Geometry:
-        """The geometry with the voxels that the algorithm works on. The result has the geometry's own voxels."""
-        return geometry
+    def grid(self, geometry: Geometry) -> Grid:
+        """The voxels that the algorithm works on. The result has the geometry's own voxels."""
+        return geometry.grid

@@ -108,9 +108,10 @@ class ASDPOCS(Algorithm):
 
     Use it for few views of objects with large uniform regions. For noisy projections, maxl2err sets how closely to match them.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = ASDPOCS(niter=5).run(measured)
+        >>> found = lm.reconstruct(measured, lm.ASDPOCS(niter=5), progress=False)
         >>> len(found.residuals), found.residuals[-1] < 0.05
         (6, True)
 
@@ -147,7 +148,7 @@ class ASDPOCS(Algorithm):
         if self.maxl2err is not None:
             check_bound('maxl2err', self.maxl2err)
 
-    def run(
+    def _run(
         self,
         scan: Scan,
         *,
@@ -157,7 +158,7 @@ class ASDPOCS(Algorithm):
         blur: Sequence[float] | None = None,
         watch: Callable[[int, mi.Float], bool] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. `weights` and `blur` of P are as in `OSSART.run`.
+        """Reconstruct the volume of a scan, see `run_algorithm`. `weights` and `blur` of P are as in `Sweeps._run`.
 
         watch   called after every pass as watch(passes done, volume on the device, mi.Float [voxels]); True stops
         """
@@ -186,7 +187,7 @@ class ASDPOCS(Algorithm):
             data_length = norm(data_change)
             if k == 0:
                 step = self.alpha * data_length
-            x = minimise_tv(x, scan.geometry.nVoxel, step, self.tviter)
+            x = minimise_tv(x, scan.geometry.grid.shape, step, self.tviter)
             tv_change = evaluated(x - projected)
             tv_length = norm(tv_change)
             if tv_length > self.rmax * data_length and error() > maxl2err:
@@ -200,7 +201,7 @@ class ASDPOCS(Algorithm):
             if watch is not None and watch(k + 1, x):
                 break
         error()  # of the last pass in any case
-        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)
 
     def _maxl2err(self, system: System, scan: Scan) -> float:
         """|A x - b| at which the data count as matched."""
@@ -208,4 +209,4 @@ class ASDPOCS(Algorithm):
             return self.maxl2err
         if not can_rectify(scan):
             return 0.0
-        return 0.2 * system.residual(system.start(FDK().run(scan).volume))[1] * system.size_b
+        return 0.2 * system.residual(system.start(FDK()._run(scan).volume))[1] * system.size_b

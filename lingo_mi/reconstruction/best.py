@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gc
+import json
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
 from typing import Any, ClassVar
 
 import drjit as dr
@@ -15,14 +18,16 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.files.slabs import plan_and_error_map
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
-from lingo_mi.reconstruction.held_out import Score, Trial, Watch, split
+from lingo_mi.reconstruction.held_out import Score, Trial, TrialWatch, split_views
 from lingo_mi.reconstruction.parameters import check_counts
 from lingo_mi.reconstruction.refined import Refined, means, structure
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
+from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 
 START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
 AHEAD = 0.9  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
@@ -35,9 +40,9 @@ DOUBTFUL = 0.5  # a score above it says that something is wrong; sound scans of 
 PLAIN = 'asd-pocs'
 TICKS = 20  # steps of the progress for a fit
 
-# Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a geometry, which gives the
+# Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a grid, which gives the
 # cloud's densities per mm [x, y, z] at the voxel centres.
-Fit = Callable[[Scan, Callable[[int, int], None]], Callable[[Geometry], np.ndarray]]
+Fit = Callable[[Scan, Callable[[int, int], None]], Callable[[Grid], np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,7 @@ class Chosen(Reconstruction):
         """What was tried, one line each: setting, voxels, passes, and how far the held-out views are off (`Score`)."""
         lines = []
         for i, trial in enumerate(self.plan):
-            size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.geometry.dVoxel)
+            size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.grid.spacing)
             mark = '*' if i == self.taken else ' '
             lines.append(f'{mark} {trial.name:22} voxels {size} mm, {trial.niter:2} passes: {trial.score:.5f}')
         return '\n'.join(lines)
@@ -74,6 +79,22 @@ class Chosen(Reconstruction):
             tried=[trial.record for trial in self.plan],
             seconds=self.seconds,
         )
+
+    def save(self, path: str | PathLike, *, force: bool = False) -> Path:
+        """Write the volume, see `Reconstruction.save`, and beside it the map of errors and the plan; returns the volume's path.
+
+        For V.nii.gz these are V-error.nii.gz and V-plan.json.
+        """
+        path = as_path('path', path)
+        plan, error = plan_and_error_map(path)
+        with writing(path):
+            for file in (plan, error):
+                new_file(file, force)
+        super().save(path, force=force)
+        assert self.error is not None
+        Reconstruction(self.error, [], self.seconds, self.grid).save(error, force=force)
+        write_text(plan, json.dumps(self.record(), indent=1) + '\n')  # last: it says whose the map is
+        return path
 
 
 @dataclass(frozen=True)
@@ -99,9 +120,10 @@ class Best(Algorithm):
     cloud      whether to try the volume of a fitted cloud as a start; it takes two fits, whose worth docs/how_to/best.md shows
     seed       of the random orders, at least 0
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=10, pixels=48).train
-        >>> found = Best(niter=5).run(measured)
+        >>> found = lm.reconstruct(measured, lm.Best(niter=5), progress=False)
         >>> len(found.plan) >= 3, found.error.shape
         (True, (24, 24, 24))
 
@@ -110,6 +132,9 @@ class Best(Algorithm):
     """
 
     name: ClassVar[str] = 'best'
+    no_start: ClassVar[str] = (
+        'best starts from nothing, since a volume has seen the views that it holds out: leave out start'
+    )
 
     niter: int = 20
     finer: int = 2
@@ -125,24 +150,22 @@ class Best(Algorithm):
     def steps(self, scan: Scan) -> int:
         return 2 * START + 2 * TRIAL + 3 * self.niter + (2 * TICKS + self.niter if self.cloud else 0)
 
-    def grid(self, geometry: Geometry) -> Geometry:
-        return Refined(finer=self.finer).grid(geometry)
+    def grid(self, geometry: Geometry) -> Grid:
+        return geometry.grid.finer(self.finer)
 
-    def run(
+    def _run(
         self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None, fit: Fit | None = None
     ) -> Chosen:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. The residuals are those of the last refinement.
+        """Reconstruct the volume of a scan, see `run_algorithm`. The residuals are those of the last refinement.
 
         fit   with `cloud`: fits one (`completion.prepare.fit_cloud`)
 
-        Raises InputError for a `start`, which would have seen the views that are held out, and where `fit` is missing.
+        Raises InputError if `cloud` is set and `fit` is missing.
         """
-        if start is not None:
-            raise InputError('best starts from nothing, since a volume has seen the views that it holds out')
         if self.cloud and fit is None:
             raise InputError('best tries a cloud where it is given a function that fits one: use lm.reconstruct')
         began, count = time.perf_counter(), self._counter(progress, self.steps(scan))
-        kept, held_out = split(scan, self.held_out)
+        kept, held_out = split_views(scan, self.held_out)
         plan = self._plan(kept, held_out, count, fit if self.cloud else None)
         gc.collect()
         dr.flush_malloc_cache()  # two thirds of the memory that the trials took
@@ -150,7 +173,7 @@ class Best(Algorithm):
         if chosen.score > DOUBTFUL:
             warnings.warn(
                 f'views that are held out are predicted badly (error {chosen.score:.2g}; 0 is exact, 1 an empty volume): unless '
-                'they are few or very noisy, check geometry, angles and order of the views (lingo-mi inspect)',
+                'they are few or very noisy, check geometry, angles and order of the views',
                 stacklevel=3,
             )
         found = self._apply(scan, plan[0].niter, chosen, count, fit)
@@ -165,7 +188,7 @@ class Best(Algorithm):
             volume,
             found.residuals,
             time.perf_counter() - began,
-            scan.geometry,
+            scan.geometry.grid,
             tuple(plan),
             next(i for i, trial in enumerate(plan) if trial is chosen),
             error_map(volume, tried),
@@ -173,7 +196,9 @@ class Best(Algorithm):
 
     def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
         plain = Trial(PLAIN, 1)
-        ASDPOCS(niter=START, seed=self.seed).run(kept, progress=count, watch=Watch(Score(held_out), plain, slow=True))
+        ASDPOCS(niter=START, seed=self.seed)._run(
+            kept, progress=count, watch=TrialWatch(Score(held_out), plain, slow=True)
+        )
         assert plain.volume is not None  # of its best pass
         start, plan = plain.volume, [plain]
         own = self._try(kept, held_out, start, _refined(1), count, by=TRIAL)
@@ -202,13 +227,12 @@ class Best(Algorithm):
             if count is not None and done * TICKS // steps > (done - 1) * TICKS // steps:
                 count(done, steps, None)
 
-        return fit(scan, progress)(Refined(finer=finer).grid(scan.geometry))
+        return fit(scan, progress)(scan.geometry.grid.finer(finer))
 
     def _try(self, kept, held_out, start: np.ndarray, trial: Trial, count, beat=None, by=0) -> Trial:
-        grid = Refined(finer=trial.finer).grid
-        score = Score(replace(held_out, geometry=grid(held_out.geometry)))
+        score = Score(held_out.on(held_out.geometry.grid.finer(trial.finer)))
         niter = min(by, self.niter) if by and beat is None else self.niter
-        refine(kept, start, niter, trial.finer, trial.smooth, self.seed, count, Watch(score, trial, beat, by))
+        refine(kept, start, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by))
         return trial
 
     def _apply(self, scan: Scan, start_niter: int, trial: Trial, count, fit: Fit | None) -> Reconstruction:
@@ -217,7 +241,7 @@ class Best(Algorithm):
             assert fit is not None  # which has made the trial
             start = self._cloud(scan, trial.finer, fit, count)
         else:
-            plain = ASDPOCS(niter=start_niter, seed=self.seed).run(scan, progress=count)
+            plain = ASDPOCS(niter=start_niter, seed=self.seed)._run(scan, progress=count)
             if trial.name == PLAIN:
                 return plain
             start = plain.volume
@@ -244,7 +268,7 @@ def refine(
     smooth: bool = False,
     seed: int = 0,
     progress: Progress | None = None,
-    watch: Watch | None = None,
+    watch: TrialWatch | None = None,
 ) -> Reconstruction:
     """The passes of `Refined` over measured views.
 
@@ -252,14 +276,14 @@ def refine(
     finer    parts along each side of a voxel; the volume that is returned has the smaller voxels
     smooth   whether to take more total variation
     """
-    fine = replace(scan, geometry=Refined(finer=finer).grid(scan.geometry))
-    if start.shape == tuple(scan.geometry.nVoxel):
+    fine = scan.on(scan.geometry.grid.finer(finer))
+    if start.shape == scan.geometry.grid.shape:
         start = _parts(start, finer)
     algorithm = replace(Refined(niter=niter, seed=seed).on_measured(), lmbda=LMBDA, lmbda_red=LMBDA_RED)
     if smooth:
         algorithm = replace(algorithm, alpha=SMOOTH)
     weights, blur = structure(start), excess_width(fine.geometry)
-    return algorithm.run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
+    return algorithm._run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
 
 
 def _refined(finer: int, smooth: bool = False, cloud: bool = False) -> Trial:

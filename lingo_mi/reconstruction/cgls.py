@@ -31,9 +31,10 @@ class CGLS(Algorithm):
     It stops early when the gradient is zero to rounding. Use it for many views, or for a plain least-squares solution. It has
     no constraints: densities may be negative, and late iterations fit the noise.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
-        >>> CGLS(niter=10).run(measured).residuals[-1] < 0.05
+        >>> lm.reconstruct(measured, lm.CGLS(niter=10), progress=False).residuals[-1] < 0.05
         True
 
     Björck, "Numerical Methods for Least Squares Problems", SIAM 1996, algorithm 7.4.1. Raises InputError for an option out of
@@ -49,8 +50,8 @@ class CGLS(Algorithm):
         check_counts(niter=self.niter)
         check_bound('tol', self.tol)
 
-    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
-        """Reconstruct the volume of a scan, as `Algorithm.run` says."""
+    def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
+        """Reconstruct the volume of a scan, see `run_algorithm`."""
         began = time.perf_counter()
         system = System(scan)
         A, views = system.A, system.views
@@ -72,4 +73,4 @@ class CGLS(Algorithm):
             residuals.append(system.relative(r))
             if progress:
                 progress(k + 1, self.niter, residuals[-1])
-        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)

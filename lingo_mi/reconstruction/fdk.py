@@ -24,7 +24,7 @@ import scipy.fft
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.preconditions import require_circle
@@ -168,8 +168,8 @@ def filtered(projections: np.ndarray, geometry: CircularGeometry, window: str = 
 
 def _add_views(volume, views, geometry):
     """Add views, each (image, matrix, weight), to the volume: bilinear, zero outside the panel."""
-    (n_v, n_u), (_, ny, nz) = geometry.nDetector, geometry.nVoxel
-    index = dr.arange(mi.UInt, int(np.prod(geometry.nVoxel)))
+    (n_v, n_u), (_, ny, nz) = geometry.nDetector, geometry.grid.shape
+    index = dr.arange(mi.UInt, int(np.prod(geometry.grid.shape)))
     row = index // nz
     i = row // ny
     voxel = mi.Vector3f(mi.Float(i), mi.Float(row - i * ny), mi.Float(index - row * nz))
@@ -210,9 +210,10 @@ class FDK(Algorithm):
 
     Use it for hundreds of views, or if time is short. Few views cause streaks, and the ramp amplifies noise.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=90, pixels=48).train
-        >>> FDK(filter='hann').run(measured).volume.shape
+        >>> lm.reconstruct(measured, lm.FDK(filter='hann'), progress=False).volume.shape
         (24, 24, 24)
 
     Feldkamp, Davis and Kress, "Practical cone-beam algorithm", JOSA A 1 (1984), with the ramp of Kak and Slaney, "Principles of
@@ -220,6 +221,9 @@ class FDK(Algorithm):
     """
 
     name: ClassVar[str] = 'fdk'
+    no_start: ClassVar[str] = (
+        'filtered backprojection starts from no volume: leave out start, or take another algorithm'
+    )
 
     filter: str = 'ram-lak'
 
@@ -229,16 +233,12 @@ class FDK(Algorithm):
     def steps(self, scan: Scan) -> int:
         return len(scan)
 
-    def run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. `progress` counts views; there are no residuals.
+    def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
+        """Reconstruct the volume of a scan, see `run_algorithm`. `progress` counts views; there are no residuals.
 
-        Raises InputError for a start volume, for a source that is not on a circle about z, for a panel that moves relative to
-        the source, and for invalid pixels.
+        Raises InputError for a source that is not on a circle about z, for a panel that moves relative to the source, and for
+        invalid pixels.
         """
-        if start is not None:
-            raise InputError(
-                'filtered backprojection starts from no volume: leave out start, or take another algorithm'
-            )
         began = time.perf_counter()
         projections, geometry = _weighted(scan)
 
@@ -246,21 +246,21 @@ class FDK(Algorithm):
             return filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
 
         volume = _backprojected(geometry, images, progress)
-        return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry)
+        return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry.grid)
 
     def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
-        """The volume of `run` in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
+        """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
         progress   called as progress(views done in all slabs, views of all slabs, None)
 
-        Takes memory for two sets of projections and for three slabs, however large the volume. Raises InputError as `run`, and
+        Takes memory for two sets of projections and for three slabs, however large the volume. Raises InputError as `_run`, and
         for too little memory.
 
             for slab in FDK().slabs(scan, 64):
                 ...
         """
-        parts = scan.geometry.slabs(thickness)
-        check_memory(scan.geometry.slab(*parts[0]), needed=_slab_memory(scan, parts[0][1]))
+        parts = scan.geometry.grid.slabs(thickness)
+        check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))
         projections, geometry = _weighted(scan)
         n = len(geometry)
         found = np.empty((n, *geometry.nDetector[::-1]), np.float32)  # filtered once, for all slabs
@@ -273,12 +273,12 @@ class FDK(Algorithm):
                 if progress:
                     progress(k * n + done, len(parts) * n, None)
 
-            slab: CircularGeometry = geometry.slab(*part)  # type: ignore[assignment] - of the same class
+            slab = geometry.on(geometry.grid.slab(*part))
             yield _backprojected(slab, lambda first: found[first : first + BATCH], report)
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""
-        return len(scan) * len(scan.geometry.slabs(thickness))
+        return len(scan) * len(scan.geometry.grid.slabs(thickness))
 
 
 def _slab_memory(scan: Scan, thickness: int) -> float:
@@ -286,7 +286,7 @@ def _slab_memory(scan: Scan, thickness: int) -> float:
     level = rectified_geometry(scan.geometry, NAME)
     pixels = 0 if level is scan.geometry else prod(level.nDetector)
     pixels += prod(scan.geometry.nDetector) + prod(extended(level)[0].nDetector)
-    return 4 * (3 * prod(scan.geometry.nVoxel[:2]) * thickness + (len(scan) + 2 * BATCH) * pixels)
+    return 4 * (3 * prod(scan.geometry.grid.shape[:2]) * thickness + (len(scan) + 2 * BATCH) * pixels)
 
 
 def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry]:
@@ -310,7 +310,7 @@ def _backprojected(
     geometry: CircularGeometry, images: Callable[[int], np.ndarray], progress: Progress | None
 ) -> np.ndarray:
     """The volume [x, y, z] of filtered projections. images: gives those of a batch, [view, u, v], by its first view."""
-    volume = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    volume = dr.zeros(mi.Float, int(np.prod(geometry.grid.shape)))
     dr.make_opaque(volume)
     matrices, weights = geometry.voxel_matrices(), view_weights(geometry)
     n = len(geometry)
@@ -329,4 +329,4 @@ def _backprojected(
         dr.eval(volume)
         if progress:
             progress(min(first + BATCH, n), n, None)
-    return volume.numpy().reshape(geometry.nVoxel)
+    return volume.numpy().reshape(geometry.grid.shape)

@@ -29,13 +29,13 @@ PATIENCE = 3  # passes without a better score, after which a trial ends
 GAIN = 0.005  # part by which they must lower the score of a `slow` trial: with noise it sinks on while the volume gets worse
 
 
-def split(scan: Scan, every: int) -> tuple[Scan, Scan]:
+def split_views(scan: Scan, every: int) -> tuple[Scan, Scan]:
     """The views to reconstruct from, and those held out: one of `every` consecutive ones, never the first or the last. Views
     without a valid pixel are left out.
 
     Raises InputError for fewer than four views.
 
-        kept, held_out = split(scan, 5)
+        kept, held_out = split_views(scan, 5)
     """
     if scan.valid is not None:
         scan = scan.subset(np.flatnonzero(scan.valid.any((1, 2))))
@@ -106,7 +106,8 @@ class Score:
     """
 
     def __init__(self, scan: Scan):
-        self.A, self.views, self.size = GridPair(scan.geometry, scan.valid), np.arange(len(scan)), scan.geometry.nVoxel
+        self.A, self.views = GridPair(scan.geometry, scan.valid), np.arange(len(scan))
+        self.size = scan.geometry.grid.shape
         self.b = self.A.images(scan.projections)
         rows, columns = scan.geometry.nDetector
         self.shape = len(scan), columns, rows
@@ -120,8 +121,8 @@ class Score:
         return float(np.sqrt(np.mean([power(view.T).mean() for view in views])))  # one by one, for memory
 
 
-class Watch:
-    """The `watch` of `ASDPOCS.run` that scores a trial after every pass, and keeps its best volume.
+class TrialWatch:
+    """The `watch` of `ASDPOCS._run` that scores a trial after every pass, and keeps its best volume.
 
     score    of the held-out views, on the trial's voxels
     beat     score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import prod
 from typing import NamedTuple
 
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.reconstruction.rectify import rectified_geometry
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 
@@ -37,11 +37,11 @@ def needed(algorithm: str, geometry: Geometry, views: int) -> float:
     """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus at most two sets of
     projections) and of work on projections (plus one volume). FDK has another set on the upright panel where the real one
     leans."""
-    volume, projections = 4 * prod(geometry.nVoxel), 4 * views * prod(geometry.nDetector)
+    volume, projections = 4 * prod(geometry.grid.shape), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]
     volumes = need.wide_pixels if leave_voxels_out(geometry) else need.volumes
     level = 0
     if algorithm == 'fdk' and not isinstance(geometry, CircularGeometry):
-        level = 4 * views * prod(rectified_geometry(geometry, 'FDK').nDetector)
+        level = 4 * views * prod(rectified_geometry(geometry, 'filtered backprojection').nDetector)
     sets = need.projections
     return max(volumes * volume + min(sets, 2) * projections, volume + sets * projections) + level

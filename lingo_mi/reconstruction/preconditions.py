@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.scan import Scan, require_finite
 
 
@@ -32,7 +32,7 @@ def require_pixels(scan: Scan, what: str) -> None:
 
 def require_rays(geometry: Geometry) -> None:
     """Raises InputError if a source is inside the volume, or if no ray of any view meets the volume."""
-    rays, centre, half = geometry.rays(), np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    rays, centre, half = geometry.rays(), np.array(geometry.grid.centre), np.array(geometry.grid.size) / 2
     if not rays.parallel and (np.abs(rays.source - centre) < half).all(1).any():
         raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
     corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
-from lingo_mi.geometry.circle import SAME
+from lingo_mi.geometry.circle import SAME, CircularGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import scanner_rays
 from lingo_mi.reconstruction.arcs import gaps
@@ -104,12 +104,10 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
         DSD=DSD,
         nDetector=(rows, columns),
         dDetector=(step_v, step_u),
-        nVoxel=geometry.nVoxel,
-        dVoxel=geometry.dVoxel,
         angles=angles,
         mode=geometry.mode,
-        offOrigin=geometry.offOrigin,
         offDetector=(-(top + bottom) / 2, (left + right) / 2),
+        grid=geometry.grid,
     )
 
 

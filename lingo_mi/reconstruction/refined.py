@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.parameters import check_counts
@@ -55,10 +55,11 @@ class Refined(Algorithm):
 
     Use it for few views if a cloud has been fitted to them (`lingo_mi.completion` prepares its inputs).
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> found = x3d_scan.scan(make('foot', 24), views=10, pixels=48)
-        >>> near = SART(niter=1).run(found.train)  # in the place of a cloud's volume
-        >>> refined = Refined(niter=5, completed_niter=0).run(found.train, start=near)
+        >>> near = lm.reconstruct(found.train, lm.SART(niter=1), progress=False)  # in the place of a cloud's volume
+        >>> refined = lm.reconstruct(found.train, lm.Refined(niter=5), start=near, progress=False)
         >>> refined.residuals[-1] < 0.5 * near.residuals[-1]
         True
 
@@ -86,24 +87,22 @@ class Refined(Algorithm):
     def steps(self, scan: Scan) -> int:
         return self.completed_niter + self.niter
 
-    def grid(self, geometry: Geometry) -> Geometry:
-        return geometry.with_volume(
-            [self.finer * n for n in geometry.nVoxel], [d / self.finer for d in geometry.dVoxel]
-        )
+    def grid(self, geometry: Geometry) -> Grid:
+        return geometry.grid.finer(self.finer)
 
-    def run(
+    def _run(
         self,
         scan: Scan,
         *,
         start: ArrayLike | None = None,
         progress: Progress | None = None,
-        sample: Callable[[Geometry], np.ndarray] | None = None,
+        sample: Callable[[Grid], np.ndarray] | None = None,
         completed: Scan | None = None,
     ) -> Reconstruction:
         """Reconstruct the volume from measured projections. The residuals are those of the measured views.
 
         start       the cloud's volume [x, y, z], density per mm; give either this or `sample`
-        sample      function of a geometry: the cloud's densities per mm [x, y, z] at its voxel centres; needed for `finer` > 1
+        sample      function of a grid: the cloud's densities per mm [x, y, z] at its voxel centres; needed for `finer` > 1
         completed   the measured views, then those between (`completion.views.insert_views`); None if completed_niter is 0
         progress    called as progress(passes done, passes, residual); the residual is None in passes over completed views
 
@@ -119,23 +118,26 @@ class Refined(Algorithm):
         elif start is None or sample is not None:
             raise InputError("refined starts from a cloud's volume: give it as start, or a function for it as sample")
         elif self.finer > 1:
-            raise InputError("finer needs the cloud's densities on smaller voxels: give sample in the place of start")
+            raise InputError("finer needs the cloud's densities on smaller voxels: give the fit as start")
         else:
             volume = on_voxels(start, geometry, 'start volume')
-        scan, blur = replace(scan, geometry=fine), excess_width(fine)
+        scan = scan.on(fine)
+        blur = excess_width(scan.geometry)
         if completed is not None and self.completed_niter:
-            completed = replace(completed, geometry=self.grid(completed.geometry))
+            completed = completed.on(self.grid(completed.geometry))
             volume = _on_completed(
                 completed, self.completed_niter, volume, blur, self.seed, _continued(progress, 0, steps)
             )
-        found = self.on_measured().run(
+        found = self.on_measured()._run(
             scan,
             start=volume,
             progress=_continued(progress, self.completed_niter, steps),
             weights=structure(volume),
             blur=blur,
         )
-        return Reconstruction(means(found.volume, self.finer), found.residuals, time.perf_counter() - began, geometry)
+        return Reconstruction(
+            means(found.volume, self.finer), found.residuals, time.perf_counter() - began, geometry.grid
+        )
 
     def on_measured(self) -> ASDPOCS:
         """The algorithm of the passes over the measured views."""

@@ -1,50 +1,87 @@
-"""Runs algorithms, with checks before and a progress bar."""
+"""Runs algorithms, with checks before, and shows their progress."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from lingo_mi.common import progress as bars
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.effects.forward import effects_of
+from lingo_mi.files.slabs import write_slabs
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.memory_needs import needed
-from lingo_mi.reconstruction.preconditions import require_rays, require_signal
+from lingo_mi.reconstruction.preconditions import require_signal
+from lingo_mi.reconstruction.sart import Sweeps
+from lingo_mi.reconstruction.slab_sweeps import discard
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
 MOST_ENTRIES = 2**32  # of one of Dr.Jit's arrays
 
 
-@one_at_a_time()
-def reconstruct(
+def run_algorithm(
     scan: Scan, algorithm: Algorithm, *, start: ArrayLike | None = None, progress: Progress | None = None, **inputs: Any
 ) -> Reconstruction:
-    """Reconstruct a scan with an algorithm, after checks of the memory and of the scan.
+    """Reconstruct a scan with an algorithm, after checks of the memory and of the signal.
 
-        found = reconstruct(scan, ASDPOCS(niter=20))
-        better = reconstruct(scan, SART(niter=5), start=found)
+    Parameters
+    ----------
+    scan : Scan
+        Whose projections are line integrals: take a detector's effects out before (`line_integrals.counts_to_line_integrals`).
+    algorithm : Algorithm
+        With its options.
+    start : array, optional
+        Volume [x, y, z] to start from, density per mm: an array or another `Reconstruction` (default: zero).
+    progress : callable, optional
+        Called as progress(steps done, `algorithm.steps`, residual or None) after every step.
+    inputs
+        Further arguments of this algorithm's `_run`, such as `weights`, or `sample` and `completed` of `Refined`.
 
-    scan       projections and geometry. Projections must be line integrals: remove a detector's effects before
-               (`effects_correction.linearised`)
-    algorithm  with its options
-    start      volume [x, y, z] to start from, density per mm (default: zero)
-    progress   called as progress(steps done, steps, residual or None) after every step
-    inputs     further arguments of this algorithm's `run`, such as `weights`, or `sample` and `completed` of `Refined`
-
-    Raises InputError as `check_scan` and `require_signal` do, for a start that does not fit the geometry, and if the result
-    is not finite.
+    Raises
+    ------
+    InputError
+        As `check_room` and `require_signal` do, for a start that the algorithm does not take or that does not fit the geometry,
+        and if the result is not finite.
     """
+    effects = effects_of(scan)
+    if effects is not None and not effects.ideal:
+        raise InputError(
+            'the projections are not line integrals, because the scan has effects: take line_integrals(scan) of '
+            'lingo_mi.reconstruction.line_integrals'
+        )
+    if start is not None and algorithm.no_start:
+        raise InputError(algorithm.no_start)
     views = max(len(scan), len(inputs.get('completed') or ()))
-    check_scan(scan.geometry, algorithm, views, mask_images(scan))
+    check_room(scan.geometry, algorithm, views, mask_images(scan))
     require_signal(scan)
-    return algorithm.run(scan, start=start, progress=progress, **inputs)
+    return algorithm._run(scan, start=start, progress=progress, **inputs)
+
+
+def run_in_slabs(
+    scan: Scan, algorithm: FDK | Sweeps, path: Path, thickness: int, progress: Progress | None = None
+) -> None:
+    """Reconstruct a scan in slabs of `thickness` slices, and write each to a file of the volume, which need not fit into memory.
+
+    Iterative algorithms hold the volume in a folder beside the file, whose name ends in .slabs, until the file is written. If the
+    work is stopped, the same call goes on.
+
+    progress   called as progress(steps done, `algorithm.slab_steps`, residual or None)
+    """
+    require_signal(scan)
+    if isinstance(algorithm, FDK):
+        write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress))
+        return
+    work = path.with_name(path.name + '.slabs')
+    write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress))
+    discard(work)  # not before the volume is safe
 
 
 def mask_images(scan: Scan) -> int:
@@ -52,48 +89,44 @@ def mask_images(scan: Scan) -> int:
     return 0 if scan.valid is None else 4 * scan.valid.size
 
 
-def check_scan(
-    geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, beside: float = 0
-) -> None:
-    """Raises InputError if no ray meets the volume, if the source is inside it, or if memory is too small.
-
-    algorithm   to check memory for (None: the least that any algorithm needs)
-    views       number of views to reconstruct from (None: the geometry's own)
-    beside      bytes that are held beside what the algorithm needs, such as `mask_images`
-    """
-    require_rays(geometry)
-    check_room(geometry, algorithm, views, beside)
-
-
 def check_room(
     geometry: Geometry, algorithm: Algorithm | None = None, views: int | None = None, beside: float = 0
 ) -> None:
-    """Raises InputError if memory or an array is too small; arguments as of `check_scan`."""
+    """Raises InputError if memory or an array is too small.
+
+    algorithm   to check for (None: the least that any algorithm needs)
+    views       number of views to reconstruct from (None: the geometry's own)
+    beside      bytes that are held beside what the algorithm needs, such as `mask_images`
+    """
     views = views or len(geometry)
-    grid, pixels = geometry, 0
+    fine, pixels = geometry, 0
     if algorithm is not None:
-        grid = algorithm.grid(geometry)
+        fine = geometry.on(algorithm.grid(geometry))
         if algorithm.name != 'fdk':
             pixels = views * math.prod(geometry.nDetector)
-    for number, what in (math.prod(grid.nVoxel), 'voxels'), (pixels, 'pixels in all views'):
+    for number, what in (math.prod(fine.grid.shape), 'voxels'), (pixels, 'pixels in all views'):
         if number >= MOST_ENTRIES:
             raise InputError(
-                f'{number:.4g} {what} are more than an array can hold, 2^32; take larger ones, or slabs (--slab)'
+                f'{number:.4g} {what} are more than an array can hold, 2^32; take larger ones, or give slab=64'
             )
     if algorithm is None:
         check_memory(geometry, views=views)
     else:
-        check_memory(grid, views=views, needed=needed(algorithm.name, grid, views) + beside)
+        check_memory(fine, views=views, needed=needed(algorithm.name, fine, views) + beside)
 
 
 @contextmanager
-def progress_bar(algorithm: Algorithm, scan: Scan, label: str | None = None) -> Iterator[Progress]:
+def progress_bar(
+    algorithm: Algorithm, scan: Scan, label: str | None = None, *, steps: int | None = None, shown: bool = True
+) -> Iterator[Progress]:
     """A `progress` function that shows a bar on standard error.
 
         with progress_bar(algorithm, scan) as progress:
-            found = reconstruct(scan, algorithm, progress=progress)
+            found = run_algorithm(scan, algorithm, progress=progress)
 
     label   before the bar (default: the algorithm's name)
+    steps   in all (default: those of `run_algorithm`)
+    shown   False: draw nothing
     """
-    with bars.Progress(label or algorithm.name, algorithm.steps(scan)) as bar:
+    with bars.Progress(label or algorithm.name, steps or algorithm.steps(scan), shown=shown) as bar:
         yield lambda done, _, residual: bar.update(done, residual=residual)

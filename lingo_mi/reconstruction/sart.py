@@ -77,7 +77,7 @@ def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Genera
 def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterator[list[np.ndarray]]:
     """The `blocks` of pass after pass, an endless iterator."""
     rng = np.random.default_rng(seed)
-    # Drawn once and discarded, so that a seed gives the same orders as in 0.1.0.
+    # The first draw of a seed is skipped: the published numbers are those of the orders that follow it.
     blocks(angles, blocksize, order, rng)
     while True:
         yield blocks(angles, blocksize, order, rng)
@@ -96,7 +96,7 @@ def sweep(
     if system.between is not None:
         change = system.between.filled(change)
     if system.blur is not None:
-        change = blurred(change, system.geometry.nVoxel, system.blur)
+        change = blurred(change, system.geometry.grid.shape, system.blur)
     return evaluated(dr.maximum(start + change, 0) if noneg else start + change)
 
 
@@ -107,7 +107,7 @@ class Sweeps(Algorithm):
     def _by_blocks(self, views: int) -> OSSART:
         """The same sweeps of a scan with so many views as `OSSART`."""
 
-    def run(
+    def _run(
         self,
         scan: Scan,
         *,
@@ -116,7 +116,7 @@ class Sweeps(Algorithm):
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume of a scan, see `Algorithm.run`. Without tol, the residual is not computed after every pass, of
+        """Reconstruct the volume of a scan, see `run_algorithm`. Without tol, the residual is not computed after every pass, of
         which it takes a third of the time, but at the end.
 
         weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
@@ -136,12 +136,12 @@ class Sweeps(Algorithm):
             dr.sync_thread()  # Ctrl-C comes through between passes
             if progress:
                 progress(k + 1, how.niter, residuals[-1] if known else None)
-        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry)
+        return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)
 
     def slabs(
         self, scan: Scan, thickness: int, folder: str | PathLike, *, progress: Progress | None = None
     ) -> Iterator[np.ndarray]:
-        """The volume of `run` in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
+        """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
         folder     for the volume while it is made, twice its size; made if missing. Where the work was stopped, the same call
                    goes on after the last whole update, to the same result. The files stay: remove them when the volume is safe
@@ -149,7 +149,7 @@ class Sweeps(Algorithm):
                    this update before it)
 
         Takes memory for seven slabs, two sets of projections (three with invalid pixels), and ten images for each view of a
-        block. Raises InputError as `run`, if tol is above 0, if rays leave voxels out, for too little memory or room on the
+        block. Raises InputError if tol is above 0, if rays leave voxels out, for too little memory or room on the
         disk, and for a folder that holds other work.
 
             for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
@@ -167,7 +167,7 @@ class Sweeps(Algorithm):
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""
         how = self._by_blocks(len(scan))
-        return how.niter * -(-len(scan) // how.blocksize) * len(scan.geometry.slabs(thickness))
+        return how.niter * -(-len(scan) // how.blocksize) * len(scan.geometry.grid.slabs(thickness))
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,10 @@ class OSSART(Sweeps):
 
     Use it instead of `SART` for many views: a pass has fewer updates, and each averages the noise of its views.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
-        >>> found = OSSART(niter=4, blocksize=5).run(measured)
+        >>> found = lm.reconstruct(measured, lm.OSSART(niter=4, blocksize=5), progress=False)
         >>> found.volume.shape, found.residuals[-1] < 0.05
         ((24, 24, 24), True)
 
@@ -240,10 +241,11 @@ class SART(Sweeps):
 
     Use it for few clean views, which few passes match closely. With noise, use fewer passes or a smaller lmbda.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = SART(niter=3).run(measured)
-        >>> better = SART(niter=3, lmbda=0.5).run(measured, start=found)
+        >>> found = lm.reconstruct(measured, lm.SART(niter=3), progress=False)
+        >>> better = lm.reconstruct(measured, lm.SART(niter=3, lmbda=0.5), start=found, progress=False)
         >>> better.residuals[-1] < found.residuals[-1] < 0.05
         True
 
@@ -285,9 +287,10 @@ class SIRT(Sweeps):
     Use it for noisy views: it approaches a least-squares solution smoothly, with many times the passes of `SART`.
     lmbda=1.9 with lmbda_red=1 is fastest.
 
+        >>> import lingo_mi as lm
         >>> from lingo_mi.phantoms import make, x3d_scan
         >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = SIRT(niter=10, lmbda=1.9, lmbda_red=1.0).run(measured)
+        >>> found = lm.reconstruct(measured, lm.SIRT(niter=10, lmbda=1.9, lmbda_red=1.0), progress=False)
         >>> found.residuals[-1] < 0.2 * found.residuals[0]
         True
 

@@ -34,7 +34,7 @@ from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector_
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
-from lingo_mi.storage.file_access import leftovers, parsed_json, reading, write_text, writing
+from lingo_mi.storage.file_access import leftovers, read_json, reading, write_text, writing
 from lingo_mi.storage.folder_lock import locked
 
 Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
@@ -60,9 +60,9 @@ def swept(
     require_rays(scan.geometry)
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
-    begin, end = scan.geometry.slabs(thickness)[0]
+    grid = scan.geometry.grid
     blocksize = max(len(views) for _, views in updates)
-    check_memory(scan.geometry.slab(begin, end), needed=needed(scan, thickness, blocksize))
+    check_memory(scan.geometry.on(grid.slab(*grid.slabs(thickness)[0])), needed=needed(scan, thickness, blocksize))
     with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
         if volume.done < len(updates):
             _complete(_Slabs(scan, volume), updates, noneg, progress)
@@ -75,7 +75,7 @@ def swept(
 
 def needed(scan: Scan, thickness: int, blocksize: int) -> int:
     """Peak memory of `swept` with updates of so many views, bytes."""
-    nx, ny, nz = scan.geometry.nVoxel
+    nx, ny, nz = scan.geometry.grid.shape
     slab = nx * ny * min(thickness + 2, nz)  # with its slices of zeros
     images = (2 if scan.valid is None else 3) * len(scan) + IMAGES * blocksize
     return 4 * (SLABS * slab + images * prod(scan.geometry.nDetector))
@@ -114,7 +114,7 @@ class _Slabs:
 
     def __init__(self, scan: Scan, volume: _Volume):
         self.scan, self.volume = scan, volume
-        one = scan.geometry.slab(0, 1)
+        one = scan.geometry.on(scan.geometry.grid.slab(0, 1))
         self.A = projector_class(scan.geometry)(one, scan.valid)
 
     def lengths(self) -> np.ndarray:
@@ -186,12 +186,12 @@ class _Slabs:
     def _margins(self, part):
         """How many slices of zeros lie below and above a slab."""
         begin, end = self.volume.parts[part]
-        return int(begin > 0), int(end < self.scan.geometry.nVoxel[2])
+        return int(begin > 0), int(end < self.scan.geometry.grid.shape[2])
 
     def _projector(self, part):
         """The projector of a slab between its slices of zeros, and a function that tells whether a voxel is none of these."""
         (begin, end), (below, above) = self.volume.parts[part], self._margins(part)
-        A = self.A.of_slab(self.scan.geometry.slab(begin - below, end + above))
+        A = self.A.of_slab(self.scan.geometry.on(self.scan.geometry.grid.slab(begin - below, end + above)))
         low, high = (dr.opaque(mi.UInt, z) for z in (below, end - begin + below))
 
         def inside(voxel):
@@ -216,17 +216,15 @@ class _Volume:
     """
 
     def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
-        self.parts, self.done = scan.geometry.slabs(thickness), 0
-        self._size, self._folder, self._digest = scan.geometry.nVoxel, folder, digest
+        self.parts, self.done = scan.geometry.grid.slabs(thickness), 0
+        self._size, self._folder, self._digest = scan.geometry.grid.shape, folder, digest
         self._paths = [folder / name for name in FILES]
         state = folder / STATE
         for path, _ in leftovers(folder):
             path.unlink()
         if state.exists():
-            with reading(state):
-                text = state.read_bytes()
+            known = read_json(state)
             try:
-                known = parsed_json(text)
                 found, done = known['of'], int(known['updates'])
             except (KeyError, TypeError, ValueError):
                 raise InputError(f'{state}: is no state of ours; move its folder away') from None

@@ -101,7 +101,7 @@ class System:
 
     def volume(self, x: mi.Float) -> np.ndarray:
         """A device volume as float32 [x, y, z]. Raises InputError if it is not finite."""
-        volume = x.numpy().reshape(self.geometry.nVoxel)
+        volume = x.numpy().reshape(self.geometry.grid.shape)
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
         return volume
@@ -139,8 +139,8 @@ def norm(a: mi.Float) -> float:
 def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
     """A volume as float32 [x, y, z]. Raises InputError if it does not fit the geometry or is not finite."""
     volume = np.ascontiguousarray(as_numpy(volume, f'the {name}', np.float32))
-    if volume.shape != geometry.nVoxel:
-        raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.nVoxel}')
+    if volume.shape != geometry.grid.shape:
+        raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.grid.shape}')
     if not np.isfinite(volume).all():
         raise InputError(f'the {name}: NaN or infinity')
     return volume

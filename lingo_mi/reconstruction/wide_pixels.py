@@ -23,7 +23,7 @@ def pitch(geometry: Geometry) -> tuple[float, float, float]:
     """The distance between rays at the axis, in voxels (x, y, z): between columns along x and y, between rows along z."""
     at_axis = geometry.DSO / geometry.DSD if geometry.mode == 'cone' else 1.0
     v, u = (at_axis * d for d in geometry.dDetector)
-    x, y, z = geometry.dVoxel
+    x, y, z = geometry.grid.spacing
     return u / x, u / y, v / z
 
 
@@ -58,7 +58,7 @@ class Between:
         return cls(geometry, A, views) if leave_voxels_out(geometry) else None
 
     def __init__(self, geometry: Geometry, A: Any, views: np.ndarray):
-        self.size, self.deviations = geometry.nVoxel, tuple(p / 2 for p in pitch(geometry))
+        self.size, self.deviations = geometry.grid.shape, tuple(p / 2 for p in pitch(geometry))
         weight = A.adjoint(dr.ones(mi.Float, len(views) * A.pixels), views)
         self.crossed = weight > LEAST * blurred(weight, self.size, self.deviations)
         share = blurred(dr.select(self.crossed, mi.Float(1), 0), self.size, self.deviations)

@@ -71,7 +71,7 @@ QUALITY = {
     ),
 }  # fmt: skip
 SETTINGS = {
-    'method': Number('Method', '', '', 'The recipe of a fit, or the algorithm of a reconstruction.'),
+    'method': Number('Method', '', '', 'The method of a fit, or the algorithm of a reconstruction.'),
     'views': Number('Views used', '', '', 'Measured projections that the result was made of.'),
     'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
     'stopping': Number(

@@ -193,8 +193,8 @@ def scanner(geometry: Geometry, most: int = 400) -> dict:
     panels = np.stack([corner, corner + nu * rays.u, corner + nu * rays.u + nv * rays.v, corner + nv * rays.v], 1)
     sources = rays.source
     if rays.parallel:
-        reach = float(np.max(geometry.nVoxel * np.asarray(geometry.dVoxel)))
-        sources = np.asarray(geometry.offOrigin) - 1.5 * reach * sources
+        reach = max(geometry.grid.size)
+        sources = np.asarray(geometry.grid.centre) - 1.5 * reach * sources
     return dict(sources=sources.round(3).tolist(), panels=panels.round(3).tolist(), parallel=bool(rays.parallel))
 
 

@@ -1,1 +1,1 @@
-"""Results of a fit: its numbers (`measure`), its files (`save`), its scene (`scene_file`)."""
+"""What is shown of fits: a page and a log that grow while one runs, and a page of several side by side."""

@@ -3,38 +3,103 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lingo_mi.common.errors import InputError, brief
-from lingo_mi.files.volumes import Volume
+from lingo_mi.files.slabs import plan_and_error_map
+from lingo_mi.files.volumes import Volume, read_volume
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.report import template
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text
 from lingo_mi.report.packing import Arrays
 from lingo_mi.report.payload import colour_maps, error_maps, slices, views
-from lingo_mi.results.stored import Stored
+from lingo_mi.scan import values_digest
+from lingo_mi.storage.file_access import as_path, parsed_json
 
 LOWER_IS_BETTER = 'ipsd', 'ipsd_reverse', 'seconds_init', 'seconds_fit', 'ms_per_iteration'
 MOST = 6
 
 
-def compare_page(results: list[Stored], truth: Volume | None = None, title: str = '') -> str:
+@dataclass(frozen=True, eq=False)
+class VolumeFile:
+    """A volume from a file, such as `lingo-mi reconstruct` writes.
+
+    Parameters
+    ----------
+    volume : Volume
+        Its density.
+    error_map : Volume, optional
+        Of the file V-error.nii.gz beside a volume V.nii.gz, which the algorithm `best` writes.
+    """
+
+    volume: Volume
+    error_map: Volume | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> VolumeFile:
+        """The volume, and its map of errors if the plan beside them does not name another volume. Raises InputError."""
+        plan, errors = plan_and_error_map(path)
+        volume = read_volume(path)
+        of_it = errors.exists() and _planned(plan) in (None, values_digest(volume.data))
+        return cls(volume, read_volume(errors) if of_it else None)
+
+
+def _planned(plan: Path) -> str | None:
+    """The check sum of the volume that a plan of `best` has made, if there is one that says."""
+    try:
+        return parsed_json(plan.read_text(encoding='utf-8')).get('volume')
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def load_result(path: PathLike | str) -> tuple[str, Fit | VolumeFile]:
+    """The name and the fit of a folder, or the name and the volume of a file.
+
+    Raises
+    ------
+    InputError
+        If there is neither, a file is damaged, or files do not belong together.
+    """
+    path = as_path('path', path)
+    if path.is_file() or path.name.lower().endswith('.zarr'):
+        return path.name.removesuffix('.gz').removesuffix('.zarr').rsplit('.', 1)[0], VolumeFile.read(path)
+    return path.resolve().name, Fit.load(path)
+
+
+def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume | None = None, title: str = '') -> str:
     """A page, as text, that shows results side by side. Differences are to the truth, or else to the first result.
 
-    results   2 to 6; volumes must have one grid, and views are shown where they are of the same angles and size
-    truth     the true volume, on the same grid
+    Parameters
+    ----------
+    results : sequence of (str, Fit or VolumeFile)
+        2 to 6 results with their names. Volumes must have one grid, and views are shown if their angles and sizes are the same.
+    truth : Volume, optional
+        The true volume, on the same grid.
+    title : str
+        Of the page (default: the names).
 
-    Raises InputError for fewer or more results, and for volumes of different grids.
+    Raises
+    ------
+    InputError
+        For fewer or more results, and for volumes of different grids.
 
-        compare_page([read_stored('out/a'), read_stored('out/b')])
+    Examples
+    --------
+    `compare_page([load_result('out/a'), load_result('out/b')])`
     """
     if not 2 <= len(results) <= MOST:
         raise InputError(f'a comparison is of 2 to {MOST} results, not of {len(results)}')
-    names = _names(results)
+    names = _names([name for name, _ in results])
+    named = dict(zip(names, (result for _, result in results)))
     arrays = Arrays()
     known: dict[str, Any] = dict(colours=colour_maps(), history=[])
-    volumes = {name: r.volume for name, r in zip(names, results) if r.volume is not None}
+    volumes = {name: volume for name, r in named.items() if (volume := _volume(r)) is not None}
     if truth is not None and volumes:
         volumes['Truth'] = truth
     if volumes:
@@ -55,39 +120,41 @@ def compare_page(results: list[Stored], truth: Volume | None = None, title: str 
         known['slices'] = slices(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)
         maps = {
             f'Error map: {name}': r.error_map.data
-            for name, r in zip(names, results)
-            if r.error_map is not None and r.error_map.data.shape == first.data.shape
+            for name, r in named.items()
+            if isinstance(r, VolumeFile) and r.error_map is not None and r.error_map.data.shape == first.data.shape
         }
         if maps:
             known['slices'] |= error_maps(maps, known['slices'], arrays)
-    shown = {name: r for name, r in zip(names, results) if r.views is not None}
-    if len(shown) > 1 and _same_views(list(shown.values())):
-        one = next(iter(shown.values()))
-        images: dict[str, np.ndarray] = {name: r.views for name, r in shown.items() if r.views is not None}
-        pixel = _pixel(one.metrics)
-        known['views'] = views(images, one.angles, pixel or (1.0, 1.0), arrays, next(iter(images)))
-        if pixel is None:
-            known['views']['unit'] = 'pixels'
+    fits = {name: r for name, r in named.items() if isinstance(r, Fit)}
+    shown = {name: fit.views for name, fit in fits.items() if fit.views is not None}
+    angles = [fits[name].view_angles for name in shown]
+    alike = len({images.shape for images in shown.values()}) == 1
+    if len(shown) > 1 and alike and all(np.allclose(a, angles[0], atol=1e-3) for a in angles):
+        one = next(iter(shown))
+        known['views'] = views(shown, angles[0], fits[one].nominal_geometry.dDetector, arrays, one)
     title = brief(title or ' · '.join(names), 120)
-    return template.page(title, f'{len(results)} results side by side', _tables(names, results), '', known, arrays)
+    return template.page(title, f'{len(results)} results side by side', _tables(named), '', known, arrays)
 
 
-def _pixel(metrics: dict) -> list[float] | None:
-    """The size of a detector pixel, (v, u), mm; None where a result does not say, as those of earlier versions."""
-    pixel = metrics.get('pixel')
-    known = (
-        isinstance(pixel, list) and len(pixel) == 2 and all(isinstance(p, float) and 0 < p < math.inf for p in pixel)
-    )
-    return pixel if known else None
+def _volume(result: Fit | VolumeFile) -> Volume | None:
+    """The density; None for a method without."""
+    if isinstance(result, VolumeFile):
+        return result.volume
+    if not result.method.makes_volume:
+        return None
+    geometry = result.nominal_geometry
+    affine = np.diag([*geometry.grid.spacing, 1.0])
+    affine[:3, 3] = geometry.grid.first_voxel
+    return Volume(result.volume(), geometry.grid.spacing, affine, '1/mm')
 
 
-def _names(results: list[Stored]) -> list[str]:
+def _names(wanted: list[str]) -> list[str]:
     """One name for each, that no other has."""
     names: list[str] = []
-    for result in results:
-        name, n = brief(result.name, 40), 2
+    for text in wanted:
+        name, n = brief(text, 40), 2
         while name in [*names, 'Truth']:
-            name, n = f'{brief(result.name, 36)} ({n})', n + 1
+            name, n = f'{brief(text, 36)} ({n})', n + 1
         names.append(name)
     return names
 
@@ -96,17 +163,10 @@ def _grid(volume: Volume) -> str:
     return f'{" x ".join(map(str, volume.data.shape))} voxels of {" x ".join(f"{s:.4g}" for s in volume.spacing)} mm'
 
 
-def _same_views(results: list[Stored]) -> bool:
-    first = results[0]
-    return first.views is not None and all(
-        r.views is not None and r.views.shape == first.views.shape and np.allclose(r.angles, first.angles, atol=1e-3)
-        for r in results
-    )
-
-
-def _tables(names: list[str], results: list[Stored]) -> str:
-    metrics = [r.metrics for r in results]
-    head = ('', *names)
+def _tables(named: dict[str, Fit | VolumeFile]) -> str:
+    metrics = [r.record if isinstance(r, Fit) else {} for r in named.values()]
+    settings = [r.method.flat() if isinstance(r, Fit) else {} for r in named.values()]
+    head = ('', *named)
 
     def rows(labels: dict[str, str]):
         return [
@@ -119,7 +179,6 @@ def _tables(names: list[str], results: list[Stored]) -> str:
     if quality := rows({key: number.label for key, number in QUALITY.items()}):
         out.append(template.table('Quality and cost', quality, 'numbers', head))
     done = rows({key: number.label for key, number in SETTINGS.items()})
-    settings: list[dict] = [m['settings'] if isinstance(m.get('settings'), dict) else {} for m in metrics]
     changed = [
         (key, *(as_text('', s.get(key)) for s in settings))
         for key in dict.fromkeys(k for s in settings for k in s)
@@ -127,7 +186,7 @@ def _tables(names: list[str], results: list[Stored]) -> str:
     ]
     if done or changed:
         out.append(template.table('What was done, and settings that differ', done + changed, 'numbers', head))
-    for name, m in zip(names, metrics):
+    for name, m in zip(named, metrics):
         if m.get('command'):
             out.append(template.code(f'Make {name} again', str(m['command'])))
     return '\n'.join(out)

@@ -10,8 +10,8 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.notebook import grey_range
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.report.planes import plane, richest
-from lingo_mi.results.watch import Snapshot
 from lingo_mi.storage.file_access import as_path, optional, writing
 
 
@@ -44,17 +44,18 @@ class EventLog:
             self._writer.add_image(name, image, entry['iteration'], dataformats='HW')
         self._pictures = []
 
-    def look(self, snapshot: Snapshot) -> None:
-        """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth where there is one."""
-        volume = snapshot.volume
-        if volume is not None:
-            shown = [volume] if snapshot.measured is None else [volume, snapshot.measured[1]]
+    def look(self, fit: Fit) -> None:
+        """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth if there is one."""
+        data = fit.data
+        if fit.method.makes_volume:
+            truth = None if data is None else data.volume
+            shown = [fit.volume()] if truth is None else [fit.volume(), truth]
             window = grey_range(shown[-1])
             for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
                 index = richest(shown[-1], axis)
                 self._picture(f'slices/{name}', [plane(v, axis, index)[::-1] for v in shown], window)
-        if snapshot.test is not None and snapshot.views is not None:
-            pair = [snapshot.views[0], snapshot.test.projections[0]]
+        if data is not None and data.test is not None and fit.views is not None:
+            pair = [fit.views[0], data.test.projections[0]]
             self._picture('views/rendered_measured', pair, grey_range(pair[1]))
 
     def close(self, finished: bool) -> None:

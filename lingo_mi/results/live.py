@@ -12,6 +12,7 @@ import secrets
 import sys
 import threading
 import time
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -20,12 +21,12 @@ import numpy as np
 
 from lingo_mi.common.errors import brief
 from lingo_mi.common.progress import clock
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.report import template
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.packing import Arrays, preview
 from lingo_mi.report.payload import colour_maps, history, payload
-from lingo_mi.results.watch import Snapshot
 
 SHARE = 0.015  # of the fit's processor time, that a page may take until the end, whose state is shown in any case
 MOST_VOXELS = 128**3  # of a volume in the page
@@ -49,7 +50,7 @@ class Live:
         self._thinned = 0  # how often the history was
         self._line, self._number, self._done, self._end_seen = 'The fit begins.', 0, False, threading.Event()
         self._data: ReportData | None = None
-        self._waiting: Snapshot | None = None  # the latest, until it is shown
+        self._waiting: Fit | None = None  # the latest, until it is shown
         self._packed: tuple[int, dict, Arrays] = 0, {}, Arrays()
         self._changed: dict[str, int] = {}  # the state that brought each array as it is
         self._packing = threading.Lock()
@@ -100,9 +101,9 @@ class Live:
             self._line = ', '.join(parts) + '.'
         self._show_if_due()
 
-    def look(self, snapshot: Snapshot) -> None:
+    def look(self, fit: Fit) -> None:
         """See `watch.Watcher`. It is shown as soon as a page is there and `SHARE` allows it, unless a later one comes first."""
-        self._waiting = snapshot
+        self._waiting = fit
         self._show_if_due()
 
     def _show_if_due(self) -> None:
@@ -115,9 +116,9 @@ class Live:
     def _watched(self) -> bool:
         return time.perf_counter() - self._asked < PATIENCE
 
-    def _show(self, snapshot: Snapshot) -> None:
+    def _show(self, fit: Fit) -> None:
         began, self._waiting = time.process_time(), None  # of all threads: a volume is made by those of Dr.Jit
-        data = self._contents(snapshot)
+        data = self._contents(fit)
         with self._lock:
             self._data, self._number = data, self._number + 1
             self._latest = time.process_time() - began
@@ -138,45 +139,15 @@ class Live:
         self._server.shutdown()
         self._server.server_close()
 
-    def _contents(self, snapshot: Snapshot) -> ReportData:
-        geometry = self.geometry
-        held_out: dict[str, Any] = {}
-        if snapshot.test is not None and snapshot.views is not None:
-            held_out = dict(
-                views=snapshot.views,
-                views_truth=snapshot.test.projections,
-                views_angles=np.degrees(snapshot.test.geometry.angles),
-            )
-        volume = snapshot.volume
-        truth, blocks = None, 1
-        if volume is not None:
-            volume, blocks = preview(volume, MOST_VOXELS)
-            if snapshot.measured is not None:
-                given = snapshot.measured[1]
-                if self._truth is None or self._truth[0] is not given:
-                    self._truth = given, preview(given, MOST_VOXELS)[0]
-                truth = self._truth[1]
-        cloud: dict[str, Any] = {}
-        if snapshot.model.settings.cloud:
-            centres, scales, quaternions, density = snapshot.gaussians
-            cloud = dict(
-                cloud_centres=centres, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions
-            )
-        return ReportData(
-            title=self.title,
-            metrics={},
-            volume=volume,
-            truth=truth,
-            shape=geometry.nVoxel,
-            spacing=geometry.dVoxel,
-            centre=geometry.offOrigin,
-            preview=blocks,
-            pixel=geometry.dDetector,
-            cloud_unit='opacity' if volume is None else 'density at the centre [1/mm]',
-            scanner=geometry,
-            **cloud,
-            **held_out,
-        )
+    def _contents(self, fit: Fit) -> ReportData:
+        whole = fit.report(self.title, dict(history=[]))
+        if whole.volume is None:
+            return whole
+        volume, blocks = preview(whole.volume, MOST_VOXELS)
+        if whole.truth is not None and (self._truth is None or self._truth[0] is not whole.truth):
+            self._truth = whole.truth, preview(whole.truth, MOST_VOXELS)[0]
+        truth = None if whole.truth is None or self._truth is None else self._truth[1]
+        return replace(whole, volume=volume, truth=truth, preview=blocks)
 
     # ---- of the server's threads ----
 

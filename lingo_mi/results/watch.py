@@ -6,47 +6,12 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Protocol
 
-import numpy as np
-
 from lingo_mi.common.errors import brief
-from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.kinds import Model
-from lingo_mi.scan import Scan
+from lingo_mi.fitting.fit import Fit
 
 EVERY = 1.0  # seconds between two steps that watchers are told of
-
-
-@dataclass(eq=False)
-class Snapshot:
-    """A fit at one of the moments at which it is measured. What was not measured is computed when it is asked for.
-
-    test       held-out views (some), or None
-    views      the same, rendered, float32 [view, v, u]
-    measured   the volume, float32 [x, y, z], where it has a truth to be compared with, and that truth
-    numbers    what was measured, by name
-    """
-
-    model: Model
-    state: DeviceState
-    test: Scan | None
-    views: np.ndarray | None
-    measured: tuple[np.ndarray, np.ndarray] | None
-    numbers: dict
-
-    @cached_property
-    def volume(self) -> np.ndarray | None:
-        """Density per mm; None for alpha compositing."""
-        return self.measured[0] if self.measured else self.model.volume(self.state)
-
-    @cached_property
-    def gaussians(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """As `Fitted.world_gaussians`."""
-        return Fitted(self.model, self.state.host(), np.empty((0, 3))).world_gaussians()
 
 
 class Watcher(Protocol):
@@ -58,8 +23,8 @@ class Watcher(Protocol):
     def step(self, entry: dict, total: int) -> None:
         """About every second: `iteration`, `seconds`, `loss`, `gaussians`, and at some also what was measured; steps in all."""
 
-    def look(self, snapshot: Snapshot) -> None:
-        """At a few moments, each right before the step that has its numbers."""
+    def look(self, fit: Fit) -> None:
+        """At a few moments, each right before the step that has its numbers. The fit knows few of its held-out views."""
 
     def close(self, finished: bool) -> None:
         """At the end; finished: False where the fit was stopped."""
@@ -95,10 +60,10 @@ class Watch:
         self._new = {}
         self._each(lambda watcher: watcher.step(entry, total))
 
-    def look(self, snapshot: Snapshot) -> None:
-        """To be called with a state that is measured."""
-        self._new = snapshot.numbers
-        self._each(lambda watcher: watcher.look(snapshot))
+    def look(self, fit: Fit, numbers: dict) -> None:
+        """To be called with a fit that was measured, and what was measured."""
+        self._new = dict(numbers)
+        self._each(lambda watcher: watcher.look(fit))
 
     def close(self, finished: bool) -> None:
         """To be called at the end."""

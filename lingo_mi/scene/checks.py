@@ -21,10 +21,10 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
     """
     known = [g for g in geometries if g is not None]
     views = views or sum(map(len, known))
-    voxels, pixels = math.prod(known[0].nVoxel), views * math.prod(known[0].nDetector)
+    voxels, pixels = math.prod(known[0].grid.shape), views * math.prod(known[0].nDetector)
     needed = needed or 4 * (3 * voxels + 2 * pixels)
     if needed > (has := room()):
-        size = [' x '.join(map(str, counts)) for counts in (known[0].nVoxel, known[0].nDetector)]
+        size = [' x '.join(map(str, counts)) for counts in (known[0].grid.shape, known[0].nDetector)]
         raise InputError(
             f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2**30:,.1f} GiB of '
             f'memory, but this process may take {has / 2**30:,.1f} GiB: lower nVoxel, nDetector or the views'
@@ -33,7 +33,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
 
 def thinned(geometry: Geometry, slab: int) -> Geometry:
     """A scan with the slices of its volume that are in memory at once, of which `slab` are asked for (0: all)."""
-    return geometry.slab(0, min(slab, geometry.nVoxel[2])) if slab else geometry
+    return geometry.on(geometry.grid.slab(0, min(slab, geometry.grid.shape[2]))) if slab else geometry
 
 
 def require_densities(volume: np.ndarray) -> None:
@@ -52,8 +52,8 @@ def require_densities(volume: np.ndarray) -> None:
 
 def warn_if_truncated(geometry: Geometry) -> None:
     """Warn if the volume's midplane is wider than the panels' field of view."""
-    rays, centre = geometry.rays(), np.array(geometry.offOrigin)
-    widest, columns = max(geometry.sVoxel[:2]), geometry.nDetector[1]
+    rays, centre = geometry.rays(), np.array(geometry.grid.centre)
+    widest, columns = max(geometry.grid.size[:2]), geometry.nDetector[1]
     cut = 0
     for view in range(len(rays)):
         across = rays.u[view] / np.linalg.norm(rays.u[view]) * widest / 2

@@ -27,8 +27,8 @@ def data_file(name: str, parameter: str) -> str:
         where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
         raise InputError(
             f'{name[:100]}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
-            f'that holds it, or name your file: -D {parameter}=FILE'
+            f'that holds it, or name your file: {parameter}=FILE'
         )
     if not found.is_file() and not found.is_dir():
-        raise InputError(f'{name}: is no regular file, but a device or a pipe; name another: -D {parameter}=FILE')
+        raise InputError(f'{name}: is no regular file, but a device or a pipe; name another: {parameter}=FILE')
     return str(found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,8 +9,8 @@ import numpy as np
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import to_posed
-from lingo_mi.geometry import astra
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry, astra
+from lingo_mi.geometry.grid import Grid, grid_of
 from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.geometry.trajectories import circular, helix
 from lingo_mi.scene.data_files import data_file
@@ -62,9 +61,9 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
         type='ct_scanner',
         mode=geometry.mode,
         nDetector=join(geometry.nDetector),
-        nVoxel=join(geometry.nVoxel),
-        dVoxel=join(geometry.dVoxel),
-        offOrigin=join(geometry.offOrigin),
+        nVoxel=join(geometry.grid.shape),
+        dVoxel=join(geometry.grid.spacing),
+        offOrigin=join(geometry.grid.centre),
         view=index,
     )
     if not isinstance(geometry, CircularGeometry):
@@ -84,7 +83,7 @@ def parameter(props: Any, name: str, default: T) -> T:
     value = props.get(name, default)
     kind, wanted = {str: (str, 'text'), int: (int, 'a whole number'), float: ((int, float), 'a number')}[type(default)]
     if not isinstance(value, kind) or isinstance(value, bool) or (wanted == 'a number' and not np.isfinite(value)):
-        raise InputError(f'{name} must be {wanted}, not {value!r}')
+        raise InputError(f'{name} must be {wanted}, not {shown(value)}')
     return value
 
 
@@ -95,7 +94,7 @@ def _numbers(props, name, default=None):
     try:
         return [float(x) for x in str(value).replace(',', ' ').split()]
     except ValueError:
-        raise InputError(f'{name} = {value!r} is not a list of numbers') from None
+        raise InputError(f'{name} = {shown(value)} is not a list of numbers') from None
 
 
 def _distance(props, name, default):
@@ -112,28 +111,23 @@ def _counts(props, name):
     return values
 
 
-def own_grid(props: Any, geometry: Geometry) -> Geometry:
-    """A geometry with the voxels that a plugin's properties name, where they name any."""
-    if 'nVoxel' in props or 'dVoxel' in props:
-        count = _counts(props, 'nVoxel') if 'nVoxel' in props else geometry.nVoxel
-        geometry = geometry.with_volume(count, _numbers(props, 'dVoxel') if 'dVoxel' in props else geometry.dVoxel)
-    if 'offOrigin' in props:
-        geometry = replace(geometry, offOrigin=_numbers(props, 'offOrigin'))
-    return geometry
+def own_grid(props: Any, grid: Grid) -> Grid:
+    """The voxels that a plugin's properties name, and what they do not name of `grid`."""
+    values: dict[str, Any] = dict(nVoxel=grid.shape, dVoxel=grid.spacing, offOrigin=grid.centre)
+    if 'nVoxel' in props:
+        values['nVoxel'] = _counts(props, 'nVoxel')
+    return grid_of(values | {name: _numbers(props, name) for name in ('dVoxel', 'offOrigin') if name in props})
 
 
 def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     """The scan's and the held-out views' geometry from a plugin's properties."""
     mode = parameter(props, 'mode', 'cone')
-    shared: dict[str, Any] = dict(
-        mode=mode,
-        nDetector=_counts(props, 'nDetector'),
-        nVoxel=_counts(props, 'nVoxel'),
-        dVoxel=_numbers(props, 'dVoxel'),
-        offOrigin=_numbers(props, 'offOrigin', 0.0),
+    shared: dict[str, Any] = dict(mode=mode, nDetector=_counts(props, 'nDetector'))
+    voxels = dict(
+        nVoxel=_counts(props, 'nVoxel'), dVoxel=_numbers(props, 'dVoxel'), offOrigin=_numbers(props, 'offOrigin', 0.0)
     )
     if parameter(props, 'poses', ''):
-        return _read_poses(props, shared), None
+        return _read_poses(props, shared | voxels), None
     total, start = parameter(props, 'totalAngle', 360.0), parameter(props, 'startAngle', 0.0)
     views, held_out = parameter(props, 'views', 50), parameter(props, 'test_views', 0)
     if held_out < 0:
@@ -143,6 +137,7 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     angles = np.radians(_numbers(props, 'angles')) if 'angles' in props else circular(views, total, start)
     far = 1.0 if mode == 'parallel' else None  # a parallel beam has no source; the distances only place it
     shared |= dict(
+        grid=grid_of(voxels),
         DSO=_distance(props, 'DSO', far),
         DSD=_distance(props, 'DSD', far),
         dDetector=_numbers(props, 'dDetector'),

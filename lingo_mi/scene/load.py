@@ -99,7 +99,7 @@ def plain(error: Exception) -> str:
     if 'Could not initialize OptiX' in text:
         return (
             'Mitsuba needs OptiX to load a scene on a GPU, and the NVIDIA driver here has none (in a container: '
-            'NVIDIA_DRIVER_CAPABILITIES=all); take --variant llvm_ad_mono, or give an array or a scan instead of a scene'
+            'NVIDIA_DRIVER_CAPABILITIES=all); take variant=llvm_ad_mono, or give an array or a scan instead of a scene'
         )
     text = re.sub(r'Traceback \(most recent call last\):\n(?:[ \t].*\n)*', '', text)
     lines = [re.sub(r'^\[[\w.]+:\d+\] *', '', line.strip()) for line in text.splitlines() if line.strip()]

@@ -11,7 +11,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.progress import Progress
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.files.volumes import Volume
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.projectors import cutoff, grid
 from lingo_mi.projectors.objects import GridInCube, find_objects
@@ -46,10 +46,10 @@ def take_scan(
         spread(len(geometry), views)
     effects = find_effects(loaded.scene, scanner)
     if volume is not None:
-        geometry = geometry.with_volume(volume.data.shape, volume.spacing)
+        geometry = geometry.on(Grid(volume.data.shape, volume.spacing, geometry.grid.centre))
         check_memory(geometry, test)
-        test = test and test.with_volume(volume.data.shape, volume.spacing)
-        objects = [ScannedVolume(volume.data, geometry)]
+        test = test and test.on(Grid(volume.data.shape, volume.spacing, test.grid.centre))
+        objects = [ScannedVolume(volume.data, geometry.grid)]
     else:
         try:
             objects = find_objects(loaded.scene)
@@ -73,7 +73,7 @@ def take_scan(
         everything.subset(slice(0, len(geometry))), geometry=geometry
     )  # as given: joining may make poses of it
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
-    true = true_volume(objects, geometry) if truth else None
+    true = true_volume(objects, geometry.grid) if truth else None
     return choose_views(Dataset(train, held_out, true), 0 if test is not None else views)
 
 
@@ -106,11 +106,11 @@ def render_objects(objects: Sequence, geometry: Geometry, extent: float = cutoff
             def report(done, _):
                 bar.update(k * len(geometry) + done)
 
-            same_box = isinstance(thing, GridInCube) and fills_grid(thing, geometry)
+            same_box = isinstance(thing, GridInCube) and fills_grid(thing, geometry.grid)
             if isinstance(thing, ScannedVolume):
                 total += thing.project(geometry, report)
             elif same_box:  # skips empty margins, which rendering through the scene may not
-                total += grid.project(grid_values(thing), geometry, report)
+                total += grid.project_volume(grid_values(thing), geometry, report)
             else:
                 rays = geometry.rays()
                 for i in range(len(geometry)):

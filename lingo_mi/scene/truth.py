@@ -6,55 +6,52 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors import grid
+from lingo_mi.geometry import Geometry, Grid
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.objects import Ellipsoids, GridInCube
 from lingo_mi.projectors.sampling import on_grid
 
 
-def true_volume(objects: Iterable, geometry: Geometry) -> np.ndarray | None:
+def true_volume(objects: Iterable, grid: Grid) -> np.ndarray | None:
     """The true density on the scanner's grid [x, y, z]; None if an object cannot be sampled on it."""
-    total = np.zeros(geometry.nVoxel, np.float32)
-    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+    total = np.zeros(grid.shape, np.float32)
     for thing in objects:
         if isinstance(thing, ScannedVolume):
             total += thing.data
-        elif not isinstance(thing, GridInCube) or fills_grid(thing, geometry):
-            total += on_grid(thing, corner, geometry.dVoxel, geometry.nVoxel)
+        elif not isinstance(thing, GridInCube) or fills_grid(thing, grid):
+            total += on_grid(thing, grid.low, grid.spacing, grid.shape)
         else:
             return None
     return total
 
 
-def fills_grid(thing: GridInCube, geometry: Geometry) -> bool:
+def fills_grid(thing: GridInCube, grid: Grid) -> bool:
     """Whether an object's grid is the scanner's own."""
-    centre, half = np.array(geometry.offOrigin), np.array(geometry.sVoxel) / 2
+    near = 1e-4 * max(grid.size) / 2
     return (
-        tuple(thing.size) == geometry.nVoxel
-        and np.allclose(thing.low, centre - half, atol=1e-4 * half.max())
-        and np.allclose(thing.high, centre + half, atol=1e-4 * half.max())
+        tuple(thing.size) == grid.shape
+        and np.allclose(thing.low, grid.low, atol=near)
+        and np.allclose(thing.high, grid.high, atol=near)
     )
 
 
 class ScannedVolume:
     """A volume on the scan's own grid, as an object to scan."""
 
-    def __init__(self, data: np.ndarray, geometry: Geometry):
-        self.data, self.box = data, geometry
+    def __init__(self, data: np.ndarray, grid: Grid):
+        self.data, self.grid = data, grid
 
     def project(self, geometry: Geometry, progress: Callable[[int, int], None] | None) -> np.ndarray:
-        return grid.project(self.data, geometry, progress)
+        return project_volume(self.data, geometry, progress)
 
     def in_box(self) -> GridInCube:
         """The volume as an object of a scene."""
-        centre, half = np.array(self.box.offOrigin), np.array(self.box.sVoxel) / 2
-        return GridInCube.of(self.data, centre - half, centre + half, 'volume')
+        return GridInCube.of(self.data, self.grid.low, self.grid.high, 'volume')
 
 
-def voxelize_cloud(cloud: Ellipsoids, geometry: Geometry, extent: float) -> np.ndarray:
-    """Density of a cloud of Gaussians at the voxel centres of the scan's grid, float32 [x, y, z], per mm.
+def voxelize_cloud(cloud: Ellipsoids, grid: Grid, extent: float) -> np.ndarray:
+    """Density of a cloud of Gaussians at the voxel centres of a grid, float32 [x, y, z], per mm.
 
     extent   cut-off in standard deviations
     """
-    corner = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
-    return on_grid(cloud, corner, geometry.dVoxel, geometry.nVoxel, extent)
+    return on_grid(cloud, grid.low, grid.spacing, grid.shape, extent)

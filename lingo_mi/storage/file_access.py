@@ -66,14 +66,19 @@ def parsed_json(text: str | bytes) -> Any:
         raise ValueError('nested too deeply') from None
 
 
+def read_json(path: PathLike | str) -> Any:
+    """What a JSON file says; None where it is no JSON. Raises InputError where it cannot be read."""
+    with reading(path):
+        text = Path(path).read_bytes()
+    try:
+        return parsed_json(text)
+    except ValueError:
+        return None
+
+
 def read_object(path: PathLike | str) -> dict[str, Any]:
     """What a JSON file holds by name. Raises InputError where it cannot be read or holds something else."""
-    with reading(path):
-        text = Path(path).read_text(encoding='utf-8', errors='replace')
-    try:
-        found = parsed_json(text)
-    except ValueError:
-        found = None
+    found = read_json(path)
     if not isinstance(found, dict):
         raise InputError(f'{path}: is damaged; remove it, to make it again')
     return found
@@ -185,6 +190,20 @@ def new_file(path: Path, force: bool) -> None:
     if path.exists() and not force:
         raise InputError(f'{path}: exists already; give force=True to replace it')
     path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def check_new_file(path: Path, force: bool) -> None:
+    """Raises InputError if a file cannot be written, or would replace a folder, a link or, unless `force`, a file.
+
+    Leaves nothing behind.
+    """
+    if path.is_dir():
+        raise InputError(f'{path}: is a folder; give another name')
+    if path.is_symlink():
+        raise InputError(f'{path}: is a link, which is not written to; give another name')
+    if path.exists() and not force:
+        raise InputError(f'{path}: exists already; give force=True to replace it')
+    require_writable(path.parent, path)
 
 
 @contextmanager

@@ -1,16 +1,21 @@
-"""One writer at a time: a lock file that names its owner, and that a killed process does not leave locked."""
+"""One writer at a time: a lock file that names its owner, and that a killed process does not leave locked.
+
+filelock names no owner, takes a user's file of that name for its lock, and fails where the system answers that it does not
+support locks.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.storage.file_access import writing
+from lingo_mi.storage.file_access import leftovers, writing
 
 try:
     import fcntl
@@ -39,6 +44,19 @@ def locked(folder: Path | str, name: str = LOCK) -> Iterator[None]:
         _take(folder / name, stack)
         inner = stack.pop_all()
     with inner:
+        yield
+
+
+@contextmanager
+def writing_file(path: Path) -> Iterator[None]:
+    """Keeps other processes from writing this output file; what a killed one has left of it is removed."""
+    with locked(path.parent, f'{LOCK}-{path.name[-40:]}'):
+        for leftover, target in leftovers(path.parent):
+            if target == path.name[-40:]:
+                leftover.unlink(missing_ok=True)
+        for leftover, target in leftovers(path.parent, folders=True):
+            if target == path.name[-40:]:
+                shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 

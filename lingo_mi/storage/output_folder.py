@@ -11,20 +11,26 @@ import hashlib
 import json
 import os
 import re
-import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.storage.file_access import flush_folder, leftovers, parsed_json, reading, replacing, writing
+from lingo_mi.storage.file_access import (
+    flush_folder,
+    leftovers,
+    read_json,
+    reading,
+    replacing,
+    require_writable,
+    writing,
+)
 from lingo_mi.storage.folder_lock import LOCK
 
 METRICS, CHECKPOINT, MANIFEST, VIEWS = 'metrics.json', 'checkpoint.npz', '.lingo_mi.json', 'views'
 VOLUME, CLOUD, SCENE, PICTURE, PAGE = 'volume.nii.gz', 'gaussians.ply', 'result.xml', 'report.png', 'report.html'
 FILES = VOLUME, CLOUD, SCENE, PICTURE, PAGE, METRICS, CHECKPOINT
 _VIEW = re.compile(rf'{VIEWS}/\d{{4,}}\.exr')
-_EARLIER = CHECKPOINT + '.partial'  # earlier versions left it behind when they were killed
 
 
 @dataclass(frozen=True)
@@ -41,21 +47,15 @@ def view_name(index: int) -> str:
 
 
 def manifest_of(folder: Path) -> Manifest:
-    """The manifest of a folder; of a result by an earlier version, what it had. Raises InputError where it is no manifest."""
+    """The manifest of a folder. Raises InputError where it is no manifest."""
     path = folder / MANIFEST
     if not os.path.lexists(path):
-        return Manifest(_earlier_files(folder))
+        return Manifest()
     _require_file(path)
-    try:
-        with reading(path):
-            found = parsed_json(path.read_text(encoding='utf-8'))
-        names, begun = found['files'], found['writing']
-        if not (isinstance(names, list) and isinstance(begun, bool) and all(isinstance(n, str) for n in names)):
-            raise ValueError
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f'{path}: is no manifest of lingo_mi; move it away, or choose another folder') from None
+    found = read_json(path)
+    names, begun = (found.get('files'), found.get('writing')) if isinstance(found, dict) else (None, None)
+    if not (isinstance(names, list) and isinstance(begun, bool) and all(isinstance(n, str) for n in names)):
+        raise InputError(f'{path}: is no manifest of lingo_mi; move it away, or choose another folder')
     return Manifest(frozenset(n for n in names if _is_name(n)), begun)
 
 
@@ -100,7 +100,7 @@ def remove_others(folder: Path, names: Iterable[str]) -> None:
             views.rmdir()
 
 
-def complete(folder: Path, names: Iterable[str], numbers: dict, default: Callable | None = None) -> dict:
+def complete_result(folder: Path, names: Iterable[str], numbers: dict, default: Callable | None = None) -> dict:
     """Write metrics.json, which marks a whole result of those of these files that exist.
 
     Returns the numbers as written, with `files`, the digests.
@@ -127,18 +127,16 @@ def digest(path: Path) -> str:
 def require_together(folder: Path, names: Iterable[str]) -> None:
     """Raises InputError where files of these names in a folder are not of one result.
 
-    That is so where metrics.json has other digests of them, and where a result is begun and not completed. Results of earlier
-    versions, and files that were copied from their folder, cannot be told.
+    That is so where metrics.json has other digests of them, and where a result is begun and not completed. Nothing is known of
+    files that were copied from their folder.
     """
     path = folder / METRICS
     if not path.exists():
         manifest = manifest_of(folder)
         if manifest.writing and any(name in manifest.files and (folder / name).exists() for name in names):
-            raise InputError(
-                f'{folder}: a result was not completed here; go on with lingo-mi fit --resume, or fit again'
-            )
+            raise InputError(f'{folder}: a result was not completed here; resume the fit, or fit again')
         return
-    record = _json(path)
+    record = read_json(path)
     known = record.get('files') if isinstance(record, dict) else None
     if not isinstance(known, dict):
         return
@@ -150,8 +148,35 @@ def require_together(folder: Path, names: Iterable[str]) -> None:
 
 def occupants(folder: Path) -> list[str]:
     """Names in a folder, without what a killed process of ours has left behind."""
-    passed_over = {MANIFEST, LOCK, _EARLIER, *(path.name for path in _leftovers(folder))}
+    passed_over = {MANIFEST, LOCK, *(path.name for path in _leftovers(folder))}
     return sorted(path.name for path in folder.iterdir() if path.name not in passed_over)
+
+
+def result_folder(path: Path, *, force: bool = False, resume: bool = False) -> Path:
+    """The folder of a result, which can be made and written to. Leaves nothing behind.
+
+    force, resume   whether a folder with files in it will do
+
+    Raises InputError rather than spoil what is there.
+    """
+    if path.exists() and not path.is_dir():
+        raise InputError(f'{path}: is a file, not a folder; choose another folder')
+    there = occupants(path) if path.is_dir() else []
+    if resume and CHECKPOINT not in there:
+        instead = 'run without resume=True' + (', with force=True' if there else '')
+        raise InputError(f'{path / CHECKPOINT}: there is no checkpoint to go on from; {instead}')
+    if there and not (force or resume):
+        what, way = 'is not empty', 'force=True to write beside what is there'
+        if METRICS in there:
+            what, way = 'holds a result already', 'force=True to replace it'
+        if CHECKPOINT in there:
+            what = what if METRICS in there else 'holds a fit that was not completed'
+            way = 'resume=True to go on, force=True to replace it'
+        raise InputError(f'{path}: {what}; give {way}, or choose another folder')
+    require_writable(path, path, 'choose another folder')
+    if path.is_dir():
+        require_ours(path, FILES)
+    return path
 
 
 def clear_leftovers(folder: Path) -> None:
@@ -185,36 +210,3 @@ def _write(folder: Path, manifest: Manifest) -> None:
     with replacing(folder / MANIFEST) as temporary:
         content = dict(files=sorted(manifest.files), writing=manifest.writing)
         temporary.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
-
-
-def _json(path: Path):
-    try:
-        with reading(path):
-            return parsed_json(path.read_text(encoding='utf-8'))
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
-        return None
-
-
-def _earlier_files(folder: Path) -> frozenset[str]:
-    """The files of a result by a version without manifests, which has left metrics.json or a checkpoint that show to be ours."""
-    metrics = folder / METRICS
-    record = _json(metrics) if metrics.is_file() else None
-    versions = record.get('versions') if isinstance(record, dict) else None
-    recorded = isinstance(versions, dict) and 'lingo_mi' in versions
-    if not (recorded or _is_checkpoint(folder / CHECKPOINT)):
-        return frozenset()
-    names = {*FILES, *(f'{VIEWS}/{path.name}' for path in (folder / VIEWS).glob('*.exr'))}
-    if record is not None and not recorded:  # another program's; a damaged one is ours
-        names.remove(METRICS)
-    return frozenset(name for name in names if _is_name(name) and os.path.lexists(folder / name))
-
-
-def _is_checkpoint(path: Path) -> bool:
-    """Whether a file looks like a checkpoint of ours, by the names of its entries."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {'extra.npy', 'seen.npy', 'array.initial.npy'} <= {*archive.namelist()}
-    except (OSError, ValueError, zipfile.BadZipFile):
-        return False

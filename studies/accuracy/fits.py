@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from lingo_mi import phantoms
-from lingo_mi.fitting.cloud_model import CloudModel
-from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.initial import initial_cloud
-from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.measured import density_unit
-from lingo_mi.fitting.recipes import CLOUDS, METHODS
-from lingo_mi.fitting.state import start
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.loop import Running, run
+from lingo_mi.fitting.measure import quick_measure
+from lingo_mi.fitting.methods.by_name import CLOUDS, METHODS
+from lingo_mi.fitting.methods.fast import Fast
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics.ipsd import ipsd
-from lingo_mi.phantoms.x3d_scan import simulate
-from lingo_mi.results.measure import quick_measure
+from lingo_mi.phantoms.x3d_scan import project_phantom
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.studies.accuracy.images import EXTENT
 from lingo_mi.studies.accuracy.sizes import Sizes
@@ -33,11 +31,10 @@ def dataset(side: int, pixels: int, views: int) -> Dataset:
         DSD=1500.0,
         nDetector=(pixels, pixels),
         dDetector=(512 / pixels, 512 / pixels),
-        nVoxel=phantom.data.shape,
-        dVoxel=phantom.spacing,
         angles=angles,
+        grid=Grid(phantom.data.shape, phantom.spacing),
     )
-    both = Scan(geometry, simulate(phantom, geometry))
+    both = Scan(geometry, project_phantom(phantom, geometry))
     return Dataset(both.subset(slice(0, views)), both.subset(slice(views, None)), phantom.data)
 
 
@@ -47,38 +44,42 @@ def initialisations(sizes: Sizes) -> list[dict]:
     data = dataset(side, side, sizes.views)
     rows = []
     kinds = {
-        'edges': dict(init='edges'),
-        'lingo': dict(init='lingo'),
-        'lingo, paper density': dict(init='lingo', init_density='paper'),
-        'r2': dict(init='r2'),
+        'edges': dict(start='edges'),
+        'lingo': dict(start='masks'),
+        'lingo, paper density': dict(start='masks', density='paper'),
+        'r2': dict(start='fdk'),
     }
-    fast = METHODS['fast'].changed(
-        values_per_gaussian=0, iterations=sizes.iterations[-2]
-    )  # as many points as asked for
-    initial_cloud(data.train, fast.changed(n_points=sizes.points[0]))  # compiles
+    fast = Fast().changed(values_per_gaussian=0, iterations=sizes.iterations[-2])  # as many points as asked for
+    fast.changed(n_points=sizes.points[0]).starting_cloud(data.train)  # compiles
     for name, changes in kinds.items():
         for n in sizes.points:
-            settings = fast.changed(n_points=n, **changes)
-            cloud = initial_cloud(data.train, settings)
-            model = CloudModel(settings, data.train.geometry, density_unit(data.train, settings))
-            density = None if cloud.density is None else cloud.density / model.unit
-            state = DeviceState(start(cloud.points, cloud.spacing, density, settings))
-            fitted = run(data.train, settings, cloud)
-            born = fitted.state.values['centre'][fitted.state.born]
+            method = fast.changed(n_points=n, **changes).bounded(data.train)
+            before, state = Running(data.train, data.train, method, 0, None, None).fit(), run(data.train, method).state
+            born = state.values['centre'][state.born]
             rows.append(
                 dict(
                     name=name,
-                    points=len(cloud),
-                    seconds=cloud.info['seconds'],
-                    ipsd=ipsd(fitted.initial, born) if len(born) else None,
-                    **quick_measure(data)(model, state),
+                    points=len(before),
+                    seconds=before.info['seconds'],
+                    ipsd=ipsd(before.checkpoint.arrays['initial'], born) if len(born) else None,
+                    **_quality(data)(before),
                 )
             )
     return rows
 
 
+def _quality(data: Dataset) -> Callable[[Fit], dict]:
+    """Measures a fit by all held-out views and the true volume."""
+
+    def measured(fit):
+        fit.data = data
+        return quick_measure(fit)
+
+    return measured
+
+
 def curves(sizes: Sizes) -> list[dict]:
-    """Quality against seconds: recipes, iterations, cut-off, Gaussians, size of the phantom and of the panel."""
+    """Quality against seconds: methods, iterations, cut-off, Gaussians, size of the phantom and of the panel."""
     small, middle = sizes.phantoms[0], sizes.iterations[-2]
     plans: list[dict[str, Any]] = [dict(name=name, iterations=n) for name in CLOUDS for n in sizes.iterations]
     plans += [dict(extent=e) for e in (2.0, 4.0, EXTENT)]
@@ -103,21 +104,20 @@ def curves(sizes: Sizes) -> list[dict]:
         if (side, pixels) not in scans:
             scans[side, pixels] = dataset(side, pixels, sizes.views)
         data, method = scans[side, pixels], METHODS[plan['name']]
-        settings = method.changed(iterations=plan['iterations'], n_points=plan['points'], extent=plan['extent'])
+        method = method.changed(iterations=plan['iterations'], n_points=plan['points'], extent=plan['extent'])
         if plan['values_per_gaussian'] is not None:
-            settings = settings.changed(values_per_gaussian=plan['values_per_gaussian'])
-        cloud = initial_cloud(data.train, settings)
-        fitted = run(data.train, settings, cloud, measure=quick_measure(data))
+            method = method.changed(values_per_gaussian=plan['values_per_gaussian'])
+        fit = run(data.train, method, measure=_quality(data))
         rows.append(
             plan
             | dict(
                 asked=plan['points'],
-                points=len(cloud),
-                gaussians=len(fitted.state),
-                seconds=fitted.info['seconds'] + fitted.seconds,
-                seconds_init=fitted.info['seconds'],
-                history=fitted.history,
-                **{k: v for k, v in fitted.history[-1].items() if k.startswith('psnr')},
+                points=len(fit.checkpoint.arrays['initial']),
+                gaussians=len(fit),
+                seconds=fit.seconds,
+                seconds_init=fit.info['seconds'],
+                history=fit.history,
+                **{k: v for k, v in fit.history[-1].items() if k.startswith('psnr')},
             )
         )
     return rows

@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.projectors import grid
 from lingo_mi.projectors.balance import SHARING
 from lingo_mi.projectors.view import vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 from lingo_mi.studies import alternatives
 from lingo_mi.studies.accuracy.compare import Method, by_function, by_integrator, compare, split
 from lingo_mi.studies.accuracy.sizes import Sizes
@@ -70,7 +70,7 @@ def _through_grid(work: Workload, gaussians, n: int, step: float | None = None):
     """The image of a cloud sampled on n^3 voxels: walked exactly, or marched with steps of `step` voxels."""
     side = 2 / n
     centre, scale, rotation, density = gaussians
-    voxels = Grid(vector64((-1, -1, -1)), vector64((side,) * 3), (n, n, n))
+    voxels = Lattice(vector64((-1, -1, -1)), vector64((side,) * 3), (n, n, n))
     data = voxelize(centre, scale, rotation, density, voxels, EXTENT)
     origin, direction = alternatives.rays(work.view, 2.0)
     if step:

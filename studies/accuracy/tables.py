@@ -180,7 +180,7 @@ _INITIAL = [
     *_QUALITY,
 ]
 _FITS = [
-    ('recipe', _number('name', '{}')),
+    ('method', _number('name', '{}')),
     ('phantom', _number('side', '{0}³')),
     ('panel', _number('pixels', '{0}²')),
     ('iterations', _number('iterations', '{:,}')),

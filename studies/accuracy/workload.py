@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.view import View
 from lingo_mi.studies.closed_form import image_and_gradients
 from lingo_mi.studies.pairs import count_pairs
@@ -46,10 +46,9 @@ class Workload:
             DSD=DSD,
             nDetector=(pixels, pixels),
             dDetector=(PANEL / pixels, PANEL / pixels),
-            nVoxel=(8, 8, 8),
-            dVoxel=(1 / 4, 1 / 4, 1 / 4),
             angles=np.array([0.4]),
             mode=mode,
+            grid=Grid(8, 1 / 4),
         )
         self.view = View.of(self.geometry.rays(), 0, pixels, pixels)
         self.data = mi.TensorXf(np.concatenate(self.columns[:3], 1))

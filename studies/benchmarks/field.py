@@ -19,13 +19,11 @@ import numpy as np
 
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.field.field_step import FieldStepper
-from lingo_mi.fitting.field.settings import FieldSettings
-from lingo_mi.fitting.recipes import NAF
+from lingo_mi.fitting.field.options import Field
+from lingo_mi.fitting.methods.naf import NAF
 from lingo_mi.fitting.state import State
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.scan import Scan
 
 WARM = 2  # turns that are not counted
@@ -51,22 +49,16 @@ def main() -> None:
 
 def measured(rays: int, samples: int, repeats: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Medians of seconds, and of seconds of CPU, of a step: by Dr.Jit, and by NumPy."""
-    settings = NAF.changed(field_rays=rays, field_samples=samples)
+    method = NAF().changed(field_rays=rays, field_samples=samples)
     geometry = CircularGeometry(
-        DSO=500.0,
-        DSD=750.0,
-        nDetector=(64, 64),
-        dDetector=(6.0, 6.0),
-        nVoxel=(64, 64, 64),
-        dVoxel=(4.0, 4.0, 4.0),
-        angles=circular(4, 180),
+        DSO=500.0, DSD=750.0, nDetector=(64, 64), dDetector=(6.0, 6.0), angles=circular(4, 180), grid=Grid(64, 4.0)
     )
     rng = np.random.default_rng(0)
     scan = Scan(geometry, rng.random((4, 64, 64), np.float32))
-    stepper = FieldStepper(scan, settings)
-    begin = stepper.start(InitialCloud(np.zeros((0, 3)), None, np.zeros(0)), rng)
+    stepper = method.stepper(scan)
+    begin, *_ = stepper.begin(0)
     on_device = DeviceState(begin)
-    by_numpy = NumpyField(settings.neural, begin)
+    by_numpy = NumpyField(method.field, begin)
 
     def native(turn):
         stepper.step(on_device, [turn % 4], turn, rng)
@@ -92,8 +84,8 @@ class NumpyField:
     dtype   of all computations: float32 to be measured, float64 to be compared with
     """
 
-    def __init__(self, settings: FieldSettings, state: State, dtype: type = np.float32):
-        s = self.settings = settings
+    def __init__(self, options: Field, state: State, dtype: type = np.float32):
+        s = self.options = options
         self.dtype = dtype
         self.features = state.values['features'].reshape(-1, s.field_features).astype(dtype)
         flat, self.layers = state.values['network'][:, 0].astype(dtype), []
@@ -112,7 +104,7 @@ class NumpyField:
 
     def corners(self, points: np.ndarray):
         """Per level: indices of the eight corners of each point's cell, [8, N], and their weights."""
-        s, offset = self.settings, 0
+        s, offset = self.options, 0
         for level in range(s.field_levels):
             scale = s.field_base * s.field_growth**level - 1
             side = int(np.ceil(scale)) + 1
@@ -141,7 +133,7 @@ class NumpyField:
         inputs = np.concatenate(encoded, 1)
         hidden, self.into, self.signs = inputs, [], []
         for k, (matrix, bias) in enumerate(self.layers):
-            if k == self.settings.field_skip:
+            if k == self.options.field_skip:
                 hidden = np.concatenate([inputs, hidden], 1)
             self.into.append(hidden)
             hidden = hidden @ matrix.T + bias
@@ -155,18 +147,18 @@ class NumpyField:
         """Derivatives by all `parameters`, from those by the densities, [N], of the last call."""
         out: list[np.ndarray] = []
         g = (by_density * self.value * (1 - self.value))[:, None]
-        inputs = self.settings.field_levels * self.settings.field_features
+        inputs = self.options.field_levels * self.options.field_features
         by_inputs = np.zeros((len(g), inputs), self.dtype)
         for k in reversed(range(len(self.layers))):
             if k < len(self.layers) - 1:
                 g = g * self.signs[k]
             out = [g.T @ self.into[k], g.sum(0), *out]
             g = g @ self.layers[k][0]
-            if k == self.settings.field_skip:
+            if k == self.options.field_skip:
                 by_inputs, g = by_inputs + g[:, :inputs], g[:, inputs:]
         by_inputs = by_inputs + g
         by_features = np.zeros_like(self.features)
-        size, entries = self.settings.field_features, len(self.features)
+        size, entries = self.options.field_features, len(self.features)
         for level, (index, weight) in enumerate(self.found):
             for f in range(size):
                 values = weight * by_inputs[:, level * size + f]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 from lingo_mi.studies.benchmarks.rtk_bridge import require_every_pixel
 
@@ -25,7 +25,7 @@ def model(geometry: Geometry, mbirjax: Any) -> Any:
     """MBIRJAX's model of a scan. Raises InputError for one that is not on a circle, or whose voxels are no cubes on the axis."""
     if not isinstance(geometry, CircularGeometry) or geometry.mode != 'cone':
         raise InputError('MBIRJAX is compared with on circles of a cone beam only')
-    if len(set(geometry.dVoxel)) > 1 or any(geometry.offOrigin[:2]):
+    if len(set(geometry.grid.spacing)) > 1 or any(geometry.grid.centre[:2]):
         raise InputError('MBIRJAX is compared with on cubic voxels around the axis of rotation only')
     out = mbirjax.ConeBeamModel(
         (len(geometry), *geometry.nDetector), np.asarray(geometry.angles, float), geometry.DSD, geometry.DSO
@@ -33,8 +33,8 @@ def model(geometry: Geometry, mbirjax: Any) -> Any:
     (dv, du), (up, along) = geometry.dDetector, geometry.offDetector
     out.set_params(
         delta_det_row=float(dv), delta_det_channel=float(du), det_row_offset=float(up), det_channel_offset=-float(along),
-        delta_voxel=float(geometry.dVoxel[0]), recon_shape=tuple(geometry.nVoxel),
-        recon_slice_offset=-float(geometry.offOrigin[2]), verbose=0,
+        delta_voxel=float(geometry.grid.spacing[0]), recon_shape=tuple(geometry.grid.shape),
+        recon_slice_offset=-float(geometry.grid.centre[2]), verbose=0,
     )  # fmt: skip
     return out
 

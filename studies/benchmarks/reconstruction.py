@@ -29,6 +29,7 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.rectify import can_rectify
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System, projector_class
 from lingo_mi.scan import Scan
@@ -53,7 +54,7 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
     )
     if tilt:
         rays = geometry.rays().moved(Rotation.from_euler('x', tilt, degrees=True).as_matrix())
-        geometry = Geometry.from_poses(rays, size, size, 256 / size)
+        geometry = Geometry.from_poses(rays, size, nVoxel=size, dVoxel=256 / size)
     empty = Scan(geometry, np.zeros((views, size, size), np.float32))
     scan = Scan(geometry, pair(projector_class(geometry), empty, volume)['projector']())
     packages = dict(ours=ours(scan, volume), exact=pair(GridPair, scan, volume))
@@ -94,7 +95,7 @@ def pair(kind: type, scan: Scan, volume: np.ndarray) -> Operations:
         return images.reshape(len(views), *geometry.nDetector[::-1]).transpose(0, 2, 1)
 
     def transpose():
-        return A.adjoint(A.images(scan.projections), views).numpy().reshape(geometry.nVoxel)
+        return A.adjoint(A.images(scan.projections), views).numpy().reshape(geometry.grid.shape)
 
     return dict(projector=project, transpose=transpose)
 
@@ -111,7 +112,7 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
         dr.eval(x)
         return system.volume(x)
 
-    fdk = dict(FDK=lambda: FDK().run(scan).volume) if can_rectify(scan) else {}
+    fdk = dict(FDK=lambda: run_algorithm(scan, FDK()).volume) if can_rectify(scan) else {}
     return pair(projector_class(geometry), scan, volume) | fdk | dict(SART=sart)
 
 
@@ -145,11 +146,11 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
     torch.set_num_threads(cores)
     geometry = scan.geometry
     rays = geometry.rays()
-    pixel, voxel = geometry.dDetector[::-1], geometry.dVoxel[::-1]
+    pixel, voxel = geometry.dDetector[::-1], geometry.grid.spacing[::-1]
     place = [rays.source, rays.centre(geometry.nDetector), rays.u / pixel[0], rays.v / pixel[1]]
     trajectory = tuple(torch.tensor(np.ascontiguousarray(x), dtype=torch.float32) for x in place)
     shapes = dict(detector_spacing=pixel, voxel_spacing=voxel, backend='torch')
-    projector = Projector(trajectory, geometry.nVoxel[::-1], geometry.nDetector[::-1], **shapes)
+    projector = Projector(trajectory, geometry.grid.shape[::-1], geometry.nDetector[::-1], **shapes)
 
     def views():
         return torch.from_numpy(np.ascontiguousarray(scan.projections.transpose(0, 2, 1)))
@@ -160,7 +161,7 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
 
     def reconstruct():
         angles = torch.tensor(geometry.angles, dtype=torch.float32)
-        return their_fdk(views(), trajectory, geometry.nVoxel[::-1], angles, **shapes).numpy().transpose(2, 1, 0)
+        return their_fdk(views(), trajectory, geometry.grid.shape[::-1], angles, **shapes).numpy().transpose(2, 1, 0)
 
     return dict(
         projector=project, transpose=lambda: projector.backproject(views()).numpy().transpose(2, 1, 0), FDK=reconstruct

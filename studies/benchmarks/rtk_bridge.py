@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
 
 
@@ -47,8 +47,8 @@ def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any) -> Any:
     """A volume [x, y, z] as an ITK image (y, z, x)."""
     image = itk.image_from_array(np.ascontiguousarray(volume.transpose(0, 2, 1), np.float32))
     order = [1, 2, 0]
-    first = np.array(geometry.offOrigin) - (np.array(geometry.sVoxel) - geometry.dVoxel) / 2
-    image.SetSpacing([geometry.dVoxel[i] for i in order])
+    first = np.array(geometry.grid.centre) - (np.array(geometry.grid.size) - geometry.grid.spacing) / 2
+    image.SetSpacing([geometry.grid.spacing[i] for i in order])
     image.SetOrigin([float(first[i]) for i in order])
     return image
 
@@ -78,7 +78,10 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     geometry = scan.geometry
     cls = getattr(itk.RTK, kind + 'ConeBeamReconstructionFilter')
     reconstruction = cls[image].New() if kind != 'SART' else cls[image, image].New()
-    inputs = [volume_image(np.zeros(geometry.nVoxel), geometry, itk), projection_image(scan.projections, geometry, itk)]
+    inputs = [
+        volume_image(np.zeros(geometry.grid.shape), geometry, itk),
+        projection_image(scan.projections, geometry, itk),
+    ]
     if kind == 'ConjugateGradient':
         inputs.append(projection_image(np.ones_like(scan.projections), geometry, itk))
     for i, x in enumerate(inputs):
@@ -99,7 +102,7 @@ def total_variation(scan: Scan, itk: Any, beta: float, alpha: float = 0.1, niter
     require_every_pixel(scan, 'RTK')
     geometry = scan.geometry
     solver = itk.RTK.ADMMTotalVariationConeBeamReconstructionFilter[itk.Image[itk.F, 3]].New()
-    solver.SetInput(0, volume_image(np.zeros(geometry.nVoxel), geometry, itk))
+    solver.SetInput(0, volume_image(np.zeros(geometry.grid.shape), geometry, itk))
     solver.SetInput(1, projection_image(scan.projections, geometry, itk))
     solver.SetGeometry(gantry(geometry, itk))
     solver.SetGatingWeights([1.0] * len(geometry))  # without a filter in between, it loses its projections (2.7)
@@ -131,7 +134,7 @@ def backproject(scan: Scan, itk: Any) -> np.ndarray:
         'JosephBackProjectionImageFilter',
         geometry,
         itk,
-        volume_image(np.zeros(geometry.nVoxel), geometry, itk),
+        volume_image(np.zeros(geometry.grid.shape), geometry, itk),
         projection_image(scan.projections, geometry, itk),
     )
     return array(found, itk)

@@ -2,14 +2,13 @@
 
 Steps from the end of a fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
 saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns, of
-differences within a turn. A renewal of the cloud (densification) counts with its share of a step.
+differences within a turn. Densification counts with its share of a step.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,9 +16,9 @@ import numpy as np
 
 from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.settings import LossSettings
-from lingo_mi.fitting.step import Stepper
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.methods.densities import DensityMethod
+from lingo_mi.fitting.options.loss import Loss
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.scan import Scan
@@ -27,24 +26,25 @@ from lingo_mi.studies.markdown import table
 
 WARM = 3  # turns that are not counted
 VIEWS = 4  # at most
-LOSS = {  # parts of the loss by the settings of their weights
+LOSS = {  # parts of the loss by the options of their weights
     'gradient of the difference': 'lambda_gradient',
     'SSIM': 'lambda_ssim',
     'total variation': 'lambda_tv',
 }
 
 
-def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
+def measured(fit: Fit, repeats: int) -> dict[str, float]:
     """Seconds of each part of a step, of a whole one, and of the integrator alone."""
-    settings, state = fitted.settings, DeviceState(fitted.state)
-    views = min(VIEWS, len(fitted.geometry))
-    every = len(fitted.geometry) // views
-    geometry, rng = fitted.geometry.subset(slice(0, views * every, every)), np.random.default_rng(0)
+    method, state, nominal = fit.method, DeviceState(fit.state), fit.nominal_geometry
+    assert isinstance(method, DensityMethod)  # others have other parts
+    views = min(VIEWS, len(nominal))
+    every = len(nominal) // views
+    geometry, rng = nominal.subset(slice(0, views * every, every)), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (views, *geometry.nDetector)).astype(np.float32))
-    steppers = {'whole': Stepper(scan, settings)}
-    for part in _parts_of_the_loss(settings.loss):
-        steppers[part] = Stepper(scan, replace(settings, loss=replace(settings.loss, **{LOSS[part]: 0.0})))
-    late, upstream = settings.iterations - 1, dr.opaque(mi.Float, 1, int(np.prod(geometry.nDetector)))
+    steppers = {'whole': method.stepper(scan)}
+    for part in _parts_of_the_loss(method.loss):
+        steppers[part] = method.changed(**{LOSS[part]: 0.0}).stepper(scan)
+    late, upstream = method.iterations - 1, dr.opaque(mi.Float, 1, int(np.prod(geometry.nDetector)))
     gradients = {name: dr.zeros(type(x), dr.width(x)) for name, x in state.values.items()}
     dr.eval(gradients)
 
@@ -53,7 +53,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
         view = steppers['whole'].targets[turn % views].view
         if backward:
             dr.enable_grad(gaussians)
-        image = line_integrals(*gaussians, view=view, options=RenderOptions(settings.model.extent))
+        image = line_integrals(*gaussians, view=view, options=RenderOptions(method.extent))
         if not backward:
             return dr.eval(image)
         dr.backward(image * upstream)
@@ -62,7 +62,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     work: dict[str, Callable[[int], object]] = {
         'image': lambda turn: integrate(turn, backward=False),
         'image and derivatives': lambda turn: integrate(turn, backward=True),
-        'Adam': lambda _: adam_step(state, gradients, settings, late),
+        'Adam': lambda _: adam_step(state, gradients, method, late),
         **{name: lambda turn, s=s: s.step(state, [turn % views], late, rng) for name, s in steppers.items()},
     }
     times: dict[str, list[float]] = {name: [] for name in work}
@@ -88,7 +88,7 @@ def measured(fitted: Fitted, repeats: int) -> dict[str, float]:
     return found | {'a step': step, 'densification': _renewal(steppers['whole'], state, rng)}
 
 
-def _parts_of_the_loss(loss: LossSettings) -> list[str]:
+def _parts_of_the_loss(loss: Loss) -> list[str]:
     """Those of LOSS that it has and can do without: something else must compare with the projections."""
     compared = loss.lambda_l1 + loss.lambda_ssim + loss.lambda_gradient
     weights = {part: getattr(loss, name) for part, name in LOSS.items()}
@@ -97,12 +97,12 @@ def _parts_of_the_loss(loss: LossSettings) -> list[str]:
 
 def _renewal(stepper, state, rng):
     """Seconds of densification, spread over all steps of the fit."""
-    s, iterations = stepper.settings.densification, stepper.settings.iterations
+    s, iterations = stepper.method.densify, stepper.method.iterations
     due = [i for i in range(s.densify_from + 1, min(s.densify_until, iterations)) if i % s.densify_every == 0]
     if not due:
         return 0.0
     began = time.perf_counter()
-    stepper.renewed(state, due[-1], rng)
+    stepper.densified(state, due[-1], rng)
     dr.sync_thread()
     return (time.perf_counter() - began) * len(due) / iterations
 

@@ -19,8 +19,7 @@ import numpy as np
 from lingo_mi.common.gpu import gpu
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.step import Stepper
+from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
@@ -44,19 +43,19 @@ def kernels(work: Callable[[], object]) -> dict:
     return dict(launches=len(taken), all=sum(taken), short=len(short), of_short=sum(short))
 
 
-def measured(fitted: Fitted, repeats: int) -> dict[str, dict]:
+def measured(fit: Fit, repeats: int) -> dict[str, dict]:
     """Of an image with its derivatives, and of a step: `kernels`; of a step also `seconds`, of one of many in a row."""
-    view = VIEW % len(fitted.geometry)
-    geometry, rng = fitted.geometry.subset([view]), np.random.default_rng(0)
+    view = VIEW % len(fit.nominal_geometry)
+    geometry, rng = fit.nominal_geometry.subset([view]), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)).astype(np.float32))
-    stepper, state = Stepper(scan, fitted.settings), DeviceState(fitted.state)
-    *vectors, density = (np.asarray(x, np.float32) for x in fitted.world_gaussians())
+    stepper, state = fit.method.stepper(scan), DeviceState(fit.state)
+    *vectors, density = (np.asarray(x, np.float32) for x in fit.gaussians)
     types = mi.Point3f, mi.Vector3f, mi.Vector4f
     gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
     rays = View.of(geometry.rays(), 0, *geometry.nDetector)
 
     def step():
-        stepper.step(state, [0], fitted.settings.iterations - 1, rng)
+        stepper.step(state, [0], fit.method.iterations - 1, rng)
 
     for _ in range(WARM):
         step()
@@ -89,9 +88,9 @@ def main() -> None:
     p.add_argument('--variant', metavar='V')
     args = p.parse_args()
     variant = use_variant(args.variant)
-    fitted = Fitted.from_checkpoint(args.checkpoint)
-    found = measured(fitted, args.repeats)
-    model = expected(len(fitted.state)) if variant.startswith('cuda') else {}
+    fit = load_fit(args.checkpoint)
+    found = measured(fit, args.repeats)
+    model = expected(len(fit)) if variant.startswith('cuda') else {}
     columns = [
         ('work', lambda row: row[0]),
         ('launches', lambda row: f'{row[1]["launches"]}'),

@@ -29,10 +29,11 @@ SHARE = (
     'plugins/test_integrator.py',
     'reconstruction/test_iterative.py',
     'fitting/test_fit.py',
+    'fitting/test_loop.py',
     'fitting/test_losses.py',
     'functional/test_functional.py',
     'studies/test_gradient_check.py',
-    'test_memory.py',
+    'common/test_memory.py',
 )
 WORKERS = 2  # test files at a time: the stand-in runs one thread
 CODE = ('lingo_mi', 'studies', 'plugins', 'scenes', 'scripts', 'examples', 'tests', 'pyproject.toml')

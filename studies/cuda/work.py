@@ -22,8 +22,7 @@ import numpy as np
 
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.step import Stepper
+from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.cloud import line_integrals
@@ -56,9 +55,9 @@ def main() -> None:
     name, part, *count = sys.argv[1:]
     use_variant('cuda_ad_mono')
     if part == 'steps':
-        return steps(Fitted.from_checkpoint(name), int(count[0]))
-    fitted = None if name == 'giants' else Fitted.from_checkpoint(name)
-    cloud, geometry = giants() if fitted is None else (fitted.world_gaussians(), fitted.geometry)
+        return steps(load_fit(name), int(count[0]))
+    fit = None if name == 'giants' else load_fit(name)
+    cloud, geometry = giants() if fit is None else (fit.gaussians, fit.nominal_geometry)
     *vectors, density = (np.asarray(x, np.float32) for x in cloud)
     types = mi.Point3f, mi.Vector3f, mi.Vector4f
     gaussians = [*(Type(*map(uploaded, x.T)) for Type, x in zip(types, vectors)), uploaded(density)]
@@ -84,13 +83,13 @@ def image(gaussians: Sequence, view: View, derivatives: bool) -> None:
     dr.sync_thread()
 
 
-def steps(fitted: Fitted, count: int) -> None:
+def steps(fit: Fit, count: int) -> None:
     """Late steps of a fit, on one view with random pixels: what is counted does not depend on them."""
-    geometry, rng = fitted.geometry.subset([VIEW]), np.random.default_rng(0)
+    geometry, rng = fit.nominal_geometry.subset([VIEW]), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)))
-    stepper, state = Stepper(scan, fitted.settings), DeviceState(fitted.state)
+    stepper, state = fit.method.stepper(scan), DeviceState(fit.state)
     for i in range(count):
-        stepper.step(state, [0], fitted.settings.iterations - 1 - count + i, rng)
+        stepper.step(state, [0], fit.method.iterations - 1 - count + i, rng)
     dr.sync_thread()
 
 

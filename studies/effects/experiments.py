@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.effects.forward import effects_of
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.method import Method
+from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors.objects import find_objects
@@ -22,8 +22,8 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.scene.simulate import render_objects, take_scan
 
 # Small, so that a fit takes about a minute.
-# Stopped nowhere: what an effect costs is told after the same steps.
-SETTINGS = FAST.changed(stop='off', iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
+# No fit stops early, so that effects are compared after the same steps.
+METHOD = Fast().changed(stop='off', iterations=750, densify_from=100, densify_until=450, values_per_gaussian=25.0)
 FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled')
 
 
@@ -32,7 +32,7 @@ class Experiment:
     """An effect, how to simulate it and how to fit what it leaves.
 
     title   in tables and pictures
-    model   settings of the fit that models it, besides those of the others
+    model   options of the fit that models it, besides those of the others
     scene   parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have
     turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
                   not told
@@ -72,7 +72,7 @@ def experiment_of(name: str) -> Experiment:
     return EXPERIMENTS[name]
 
 
-def measure(name: str, parameters: dict | None = None, settings: Any = SETTINGS, seed: int = 0) -> dict:
+def measure(name: str, parameters: dict | None = None, method: Method = METHOD, seed: int = 0) -> dict:
     """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
 
     parameters   of the scene file (`<default>` names)
@@ -89,12 +89,9 @@ def measure(name: str, parameters: dict | None = None, settings: Any = SETTINGS,
         key = tuple(sorted(given.items()))
         if key not in scenes:
             scenes[key] = scans(name, given, seed)
-        what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], settings.changed(**changes)
-        fitted = run(what, chosen, initial_cloud(what, chosen, seed), seed, lambda *_: {})
-        found[kind] = (
-            fitted.volume(),
-            dict(ms_per_iteration=pace(fitted.history), seconds=fitted.info['seconds'] + fitted.seconds),
-        )
+        what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], method.changed(**changes)
+        fit = run(what, chosen, seed)
+        found[kind] = fit.volume(), dict(ms_per_iteration=pace(fit.history), seconds=fit.seconds)
     first = next(iter(scenes.values()))  # of the clean scan
     shape = np.min([volume.shape for volume, _ in found.values()], 0)
     truth = middle(first['truth'], shape)
@@ -106,7 +103,7 @@ def measure(name: str, parameters: dict | None = None, settings: Any = SETTINGS,
         title=experiment.title,
         largest=float(first['clean'].projections.max()),
         truth=truth,
-        spacing=list(first['clean'].geometry.dVoxel),
+        spacing=list(first['clean'].geometry.grid.spacing),
         **fits,
     )
 
@@ -121,7 +118,7 @@ def scans(name: str, parameters: dict, seed: int) -> dict:
     if experiment.turn or experiment.shift:
         moved = misaligned(scan.geometry, experiment.turn, experiment.shift, seed)
         scan = Scan(scan.geometry, render_objects(objects, moved))
-    effects: Any = scan.effects
+    effects = effects_of(scan)
     if effects and effects.scatter:  # a fit must not know the random numbers of its data, and may be quicker
         scatter = replace(effects.scatter, paths=-(-effects.scatter.paths // 4), seed=effects.scatter.seed + 1)
         scan = replace(scan, effects=replace(effects, scatter=scatter))
@@ -140,7 +137,7 @@ def misaligned(geometry: Geometry, turn: float, shift: float, seed: int) -> Geom
     turns, shifts = np.random.default_rng(seed).normal(size=(2, len(geometry), 3))
     turns, shifts = np.radians(turn) * (turns - turns.mean(0)), shift * (shifts - shifts.mean(0))
     rays = geometry.rays().moved(Rotation.from_rotvec(turns).as_matrix(), shifts)
-    return Geometry.from_poses(rays, geometry.nDetector, geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+    return Geometry.from_poses(rays, geometry.nDetector, grid=geometry.grid)
 
 
 def quality(volume: np.ndarray, truth: np.ndarray) -> dict:

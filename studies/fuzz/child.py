@@ -18,8 +18,6 @@ from random import Random
 from lingo_mi.common.errors import InputError
 from lingo_mi.studies.fuzz.readers import case, reader, write
 
-LONGEST = 300  # characters of a message
-
 
 def verdict(name: str, folder: Path, rng: Random) -> str:
     """What a reader makes of one case, whose files are written below `folder`."""
@@ -46,8 +44,8 @@ def outcome(call) -> str:
         return 'value'
     except InputError as error:
         text = str(error)
-        if len(text) >= LONGEST or len(text.splitlines()) != 1:
-            return f'message of {len(text)} characters in {len(text.splitlines())} lines: {text[:200]!r}'
+        if not text.isprintable() or len(text.splitlines()) != 1:
+            return f'message of {len(text.splitlines())} lines: {text[:200]!r}'
         return 'refused'
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]

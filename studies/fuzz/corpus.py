@@ -302,42 +302,40 @@ def others() -> dict[str, list[Sample]]:
 
 
 def _checkpoints():
-    """As it is written, with a checksum, and as earlier versions wrote it, without: there a mutation gets further."""
-    from lingo_mi.fitting.models import forward_model
-    from lingo_mi.fitting.settings import Settings
+    """As it is written, and as entries that get a right checksum after they are mutated: there a mutation gets further."""
+    from lingo_mi.fitting.checkpoint import Checkpoint
+    from lingo_mi.fitting.methods.lingo import LINGO
+    from lingo_mi.fitting.start.start import StartingCloud
     from lingo_mi.geometry.base import Geometry
-    from lingo_mi.scene.description import describe
 
     geometry = Geometry.cone(DSO=10, DSD=15, nDetector=4, dDetector=1, nVoxel=4, dVoxel=1, angles=np.arange(3) / 2)
-    extra = dict(
-        seed=0, rng=np.random.default_rng(0).bit_generator.state, iteration=7, seconds=1.5, info={}, settings={}, unit=1.0,
-        history=[dict(iteration=7, seconds=1.0, loss=0.5, gaussians=5)], effects=False, views=3, scanner=describe(geometry),
-        signal=0.5,
+    method = LINGO().changed(average=0.5)
+    state = method.starting_state(StartingCloud(np.full((5, 3), 0.5), np.ones(5), np.full(5, 0.1)), 1.0)
+    arrays = {'initial': np.ones((5, 3), np.float32), 'order': np.arange(3)}
+    arrays |= {f'average.{name}': value for name, value in state.values.items()}
+    checkpoint = Checkpoint(
+        method, geometry, 1.0, state, arrays, seed=0, rng=dict(np.random.default_rng(0).bit_generator.state), iteration=7,
+        seconds=1.5, history=[dict(iteration=7, seconds=1.0, loss=0.5, gaussians=5)], info={},
+        scan=dict(views=3, signal=0.5, moments=[0.25, 0.25, 0.25], valid=None, effects=None), effects=False, search=None,
+        seen=3,
     )  # fmt: skip
-    sizes = forward_model(Settings()).parameters.items()
-    groups = ('values', 'first', 'second', *(['array.average'] if Settings().adam.average > 0 else []))
-    arrays = {f'{group}.{name}': np.full((5, size), 0.5, np.float32) for group in groups for name, size in sizes}
-    arrays |= dict(gradient=np.zeros(5, np.float32), seen=np.ones(5, np.float32), born=np.zeros(5, bool))
-    arrays |= {'array.initial': np.ones((5, 3), np.float32), 'array.order': np.arange(3)}
-    before = Structured(arrays | dict(extra=extra), _checkpoint)
-    return [Sample('c.npz', {'c.npz': before}), Sample('c.npz', {'c.npz': _checkpoint(before.data, checksum=True)})]
-
-
-def _checkpoint(data: dict, checksum: bool = False) -> bytes:
-    from lingo_mi.fitting.checkpoint import save
-    from lingo_mi.fitting.state import State
-
-    if not checksum:
-        return npz(data | dict(extra=np.array(json.dumps(data.get('extra'), default=_listed))))
-    groups = (
-        {name[len(group) + 1 :]: array for name, array in data.items() if name.startswith(group + '.')}
-        for group in ('values', 'first', 'second')
-    )
-    state = State(*groups, gradient=data['gradient'], visits=data['seen'], born=data['born'])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'c.npz')
-        save(path, state, data['extra'], {name[6:]: array for name, array in data.items() if name.startswith('array.')})
-        return path.read_bytes()
+        checkpoint.save(path)
+        written, entries = path.read_bytes(), dict(np.load(path))
+    del entries['checksum']
+    entries['extra'] = json.loads(str(entries['extra']))
+    return [Sample('c.npz', {'c.npz': Structured(entries, _checkpoint)}), Sample('c.npz', {'c.npz': written})]
+
+
+def _checkpoint(entries: dict) -> bytes:
+    """The file of these entries, with a right checksum."""
+    from lingo_mi.fitting.checkpoint import checksum_of
+
+    entries = entries | dict(extra=np.array(json.dumps(entries.get('extra'), default=_listed)))
+    members = {name: npy(value) for name, value in entries.items()}
+    checksum = checksum_of((name, zlib.crc32(content)) for name, content in members.items())
+    return zipped({f'{name}.npy': content for name, content in (members | dict(checksum=npy(checksum))).items()})
 
 
 SCENE = b"""<scene version="3.0.0">

@@ -33,7 +33,7 @@ def page(tallies: dict[str, Tally], seed: int, wall: float, seconds: float, memo
 
 Written by `lingo-mi fuzz --markdown FILE` with the seed {seed} on {date}: {total} files, each a good one with some mutations, in
 {wall:.0f} s. A case fails where its reader crashes, takes more than {seconds:g} s or {memory / 2**30:g} GiB, raises anything but
-an `InputError` of one line under 300 characters, or returns numbers that are not finite. {failed} failed. *Read*: the mutation
+an `InputError` of one printable line, or returns numbers that are not finite. {failed} failed. *Read*: the mutation
 left a file that makes sense.
 
 {rows}

@@ -88,9 +88,11 @@ def _exr(path: Path, rng: Random) -> None:
 
 
 def _checkpoint(path: Path, rng: Random) -> None:
-    from lingo_mi.fitting import checkpoint
+    from lingo_mi.fitting.checkpoint import Checkpoint
 
-    checkpoint.load(path)
+    stored = Checkpoint.load(path)
+    for values in stored.state.values.values():
+        _finite(values, 2, np.float32)
 
 
 def _scene(path: Path, rng: Random) -> None:

@@ -72,40 +72,36 @@ def _scan(size: Size):
     return Scan(g, np.broadcast_to(ball.astype(np.float32), (size.views, size.pixels, size.pixels)).copy())
 
 
-def _settings(size: Size):
-    from lingo_mi.fitting.recipes import settings_of
+def _method(size: Size):
+    from lingo_mi.fitting.methods.fast import Fast
 
-    return settings_of('fast', n_points=size.gaussians, values_per_gaussian=0)
+    return Fast().changed(n_points=size.gaussians, values_per_gaussian=0)
 
 
-def _fitted(size: Size):
-    """A cloud as `fast` has it in its course, whose Gaussians fill half of the volume, at two spacings a standard deviation."""
-    from lingo_mi.fitting.bounded import bounded
-    from lingo_mi.fitting.state import start
+def _state(size: Size):
+    """A method, and a state as in the course of a fit: Gaussians fill half of the volume, two spacings a standard deviation."""
+    from lingo_mi.fitting.start.start import StartingCloud
 
     rng = np.random.default_rng(0)
     n = size.gaussians
     points = rng.uniform(-0.8, 0.8, (n, 3)).astype(np.float32)
-    spacing = np.full(n, 0.6 * 1.6 / n ** (1 / 3), np.float32)
-    settings = bounded(_settings(size), _scan(Size(size.voxels, size.pixels, 1, 1)))
-    return start(points, spacing, np.full(n, 0.3, np.float32), settings), settings, points
+    cloud = StartingCloud(points, np.full(n, 0.3, np.float32), np.full(n, 0.6 * 1.6 / n ** (1 / 3), np.float32))
+    method = _method(size).bounded(_scan(Size(size.voxels, size.pixels, 1, 1)))
+    return method, method.starting_state(cloud, 1.0)
 
 
 def _initialise(size: Size):
-    from lingo_mi.fitting.initial import initial_cloud
-
-    scan, settings = _scan(size), _settings(size)
-    return lambda: initial_cloud(scan, settings, 0)
+    scan, method = _scan(size), _method(size)
+    return lambda: method.starting_cloud(scan)
 
 
 def _step(size: Size):
     import drjit as dr
 
     from lingo_mi.fitting.device_state import DeviceState
-    from lingo_mi.fitting.step import Stepper
 
-    host, settings, _ = _fitted(size)
-    stepper, state, rng = Stepper(_scan(size), settings), DeviceState(host), np.random.default_rng(0)
+    method, host = _state(size)
+    stepper, state, rng = method.stepper(_scan(size)), DeviceState(host), np.random.default_rng(0)
     done = iter(range(10**9))
 
     def step():
@@ -119,30 +115,25 @@ def _step(size: Size):
 
 
 def _voxelise(size: Size):
-    from lingo_mi.fitting.fitted import Fitted
+    from lingo_mi.fitting.device_state import DeviceState
 
-    return _as_fitted(size, Fitted).volume
-
-
-def _as_fitted(size: Size, kind):
-    from lingo_mi.fitting.cloud_model import CloudModel
-
-    host, settings, points = _fitted(size)
-    return kind(CloudModel(settings, _geometry(size), 1.0), host, points, info=dict(seconds=0.0))
+    method, host = _state(size)
+    model = method.model(_geometry(size), 1.0)
+    return lambda: model.volume(DeviceState(host))
 
 
 def _fdk(size: Size):
-    from lingo_mi.reconstruction import FDK
+    from lingo_mi.reconstruction import FDK, run_algorithm
 
     scan = _scan(size)
-    return lambda: FDK().run(scan)
+    return lambda: run_algorithm(scan, FDK())
 
 
 def _sart(size: Size):
-    from lingo_mi.reconstruction import SART
+    from lingo_mi.reconstruction import SART, run_algorithm
 
     scan = _scan(size)
-    return lambda: SART(niter=1).run(scan)
+    return lambda: run_algorithm(scan, SART(niter=1))
 
 
 def _measure(size: Size):
@@ -165,17 +156,35 @@ def _save(size: Size):
     """Volume, cloud and checkpoint; the report is drawn from what it needs, which does not grow with the scan."""
     from lingo_mi.files.ply import write_ply
     from lingo_mi.files.volumes import write_volume
-    from lingo_mi.fitting import checkpoint
-    from lingo_mi.fitting.fitted import Fitted
+    from lingo_mi.fitting.checkpoint import Checkpoint
+    from lingo_mi.fitting.device_state import DeviceState
 
-    fitted, g = _as_fitted(size, Fitted), _geometry(size)
+    (method, host), g = _state(size), _geometry(size)
+    model = method.model(g, 1.0)
+    checkpoint = Checkpoint(
+        method,
+        g,
+        unit=1.0,
+        state=host,
+        arrays={},
+        seed=0,
+        rng={},
+        iteration=0,
+        seconds=0.0,
+        history=[],
+        info={},
+        scan={},
+        effects=False,
+        search=None,
+        seen=len(g),
+    )
     volume = np.random.default_rng(0).random((size.voxels,) * 3, np.float32)
 
     def save():
         with tempfile.TemporaryDirectory() as folder:
-            write_volume(Path(folder) / 'volume.nii.gz', volume, g.dVoxel)
-            write_ply(Path(folder) / 'gaussians.ply', *fitted.world_gaussians())
-            checkpoint.save(Path(folder) / 'fit.npz', fitted.state, {})
+            write_volume(Path(folder) / 'volume.nii.gz', volume, g.grid)
+            write_ply(Path(folder) / 'gaussians.ply', *model.gaussians(DeviceState(host)))
+            checkpoint.save(Path(folder) / 'fit.npz')
 
     return save
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.studies.hard_cases.kinds import ViewCase
 from lingo_mi.studies.oracle import Cloud, random_cloud
@@ -36,9 +36,7 @@ def scanner(
     changes   to the `Geometry`
     """
     pixel = [s / n for s, n in zip(size, shape)]
-    settings = dict(
-        DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, nVoxel=8, dVoxel=0.25, angles=np.radians([angle])
-    )
+    settings = dict(DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, grid=Grid(8, 0.25), angles=np.radians([angle]))
     return CircularGeometry(**{**settings, 'mode': mode, **changes}).rays(), shape
 
 

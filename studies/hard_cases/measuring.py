@@ -31,7 +31,7 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 from lingo_mi.studies import oracle
 from lingo_mi.studies.closed_form import NAMES, rays_and_gradients
 from lingo_mi.studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
@@ -201,7 +201,7 @@ def _measure_voxels(case):
     points = case.corner + (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) * case.step
     weights, gaussians = weights_of((nz * ny, nx)), on_device(case.cloud)
     dr.enable_grad(gaussians)
-    density = voxelize(*gaussians, Grid(vector64(case.corner), vector64(case.step), case.shape), EXTENT)
+    density = voxelize(*gaussians, Lattice(vector64(case.corner), vector64(case.step), case.shape), EXTENT)
     dr.backward(dr.sum(density * mi.Float(weights.tolist())))
     gradients = {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)}
     return errors(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.loop import run as fit
-from lingo_mi.fitting.recipes import FAST
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.methods.fast import Fast
+from lingo_mi.fitting.start.start import Render, Start, StartingCloud
 from lingo_mi.fitting.state import activate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.scan import Scan
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases.kinds import ScanCase
@@ -31,23 +32,28 @@ def measured(angles: ArrayLike, shape: tuple[int, int] = (24, 24)) -> Scan:
     return Scan(geometry, np.reshape(images, (-1, *shape)))
 
 
-def points(n: int = 50) -> InitialCloud:
-    """An initial cloud, some of it in pairs and a tenth all at one place."""
-    rng = np.random.default_rng(10)
-    centre = rng.uniform(-0.6, 0.6, (n, 3))
-    centre[n // 2 : n // 2 + n // 5] = centre[: n // 5]
-    centre[-(n // 10) :] = 0
-    return InitialCloud(centre, np.full(n, 0.2), np.full(n, 0.1))
+@dataclass(frozen=True)
+class Coincident(Start):
+    """50 Gaussians, some of them in pairs and a tenth all at one place."""
+
+    name: ClassVar = 'coincident'
+
+    def cloud(self, scan: Scan, rng: np.random.Generator, render: Render, unit: float) -> StartingCloud:
+        n, rng = 50, np.random.default_rng(10)
+        centre = rng.uniform(-0.6, 0.6, (n, 3))
+        centre[n // 2 : n // 2 + n // 5] = centre[: n // 5]
+        centre[-(n // 10) :] = 0
+        return StartingCloud(centre, np.full(n, 0.2), np.full(n, 0.1))
 
 
-def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fitted:
-    """A fit that densifies often, as `fitting.loop.run` returns it.
+def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fit:
+    """A fit that densifies often.
 
-    changes   to its settings
+    changes   to its options
 
     Raises FloatingPointError unless it ends finite and within its bounds.
     """
-    settings = FAST.changed(
+    method = replace(Fast(), start=Coincident()).changed(
         **{
             **dict(
                 iterations=iterations,
@@ -62,8 +68,9 @@ def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fitted:
             **changes,
         }
     )
-    done = fit(scan, settings, points(), seed=1)
-    centre, scale, rotation, density = activate(done.state, done.settings)
+    done = run(scan, method, seed=1)
+    assert isinstance(done.method, Fast)
+    centre, scale, rotation, density = activate(done.state, done.method.forward)
     moments = (x for moment in (done.state.first, done.state.second) for x in moment.values())
     finite = dict(
         Gaussians=(centre, scale, rotation, density), moments=moments, losses=[h['loss'] for h in done.history]
@@ -74,7 +81,7 @@ def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fitted:
     if not len(density):
         raise FloatingPointError('the fit ends without Gaussians')
     # The sigmoid reaches its bounds where float32 saturates.
-    if scale.min() < done.settings.bounds.scale_min or scale.max() > done.settings.bounds.scale_max:
+    if scale.min() < done.method.bounds.scale_min or scale.max() > done.method.bounds.scale_max:
         raise FloatingPointError(f'the fit ends with scales from {scale.min():g} to {scale.max():g}, out of bounds')
     return done
 

@@ -1,9 +1,9 @@
 """The paper's tables as cells: fits of sparse scans, and reconstructions from completed scans, each stored when it is done.
 
 A cell is one fit, or one CT volume, of one object from one number of views. It is a JSON file, written atomically, in a folder
-named after its recipe and a hash of all settings. A stored cell is not computed again; other settings make another cell. A fit
+named after its method and a hash of all options. A stored cell is not computed again; other options make another cell. A fit
 stores its checkpoint next to it. The checkpoint has three uses: to continue after an interruption, to start the next longer fit
-of the same recipe, and to render the missing views for a CT volume.
+of the same method, and to render the missing views for a CT volume.
 
 Every object is scanned as in X3D's scenes (`phantoms.x3d_scan`): 50 views over half a turn and 50 held-out views. A fit uses a
 few evenly spaced ones of the former. For a CT volume, the fitted views are completed to 100.
@@ -27,17 +27,16 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.interrupts import between_steps
 from lingo_mi.common.progress import Progress
 from lingo_mi.completion.views import insert_views
-from lingo_mi.fitting import checkpoint
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.fit import Fit as Fitted
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.recipes import settings_of
-from lingo_mi.fitting.resume import extensible
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.measure import measure
+from lingo_mi.fitting.method import Method
+from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.metrics import quality as metrics
 from lingo_mi.phantoms.x3d_scan import scan
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Refined, progress_bar
-from lingo_mi.results.measure import measure
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.storage.file_access import replacing
@@ -98,8 +97,8 @@ SCALES = {
 class Fit:
     """A cell: a cloud fitted to some views of an object.
 
-    method       a name of METHODS, or `name:setting=value,...`
-    iterations   Adam steps; None: the recipe's own
+    method       a name of METHODS, or `name:option=value,...`
+    iterations   Adam steps; None: the method's own
     """
 
     object: str
@@ -125,10 +124,12 @@ class Volume:
         return f'{self.fit}, {self.algorithm}'
 
 
-def recipe(fit: Fit, scale: Scale) -> Settings:
-    """The settings of a fit."""
-    settings = settings_of(fit.method, n_points=scale.n_points)
-    return settings if fit.iterations is None else settings.changed(iterations=fit.iterations)
+def method_for(fit: Fit, scale: Scale) -> Method:
+    """The method of a fit, with the scale's number of Gaussians unless the fit names one, or the start has no such option."""
+    method = method_of(fit.method)
+    if 'n_points' in method.flat() and 'n_points=' not in fit.method:
+        method = method.changed(n_points=scale.n_points)
+    return method if fit.iterations is None else method.changed(iterations=fit.iterations)
 
 
 class Cells:
@@ -155,13 +156,13 @@ class Cells:
             if fit.method == 'none':
                 return self.folder_of(fit) / f'{cell.algorithm}_{_hash(of_scan | options)}.json'
             return self.path(fit).parent / f'{cell.algorithm}_{_hash(options)}.json'
-        settings = recipe(fit, self.scale).flat()
+        settings = method_for(fit, self.scale).flat()
         del settings['checkpoint_seconds']
         iterations = settings.pop('iterations')
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
 
     def folder_of(self, fit: Fit) -> Path:
-        """Where all fits of a recipe to an object's views are stored, and the volumes made of them."""
+        """Where all fits of a method to an object's views are stored, and the volumes made of them."""
         if fit.method == 'none':
             return self.folder / fit.object / f'{fit.views}_views' / 'none'
         return self.path(fit).parents[1]
@@ -173,8 +174,7 @@ class Cells:
         except (OSError, ValueError):
             return None
         needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
-        found = metrics.current_names(found) if isinstance(found, dict) else {}
-        return found if found.keys() >= set(needed) else None
+        return found if isinstance(found, dict) and found.keys() >= set(needed) else None
 
     def compute(self, cell: Fit | Volume, label: str, report: Callable[..., None] | None = None) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
@@ -223,11 +223,8 @@ class Cells:
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
             found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
         truth = averaged(scanned, self.scale.size)
-
-        def of_truth(views):
-            return replace(views, geometry=replace(views.geometry, nVoxel=truth.data.shape, dVoxel=truth.spacing))
-
-        return Dataset(self._counted(of_truth(found.train)), of_truth(found.test), truth.data)
+        assert found.test is not None  # of a simulated scan
+        return Dataset(self._counted(found.train.on(truth.grid)), found.test.on(truth.grid), truth.data)
 
     def _counted(self, scan: Scan) -> Scan:
         """The views as the scale's detector measures them."""
@@ -241,12 +238,12 @@ class Cells:
         return choose_views(self.dataset(fit.object), fit.views)
 
     def _fit(self, cell: Fit, path: Path, label: str, report: Callable[..., None] | None = None) -> dict:
-        dataset, settings, saved = self._measured(cell), recipe(cell, self.scale), path.with_name(CHECKPOINT)
+        dataset, method, saved = self._measured(cell), method_for(cell, self.scale), path.with_name(CHECKPOINT)
         if (path.exists() or saved.exists()) and _iterations(saved) is None:
             print(f'{saved}: is missing or damaged, so {cell} is fitted again', file=sys.stderr)
-        self._begin(settings, saved)
-        cloud = initial_cloud(dataset.train, settings, self.seed) if _iterations(saved) is None else None
-        with Progress(label, settings.iterations) as bar, between_steps() as check:
+        self._begin(method, saved)
+        resume = _iterations(saved) is not None
+        with Progress(label, method.iterations) as bar, between_steps() as check:
 
             def progress(iteration, **fields):
                 bar.update(iteration, **fields)
@@ -254,27 +251,26 @@ class Cells:
                 if report is not None:
                     report(iteration)
 
-            fitted = run(dataset.train, settings, cloud, self.seed, None, progress, saved)
-        found = measure(fitted, dataset.test, dataset.volume).numbers
-        return found | dict(method=cell.method, settings=settings.flat(), initial=fitted.info)
+            fitted = run(dataset.train, method, self.seed, progress=progress, path=saved, resume=resume)
+        fitted.data = dataset
+        return measure(fitted) | dict(method=cell.method, settings=method.flat(), initial=fitted.info)
 
-    def _begin(self, settings, saved: Path):
-        """Without a whole checkpoint, copy that of the longest shorter fit of the same recipe, if its steps are ours."""
-        if not extensible(settings) or _iterations(saved) is not None:
+    def _begin(self, method: Method, saved: Path):
+        """Without a whole checkpoint, copy that of the longest shorter fit of the same method, if its steps are ours."""
+        if not method.extensible or _iterations(saved) is not None:
             return
         done = sorted(int(path.parent.name) for path in saved.parents[1].glob('*/fit.json'))
-        shorter = [saved.parents[1] / str(n) / CHECKPOINT for n in done if n < settings.iterations]
+        shorter = [saved.parents[1] / str(n) / CHECKPOINT for n in done if n < method.iterations]
         whole = next((path for path in reversed(shorter) if _iterations(path) is not None), None)
         if whole is not None:
-            with replacing(saved) as temporary:
-                temporary.write_bytes(whole.read_bytes())
+            Checkpoint.load(whole).save(saved)
 
     def _cloud(self, fit: Fit) -> Fitted:
         """A stored fit; without its whole checkpoint, it is fitted again."""
-        settings, saved = recipe(fit, self.scale), self.path(fit).with_name(CHECKPOINT)
-        if _iterations(saved) != settings.iterations:  # fewer where fitting it again was interrupted
+        method, saved = method_for(fit, self.scale), self.path(fit).with_name(CHECKPOINT)
+        if _iterations(saved) != method.iterations:  # fewer where fitting it again was interrupted
             self.compute(fit, f'{fit}, again')
-        return run(self._measured(fit).train, settings, None, self.seed, path=saved)
+        return run(self._measured(fit).train, method, self.seed, path=saved, resume=True)
 
     def _completed(self, fit: Fit) -> Scan:
         """The fitted views, completed from the cloud."""
@@ -293,7 +289,7 @@ class Cells:
             inputs = dict(completed=views, sample=self._cloud(cell.fit).volume)
             views = dataset.train
         with progress_bar(algorithm, views, label) as progress:
-            found = algorithm.run(views, progress=progress, **inputs)
+            found = run_algorithm(views, algorithm, progress=progress, **inputs)
         return dict(
             algorithm=cell.algorithm,
             options=algorithm.options,
@@ -307,7 +303,7 @@ class Cells:
 def _iterations(path: Path) -> int | None:
     """How far the fit of a checkpoint has come, or None where the file is missing or damaged."""
     try:
-        return checkpoint.load(path)[1].get('iteration')
+        return Checkpoint.load(path).iteration
     except InputError:
         return None
 

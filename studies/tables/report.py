@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.fitting.recipes import settings_of
+from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.storage.file_access import replacing
 from lingo_mi.studies.provenance import write_provenance
 from lingo_mi.studies.tables import paper
@@ -34,7 +34,7 @@ LABELS = dict(
 _PAPER_IS = "The rows `paper` hold the paper's means over the 15 scenes of X3D."
 NOTES = dict(
     views=f'PSNR in dB and SSIM of the 50 views held out, each view divided by its own maximum; IPSD with the longest side as '
-    f'2. A recipe whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
+    f'2. A method whose rates fall over the run (`fast`) keeps its own number of iterations. {_PAPER_IS}',
     ct=f'3D PSNR in dB and SSIM of volumes from the measured views (`none`) and from 100 views, the missing ones rendered from '
     f'the cloud of each method; `voxelize` samples that cloud itself, and `refined` starts there, with a pass over all views '
     f'and then passes over the measured ones (`finer`: the latter alone, on voxels of half the size, whose means it gives); all '
@@ -124,15 +124,15 @@ def groups(
 
 
 def _fit(views, method, iterations):
-    """The cell of an object; a recipe whose rates fall over the run keeps its own iterations."""
-    if settings_of(method).decay_steps == 0:
+    """The cell of an object; a method whose rates fall over the run keeps its own iterations."""
+    if method_of(method).rates.decay_steps == 0:
         iterations = None
     return lambda name: Fit(name, views, method, iterations)
 
 
 def _volume(views, method, iterations, algorithm):
     """The cell of an object; of the volume that a fit samples itself, the fit."""
-    if algorithm in ('voxelize', 'refined', 'finer') and (method == 'none' or not settings_of(method).volumetric):
+    if algorithm in ('voxelize', 'refined', 'finer') and (method == 'none' or not method_of(method).makes_volume):
         return lambda name: None  # neither measured views nor opacities are a volume to begin with
     if method == 'none':
         return lambda name: Volume(Fit(name, views, 'none'), algorithm)

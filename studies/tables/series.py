@@ -11,7 +11,7 @@ from lingo_mi.jobs.job import Event, Job, Runner, run_all
 from lingo_mi.storage.file_access import leftovers
 from lingo_mi.storage.folder_lock import locked
 from lingo_mi.studies.provenance import command
-from lingo_mi.studies.tables.cells import Cells, Fit, Scale, Volume, recipe
+from lingo_mi.studies.tables.cells import Cells, Fit, Scale, Volume, method_for
 
 
 def compute_missing(
@@ -49,7 +49,7 @@ def compute_missing(
 
 def steps_of(scale: Scale) -> Callable[[Fit | Volume], int]:
     """A function that gives the steps of a cell's work, for the progress."""
-    return lambda cell: recipe(cell, scale).iterations if isinstance(cell, Fit) else 1
+    return lambda cell: method_for(cell, scale).iterations if isinstance(cell, Fit) else 1
 
 
 def compute_series(

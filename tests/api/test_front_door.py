@@ -1,5 +1,6 @@
 """`import lingo_mi as lm`: what it names, what it loads, and a fit from nothing to files and back."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.same import assert_same
-from lingo_mi.files.volumes import first_voxel, read_volume
+from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import circular
 from lingo_mi.metrics.quality import psnr_3d
 
@@ -65,6 +66,11 @@ def test_names():
         lm.nothing  # noqa: B018 - the look-up is the test
 
 
+def test_editors_read_the_same_names():
+    (listing,) = (node for node in ast.parse(Path(lm.__file__).read_text('utf-8')).body if isinstance(node, ast.If))
+    assert {name.name: line.module for line in listing.body for name in line.names} == lm._PUBLIC
+
+
 def test_import_is_light():
     """Importing the package loads Mitsuba and nothing heavy besides, and sets no variant."""
     code = (
@@ -113,17 +119,17 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.simulate(np.zeros((20, 20, 20)), g, parameters=dict(views=3)), 'parameters'),
         (lambda g: lm.phantom('hand'), 'no phantom'),
         (lambda g: lm.load('missing.pickle'), 'no such file'),
-        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fastest'), 'no such recipe'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fastest'), "there is no method 'fastest'"),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'n_pints'),
-        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), resume=True), 'checkpoint'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), resume=True), 'give folder=FOLDER'),
         (lambda g: lm.fit(lm.Scan(g, np.zeros((10, 24, 30)))), 'zero everywhere'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), 'fast', n_pints=3), 'did you mean n_points'),
-        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), None), 'recipe must be a str or a Settings, not NoneType'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), None), 'method must be a str or a Method, not NoneType'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), seed=1.5), 'seed must be a whole number'),
         (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), iterations=2.5), 'iterations must be a whole number'),
-        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), checkpoint=3), 'checkpoint must be a path, not int'),
-        (lambda g: lm.load_result('missing'), 'missing: there is no result here'),
-        (lambda g: lm.load_result(g), 'path must be a path'),
+        (lambda g: lm.fit(lm.Scan(g, np.ones((10, 24, 30))), folder=3), 'folder must be a path, not int'),
+        (lambda g: lm.load_fit('missing'), 'missing: there is no fit here'),
+        (lambda g: lm.load_fit(g), 'path must be a path'),
         (lambda g: lm.load('scan.npy', g), 'geometry must be the path of a geometry file, not CircularGeometry'),
         (lambda g: lm.load('scan.npy', views=0), 'views must be a whole number from 1 on, not 0'),
         (lambda g: lm.load(None), 'path must be a path'),
@@ -139,7 +145,7 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.simulate(VOLUME - 0.6, g), 'Hounsfield units by'),
         (
             lambda g: lm.reconstruct(lm.Scan(g, np.ones((10, 24, 30))), lm.SART(), start='out/x'),
-            "lm.load_result\\('out/x'",
+            "lm.load_fit\\('out/x'",
         ),
         (
             lambda g: lm.reconstruct(lm.Scan(g, np.ones((10, 24, 30))), lm.SART(), start={}),
@@ -152,7 +158,7 @@ def test_simulate_a_scene_and_a_phantom():
         (lambda g: lm.Scan(g, np.ones((10, 24, 30))).subset([99]), 'from 0 to 9, not by'),
         (lambda g: g.subset([-11]), 'from 0 to 9, not by'),
         (lambda g: lm.Scan(g, np.ones((10, 24, 30))).binned(2.5), 'binning of pixels must be a whole number'),
-        (lambda g: g.slabs(2.5), 'thickness of a slab, in slices, must be a whole number'),
+        (lambda g: g.grid.slabs(2.5), 'thickness of a slab, in slices, must be a whole number'),
         (lambda g: lm.project(*np.ones((4, 3)), {}), 'geometry must be a Geometry, not dict'),
         (lambda g: lm.project(*np.ones((4, 3)), g, extent='3'), 'extent is in standard deviations, from 1 to 20'),
     ],
@@ -179,7 +185,7 @@ def test_result(result, data):
     'call, message',
     [
         (lambda r: r.render('x'), 'geometry must be a Geometry, not str'),
-        (lambda r: r.volume((64, 64, 64)), 'geometry must be a Geometry, not tuple'),
+        (lambda r: r.volume((64, 64, 64)), 'grid must be a Grid, not tuple'),
         (lambda r: r.metrics(VOLUME), 'data must be a Dataset, not ndarray'),
         (lambda r: r.save(3), 'folder must be a path, not int'),
     ],
@@ -194,18 +200,33 @@ def test_undershoots_are_no_hounsfield_units(geometry):
 
 
 def test_where_nothing_can_be_written(result, data, tmp_path, monkeypatch):
-    """A file where a folder is needed, and a folder where a file is: one line, for a fit before it starts."""
+    """A file where a folder is needed: one line, for a fit before it starts."""
     (tmp_path / 'file').write_text('')
-    monkeypatch.setattr('lingo_mi.results.watched_fit.initial_cloud', None)
-    for path in tmp_path / 'file' / 'fit.npz', tmp_path / 'file' / 'folder' / 'fit.npz', tmp_path:
-        with pytest.raises(lm.InputError, match='cannot write there|is a folder|cannot be written') as caught:
-            lm.fit(data, checkpoint=path, progress=False, **TINY)
-        assert '\n' not in str(caught.value)
-    for folder in tmp_path / 'file', tmp_path / 'file' / 'folder':
-        with pytest.raises(lm.InputError, match='cannot be written') as caught:
-            result.save(folder)
-        assert '\n' not in str(caught.value)
+    monkeypatch.setattr('lingo_mi.api.fitting.run', None)
+    for write in lambda folder: lm.fit(data, folder=folder, progress=False, **TINY), result.save:
+        for folder in tmp_path / 'file', tmp_path / 'file' / 'folder':
+            with pytest.raises(lm.InputError, match='cannot write there|is a file|cannot be written') as caught:
+                write(folder)
+            assert '\n' not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ['file']
+
+
+@pytest.mark.parametrize('name', ['checkpoint.npz', 'metrics.json', 'volume.nii.gz', 'notes.txt'])
+def test_a_fit_overwrites_nothing(data, tmp_path, monkeypatch, name):
+    """Neither without force=True, nor with it what is of another program, or where a link leads."""
+    monkeypatch.setattr('lingo_mi.api.fitting.run', None)
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out' / name).write_text('mine')
+    (tmp_path / 'linked').mkdir()
+    (tmp_path / 'linked' / name).symlink_to(tmp_path / 'out' / name)
+    for folder in tmp_path / 'out', tmp_path / 'linked':
+        for options in {}, dict(force=True), dict(resume=True):
+            if name == 'notes.txt' and options:
+                continue
+            with pytest.raises(lm.InputError, match='give |move it away|run without resume=True') as caught:
+                lm.fit(data, folder=folder, progress=False, **options, **TINY)
+            assert '\n' not in str(caught.value)
+    assert (tmp_path / 'out' / name).read_text() == 'mine' and len([*tmp_path.rglob('*')]) == 4
 
 
 def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
@@ -217,8 +238,8 @@ def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
     path = found.save(tmp_path / 'new' / 'foot.nii.gz')
     stored = read_volume(path)
     np.testing.assert_array_equal(stored.data, found.volume)
-    np.testing.assert_allclose(stored.spacing, data.train.geometry.dVoxel)
-    np.testing.assert_allclose(stored.affine[:3, 3], first_voxel(data.train.geometry))
+    np.testing.assert_allclose(stored.spacing, data.train.geometry.grid.spacing)
+    np.testing.assert_allclose(stored.affine[:3, 3], data.train.geometry.grid.first_voxel)
     with pytest.raises(lm.InputError, match='force=True'):
         found.save(path)
     assert found.save(str(path), force=True) == path
@@ -231,9 +252,9 @@ def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
 
 def test_the_cloud_by_function(result, data):
     """`lm.project` and `lm.voxelize` of the result's Gaussians are what the result renders."""
-    views = lm.project(*result.gaussians, data.test.geometry, extent=result.settings.model.extent)
+    views = lm.project(*result.gaussians, data.test.geometry, extent=result.method.extent)
     np.testing.assert_allclose(views, result.render(data.test.geometry), atol=2e-4 * views.max())
-    grid = lm.voxelize(*result.gaussians, data.train.geometry, extent=result.settings.model.extent)
+    grid = lm.voxelize(*result.gaussians, data.train.geometry, extent=result.method.extent)
     np.testing.assert_allclose(grid, result.volume(), atol=2e-4 * grid.max())
 
 
@@ -243,40 +264,64 @@ def test_save_and_load(result, data, tmp_path):
     assert {'volume.nii.gz', 'gaussians.ply', 'result.xml', 'metrics.json', 'report.html', 'checkpoint.npz'} <= written
     with pytest.raises(lm.InputError, match='force'):
         result.save(folder)
-    again = lm.load_result(folder)
+    again = lm.load_fit(folder)
     np.testing.assert_allclose(again.volume(), result.volume(), atol=1e-6)
     np.testing.assert_allclose(again.render(data.test.geometry), result.render(data.test.geometry), atol=1e-4)
     assert set(result.metrics()) <= set(again.metrics())
     assert again.metrics()['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'])
     assert again.metrics(data)['psnr_3d'] == pytest.approx(result.metrics()['psnr_3d'], abs=1e-4)
-    assert len(lm.load_result(folder / 'checkpoint.npz')) == len(result)
+    assert len(lm.load_fit(folder / 'checkpoint.npz')) == len(result)
     for copy in tmp_path / 'copy', folder:  # the truth is gone, its numbers are not
         again.save(copy, force=True)
-        kept = lm.load_result(copy).metrics()
+        kept = lm.load_fit(copy).metrics()
         for name in 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d':
             assert kept[name] is not None and kept[name] == again.metrics()[name], name
     for damaged in '[]', '{':
         (folder / 'metrics.json').write_text(damaged)
         with pytest.raises(lm.InputError, match='metrics.json: is damaged'):
-            lm.load_result(folder)
+            lm.load_fit(folder)
 
 
-def test_checkpoint_and_resume(data, tmp_path, sums_in_order):
-    path = tmp_path / 'fit.npz'
+def test_a_folder_and_resume(data, tmp_path, sums_in_order):
+    folder = tmp_path / 'fit'
     short = TINY | dict(iterations=6)
-    # Recipes whose rates fall over fixed steps can go on to more iterations: the same as in one go.
-    lm.fit(data.train, 'r2', checkpoint=path, progress=False, **short)
+    # Methods whose rates fall over fixed steps can go on to more iterations: the same as in one go.
+    lm.fit(data, 'r2', folder=folder, progress=False, **short)
     with pytest.raises(lm.InputError, match='resume=True'):
-        lm.fit(data.train, 'r2', checkpoint=path, progress=False, **short)
-    longer = lm.fit(data.train, 'r2', checkpoint=path, resume=True, progress=False, **TINY)
-    direct = lm.fit(data.train, 'r2', progress=False, **TINY)
+        lm.fit(data, 'r2', folder=folder, progress=False, **short)
+    longer = lm.fit(data, 'r2', folder=folder, resume=True, progress=False, **TINY)
+    direct = lm.fit(data, 'r2', progress=False, **TINY)
     np.testing.assert_allclose(longer.volume(), direct.volume(), atol=1e-6)
+    loaded = lm.load_fit(folder)
+    assert loaded.metrics()['psnr_3d'] == longer.metrics()['psnr_3d']
+    np.testing.assert_array_equal(loaded.volume(), longer.volume())
+    with pytest.raises(lm.InputError, match='other values of seed'):
+        lm.fit(data, 'r2', seed=1, folder=folder, resume=True, progress=False, **TINY)
+    again = lm.fit(data, 'r2', seed=1, folder=folder, force=True, progress=False, record=dict(command='x'), **short)
+    assert lm.load_fit(folder).record['command'] == 'x' and lm.load_fit(folder).steps == again.steps == 6
+
+
+def test_a_fit_that_is_stopped_goes_on(data, tmp_path, sums_in_order):
+    def stop(iteration, **_):
+        if iteration == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        lm.fit(data, 'fast', folder=tmp_path, progress=stop, **TINY)
+    assert {path.name for path in tmp_path.iterdir()} == {'checkpoint.npz', '.lingo_mi.json'}
+    assert lm.load_fit(tmp_path / 'checkpoint.npz').steps == 5
+    with pytest.raises(lm.InputError, match='a result was not completed here'):
+        lm.load_fit(tmp_path)
+    with pytest.raises(lm.InputError, match='holds a fit that was not completed; give resume=True'):
+        lm.fit(data, 'fast', folder=tmp_path, progress=False, **TINY)
+    resumed = lm.fit(data, 'fast', folder=tmp_path, resume=True, progress=False, **TINY)
+    np.testing.assert_allclose(resumed.volume(), lm.fit(data, 'fast', progress=False, **TINY).volume(), atol=1e-6)
 
 
 def test_records_are_printed_by_shape_not_by_values(data):
     plain = lm.reconstruct(data.train, lm.SIRT(niter=6), progress=False)
     assert 'projections=float32[' in repr(data.train) and 'volume=float32[20, 20, 20]' in repr(data)
-    assert 'residuals=[1.0, ..., ' in repr(plain) and 'angles=float64[' in repr(plain)
+    assert 'residuals=[1.0, ..., ' in repr(plain) and 'angles=float64[' in repr(data.train.geometry)
     assert 'valid' not in repr(data.train)
     assert max(len(repr(x)) for x in (data.train, data, plain, lm.phantom('shepp_logan', size=8))) < 1000
 
@@ -296,6 +341,53 @@ def test_reconstruct(data, result):
             lm.reconstruct(data.train, algorithm, start=start, progress=False)
 
 
+def test_reconstruct_into_a_file(data, result, tmp_path):
+    """Whole or in slabs: the same volume, and nothing is left beside it."""
+    for name, algorithm, options in (
+        ('sart', lm.SART(niter=2), {}),
+        ('fdk', lm.FDK(), dict(start=result, views=12)),
+        ('best', lm.Best(niter=1, finer=1), {}),
+    ):
+        whole = lm.reconstruct(data, algorithm, out=tmp_path / f'{name}.nii', progress=False, **options)
+        np.testing.assert_array_equal(read_volume(tmp_path / f'{name}.nii').data, whole.volume)
+        if name != 'best':
+            path = lm.reconstruct(data, algorithm, out=str(tmp_path / 's.nii'), slab=7, progress=False, **options)
+            np.testing.assert_allclose(read_volume(path).data, whole.volume, atol=1e-5 * whole.volume.max())
+            path.unlink()
+    written = {'sart.nii', 'fdk.nii', 'best.nii', 'best-plan.json', 'best-error.nii'}
+    assert {path.name for path in tmp_path.iterdir()} == written
+
+
+@pytest.mark.parametrize(
+    'algorithm, options, message',
+    [
+        (lm.SART(), dict(slab=4), 'give out=FILE'),
+        (lm.SART(), dict(slab=0, out='v.nii'), 'slab must be a whole number from 1 on'),
+        (lm.CGLS(), dict(slab=4, out='v.nii'), 'cgls needs the whole volume'),
+        (lm.SART(), dict(slab=4, out='v.nii', start=VOLUME), 'leave out start, or slab'),
+        (lm.SART(), dict(views=20), 'give the fit as start'),
+        (lm.SART(), dict(views=20, start=VOLUME), 'give the fit as start'),
+        (lm.Best(), dict(start=VOLUME), 'leave out start'),
+        (lm.SART(), dict(out='v.npy'), 'ends in .nii'),
+        (lm.SART(), dict(out='there.nii'), 'force=True'),
+        (lm.SART(), dict(out='folder.nii', force=True), 'is a folder'),
+        (lm.Best(), dict(out='best.nii'), 'best-plan.json: exists already'),
+        (lm.SART(), dict(out='/proc/v.nii'), 'cannot write'),
+        ('sart', {}, 'an object such as lm.SART'),
+    ],
+)
+def test_reconstruct_refuses_before_it_works(data, tmp_path, monkeypatch, algorithm, options, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr('lingo_mi.api.volumes.run_algorithm', None)
+    monkeypatch.setattr('lingo_mi.api.volumes.run_in_slabs', None)
+    (tmp_path / 'folder.nii').mkdir()
+    for name in 'there.nii', 'best-plan.json':
+        (tmp_path / name).write_text('mine')
+    with pytest.raises(lm.InputError, match=message):
+        lm.reconstruct(data, algorithm, progress=False, **options)
+    assert len([*tmp_path.iterdir()]) == 3 and (tmp_path / 'there.nii').read_text() == 'mine'
+
+
 def test_examples_of_the_docstrings_name_what_exists():
     text = Path(lm.__file__).read_text(encoding='utf-8').split('"""')[1]
     used = {word.split('(')[0] for line in text.splitlines() for word in line.split() if word.startswith('lm.')}
@@ -308,11 +400,11 @@ def test_a_result_with_modelled_effects_is_loaded(tmp_path):
     data = lm.simulate('effects/focal_spot', views=6, parameters=sizes, progress=False)
     result = lm.fit(data, 'fast', iterations=5, n_points=100, progress=False)
     result.save(tmp_path / 'out')
-    again = lm.load_result(tmp_path / 'out')
+    again = lm.load_fit(tmp_path / 'out')
     assert_same(again.volume(), result.volume())
     np.testing.assert_allclose(again.render(data.train.geometry), result.render(data.train.geometry), atol=1e-5)
     with pytest.raises(lm.InputError, match='load the folder of its result'):
-        lm.load_result(tmp_path / 'out' / 'checkpoint.npz')
+        lm.load_fit(tmp_path / 'out' / 'checkpoint.npz')
 
 
 @pytest.mark.parametrize('change', [dict(dVoxel=16.0), dict(offOrigin=(30.0, 0.0, 0.0))])

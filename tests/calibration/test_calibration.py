@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
-from lingo_mi.api.calibration import Calibration
+from lingo_mi.calibration.calibration import Calibration
 from lingo_mi.calibration.cross_prediction import coarse
 from lingo_mi.calibration.drift import Drift, times
 from lingo_mi.calibration.panel import Panel
@@ -35,7 +35,7 @@ def scanner(views=20, rows=80, mode='cone', flat=False):
 
 def scanned(geometry, data, true):
     """Views by the real panel, with the geometry that is told."""
-    return lm.Scan(geometry, grid.project(data, true.moved(geometry)))
+    return lm.Scan(geometry, grid.project_volume(data, true.moved(geometry)))
 
 
 def in_pixels(calibration, name):
@@ -63,7 +63,7 @@ def test_resampled_views_are_those_of_the_named_panel(true):
     geometry, _ = scanner(3)
     x = np.linspace(-1, 1, SIZE)
     ball = np.exp(-6 * sum(np.square(np.meshgrid(x - 0.2, x, x + 0.1, indexing='ij')))).astype(np.float32)
-    named = grid.project(ball, geometry)
+    named = grid.project_volume(ball, geometry)
     back = true.resampled(scanned(geometry, ball, true))
     valid = np.ones(named.shape, bool) if back.valid is None else back.valid
     assert valid.mean() > 0.8
@@ -262,14 +262,14 @@ def test_a_drift_that_no_view_shows_is_not_found():
     )
     x, y = np.meshgrid(*2 * [np.arange(24) - 11.5], indexing='ij')
     rod = ((np.hypot(x - 2, y + 1) < 6) * 0.02)[:, :, None] * np.ones(24)
-    calibration = lm.calibrate(lm.Scan(geometry, grid.project(rod, geometry)), drift=3, progress=False)
+    calibration = lm.calibrate(lm.Scan(geometry, grid.project_volume(rod, geometry)), drift=3, progress=False)
     assert not any(np.abs(calibration.found.drift.panel(geometry).v).ravel() > 0)
 
 
 def test_a_response_that_was_not_found_leaves_the_effects():
     geometry, data = scanner(8)
     effects = Effects(detector=Detector(photons=1e4))
-    scan = lm.Scan(geometry, grid.project(data, geometry), effects=effects)
+    scan = lm.Scan(geometry, grid.project_volume(data, geometry), effects=effects)
     response = Response.of(geometry, air='smooth')
     drift = Drift(geometry, u=(0.5,), v=(0.3,))
     found = Found(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)

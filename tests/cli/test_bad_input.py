@@ -11,7 +11,7 @@ import pytest
 
 from helpers.script import FIT, SCENE, fit
 from lingo_mi.files.scans import write_scan
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.scan import Scan
 
 QUICK = '--iterations', '2', '-D', 'n_points=100'
@@ -21,7 +21,7 @@ QUICK = '--iterations', '2', '-D', 'n_points=100'
 def scan():
     """Measured projections of nothing in particular."""
     geometry = CircularGeometry(
-        DSO=100, DSD=150, nDetector=(8, 10), dDetector=4, nVoxel=16, dVoxel=1, angles=np.arange(6.0)
+        DSO=100, DSD=150, nDetector=(8, 10), dDetector=4, angles=np.arange(6.0), grid=Grid(16, 1)
     )
     return Scan(geometry, np.full((6, 8, 10), 3, np.float32))
 
@@ -149,7 +149,7 @@ def test_a_cloud_of_nothing(tmp_path):
     'args, says',
     [
         (['-D', 'lambda_tb=1'], 'did you mean lambda_tv?'),
-        (['-D', 'wavelet=1'], 'the documentation of Settings lists those'),
+        (['-D', 'wavelet=1'], 'the documentation of the methods lists those'),
         (['-D', 'vews=3'], '(views)'),
         (['-D', 'views'], 'name=value'),
         (['-D', '=3'], 'name=value'),
@@ -169,8 +169,8 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--views', '0'], '--views'),
         (['--views', '9'], '9 views'),
         (['--views', 'x'], '--views'),
-        (['--recipe', 'magic'], 'there is no such recipe'),
-        (['--init', 'magic'], '--init'),
+        (['--method', 'magic'], "there is no method 'magic'"),
+        (['--start', 'magic'], "not 'magic'"),
         (['--variant', 'magic'], 'variant'),
         (['--variant', 'scalar_rgb'], 'variant'),
         (['--frobnicate'], '--frobnicate'),
@@ -178,7 +178,7 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--projections', ''], '--projections names no file'),
         (['--volume', ''], '--volume names no file'),
         (['--iterations', '3', '-D', 'iterations=4'], 'leave one of them out'),
-        (['-D', 'init=r2', '--init', 'r2'], '--init'),
+        (['-D', 'start=fdk', '--start', 'fdk'], '--start'),
         (['--mu-water', '0.02'], '--volume'),
         (['--resume'], 'no checkpoint'),
         (['--seed', '-1'], 'seed'),

@@ -22,11 +22,14 @@ from lingo_mi.files.images import read_exr
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import write_volume
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.simulate import take_scan
+from lingo_mi.storage.output_folder import CHECKPOINT
 
 SCENES = Path(__file__).parents[2] / 'scenes'
 SMALL = '-D', 'n_points=300', '-D', 'densify_from=10', '-D', 'densify_every=10', '-D', 'densify_threshold=1e-4'
@@ -166,10 +169,10 @@ def test_options(scene, tmp_path):
         '3',
         '--seed',
         '5',
-        '--recipe',
+        '--method',
         'lingo',
-        '--init',
-        'r2',
+        '--start',
+        'fdk',
         '-D',
         'views=6',
         '-D',
@@ -182,11 +185,12 @@ def test_options(scene, tmp_path):
     assert metrics['views'] == 3 and metrics['seed'] == 5 and metrics['method'] == 'lingo'
     assert np.allclose(metrics['angles'], [0, 120, 240])
     settings = metrics['settings']
-    assert settings['rate_scale'] == [0.1, 0.2] and settings['normalise'] is True and settings['init'] == 'r2'
+    assert settings['rate_scale'] == [0.1, 0.2] and settings['normalise'] is True and settings['start'] == 'fdk'
 
 
 def test_scans_a_volume(scene, dataset, tmp_path):
-    write_volume(tmp_path / 'ct.nii.gz', dataset.volume[:, 2:20, 4:], (0.75, 1, 1))
+    ct = dataset.volume[:, 2:20, 4:]
+    write_volume(tmp_path / 'ct.nii.gz', ct, Grid(ct.shape, (0.75, 1, 1)))
     code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--volume', tmp_path / 'ct.nii.gz')
     assert code == 0, err
     image = nibabel.load(tmp_path / 'a' / 'volume.nii.gz')
@@ -220,7 +224,7 @@ def test_unused_views_are_held_out(scene, dataset, tmp_path):
 # ---- interruptions ---------------------------------------------------------------------------------------------------
 
 
-def wait_for(process, condition, seconds=60):
+def wait_for(process, condition, seconds=300):
     deadline = time.monotonic() + seconds
     while not condition():
         assert process.poll() is None, process.communicate()[1]
@@ -238,14 +242,35 @@ def test_resume_after_kill(result, scene, tmp_path):
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL and not (out / 'metrics.json').exists()
-    with np.load(out / 'checkpoint.npz') as file:
-        assert 0 < json.loads(str(file['extra']))['iteration'] < 60
+    assert 0 < Checkpoint.load(out / 'checkpoint.npz').iteration < 60
     code, _, err = fit(*arguments, '--resume')
     assert code == 0, err
     resumed = metrics_of(out)
     for key in 'psnr_2d_r2', 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians', 'ipsd_targets':
         assert whole[key] is not None and resumed[key] == pytest.approx(whole[key], rel=fits_alike(1e-4)), key
     assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in whole['history']]
+
+
+def test_resume_after_kills_in_a_search(scene, tmp_path):
+    """`kill -9` while the fit searches for the step to stop at, --resume, `kill -9` while it goes there, and --resume."""
+    arguments = scene, '--iterations', '60', *SMALL, '-D', 'stop=on', '-D', 'stop_every=5', '-D', 'stop_patience=15'
+    code, _, err = fit(*arguments, '--out', tmp_path / 'whole')
+    assert code == 0, err
+    out, more = tmp_path / 'a', []
+    for searching in True, False:
+        process = fit_process(*arguments, '--out', out, '-D', 'checkpoint_seconds=0', *more)
+        wait_for(process, lambda: (path := out / CHECKPOINT).exists() and Checkpoint.load(path).searching == searching)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL and not (out / 'metrics.json').exists()
+        more = ['--resume']
+    code, _, err = fit(*arguments, '--out', out, '--resume')
+    assert code == 0, err
+    whole, resumed = metrics_of(tmp_path / 'whole'), metrics_of(out)
+    for key in 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians', 'iterations':
+        assert whole[key] is not None and resumed[key] == pytest.approx(whole[key], rel=fits_alike(1e-4)), key
+    for key in 'best', 'iterations', 'errors':
+        assert resumed['search'][key] == pytest.approx(whole['search'][key], rel=fits_alike(1e-4)), key
 
 
 def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
@@ -267,8 +292,16 @@ def test_interrupt_while_a_scene_loads(tmp_path):
     (tmp_path / 'slow.xml').write_text(
         SCENE.replace('<integer name="size" value="24"/>', '<integer name="size" value="400"/>')
     )
-    process = fit_process(tmp_path / 'slow.xml', '--out', tmp_path / 'a')
-    while not (tmp_path / 'a').exists():  # it is made right before the scene is loaded
+    program = textwrap.dedent(f"""
+        import runpy, sys
+        from lingo_mi import phantoms
+        made = phantoms.make
+        phantoms.make = lambda *args: (print('begun', file=sys.stderr, flush=True), made(*args))[1]
+        sys.argv = {[str(FIT), str(tmp_path / 'slow.xml'), '--out', str(tmp_path / 'a'), '--variant', mi.variant()]!r}
+        runpy.run_path(sys.argv[0], run_name='__main__')
+    """)
+    process = subprocess.Popen([sys.executable, '-c', program], stdout=-1, stderr=-1, text=True)
+    while process.stderr.readline() != 'begun\n':
         assert process.poll() is None
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
@@ -311,7 +344,7 @@ def test_metal_part_has_a_truth():
     scanner.geometry = replace(scanner.geometry, nDetector=(48, 48), dDetector=(10, 10), angles=np.array([0.3]))
     scanner.test_geometry = None
     scan = take_scan(loaded)
-    again = grid.project(scan.volume, scan.train.geometry)
+    again = grid.project_volume(scan.volume, scan.train.geometry)
     assert again.sum() == pytest.approx(scan.train.projections.sum(), rel=2e-3)
     assert np.abs(again - scan.train.projections).mean() < 0.04 * scan.train.projections.mean()  # blurred edges
 

@@ -9,7 +9,6 @@ import pytest
 import lingo_mi as lm
 from helpers.script import FIT, fit, run
 from lingo_mi.common.errors import InputError
-from lingo_mi.completion.clouds import load_cloud
 from lingo_mi.projectors import grid
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import take_scan
@@ -27,7 +26,7 @@ CHANGES = dict(
     rate_network='3e-3,3e-4',
     epsilon=1e-10,
 )
-OPTIONS = ['--recipe', 'naf', '--views', '4', *(part for k, v in CHANGES.items() for part in ('-D', f'{k}={v}'))]
+OPTIONS = ['--method', 'naf', '--views', '4', *(part for k, v in CHANGES.items() for part in ('-D', f'{k}={v}'))]
 
 
 @pytest.fixture(scope='module')
@@ -64,12 +63,12 @@ def test_mitsuba_sees_the_field_as_voxels(fitted):
     folder, _ = fitted
     found = take_scan(load_scene(folder / 'result.xml')).train
     volume = nibabel.load(folder / 'volume.nii.gz').get_fdata().astype(np.float32)
-    np.testing.assert_allclose(found.projections, grid.project(volume, found.geometry), atol=1e-4)
+    np.testing.assert_allclose(found.projections, grid.project_volume(volume, found.geometry), atol=1e-4)
 
 
 def test_the_result_is_read_again(fitted):
     folder, _ = fitted
-    result = lm.load_result(folder)
+    result = lm.load_fit(folder / 'result.xml')
     np.testing.assert_allclose(
         result.volume(), nibabel.load(folder / 'volume.nii.gz').get_fdata(), rtol=1e-6, atol=1e-9
     )
@@ -80,10 +79,10 @@ def test_the_result_is_read_again(fitted):
 
 def test_a_finished_fit_goes_on_to_the_same_result(fitted, scene):
     folder, _ = fitted
-    before = lm.load_result(folder).volume()
+    before = lm.load_fit(folder).volume()
     code, _, err = fit(scene, *OPTIONS, '--iterations', '200', '--out', folder, '--resume')
     assert code == 0, err
-    np.testing.assert_array_equal(lm.load_result(folder).volume(), before)
+    np.testing.assert_array_equal(lm.load_fit(folder).volume(), before)
 
 
 @pytest.mark.parametrize('algorithm', ['sart', 'refined', 'voxelize'])
@@ -94,7 +93,7 @@ def test_completed_views_and_the_fields_volume(fitted, scene, tmp_path, algorith
     assert code == 0, err
     volume = nibabel.load(out).get_fdata()
     if algorithm == 'voxelize':
-        np.testing.assert_allclose(volume, lm.load_result(fitted[0]).volume(), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(volume, lm.load_fit(fitted[0]).volume(), rtol=1e-6, atol=1e-9)
     assert float(said.split('PSNR ')[1].split()[0]) > 18
 
 
@@ -109,15 +108,13 @@ def test_a_reconstruction_starts_from_the_field(fitted, scene, tmp_path):
 
 def test_what_a_field_cannot_do_is_one_line(fitted, scene, tmp_path):
     for changes, said in (
-        (['-D', 'lambda_tv=0.1'], 'lambda_tv=0'),
+        (['-D', 'lambda_tv=0.1'], 'lambda_tv: neither'),
         (['-D', 'rate_pose=1e-3,1e-4'], 'rate_pose'),
-        (['--init', 'lingo'], "'network'"),
+        (['--start', 'masks'], "'start'"),
         (['-D', 'field_samples=0'], 'field_samples'),
     ):
-        code, _, err = fit(scene, '--recipe', 'naf', *changes, '--out', tmp_path / 'out')
+        code, _, err = fit(scene, '--method', 'naf', *changes, '--out', tmp_path / 'out')
         assert code == 2 and said in err and err.count('\n') == 1, err
         assert not (tmp_path / 'out').exists()
-    code, _, err = fit(scene, '--init', 'network', '--out', tmp_path / 'out')
-    assert code == 2 and "'lingo' or 'r2'" in err
-    with pytest.raises(InputError, match=r'checkpoint\.npz of one by naf'):
-        load_cloud(fitted[0] / 'result.xml')
+    code, _, err = fit(scene, '--start', 'network', '--out', tmp_path / 'out')
+    assert code == 2 and "'masks'" in err and "not 'network'" in err

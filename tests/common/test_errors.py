@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.errors import InputError, brief, shown
 
 
 @pytest.mark.parametrize(
@@ -19,16 +19,18 @@ from lingo_mi.common.errors import InputError, shown
     ],
 )
 def test_a_message_is_one_printable_line(text):
-    message = str(InputError(text))
-    assert len(message) < 300 and message.isprintable() and len((message + '.').splitlines()) == 1
-    message.encode('utf-8')
+    for message in str(InputError(text)), brief(text), brief(InputError(text)):
+        assert message.isprintable() and len((message + '.').splitlines()) == 1
+        message.encode('utf-8')
+    assert len(brief(text)) < 300 and len(brief(InputError(text))) < 300
 
 
 def test_where_and_mend_stay():
-    message = str(InputError('scan.yml: ' + 'x' * 1000 + '; correct it'))
-    assert message.startswith('scan.yml: x') and message.endswith('; correct it')
-    assert str(InputError('a short one')) == 'a short one'
-    assert str(pickle.loads(pickle.dumps(InputError(message)))) == message
+    error = InputError('scan.yml: ' + 'x' * 1000 + '; correct it')
+    assert str(error) == 'scan.yml: ' + 'x' * 1000 + '; correct it'
+    assert brief(error).startswith('scan.yml: x') and brief(error).endswith('; correct it')
+    assert str(InputError('a short one')) == brief('a short one') == 'a short one'
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_shown():

@@ -13,6 +13,7 @@ import lingo_mi as lm
 from helpers.browser import browser, opened
 from lingo_mi.common import notebook
 from lingo_mi.files.volumes import read_volume, write_volume
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.report.view import Page
 
 
@@ -100,8 +101,8 @@ def test_scan_dataset_and_volumes(tmp_path):
     assert data._repr_html_().count('type="range"') == 5
     assert lm.Dataset(scan)._repr_html_().count('type="range"') == 1
     assert lm.phantom('foot', size=16)._repr_html_().count('type="range"') == 3
-    assert lm.Reconstruction(np.zeros((8, 8, 8)), [], 1.0, geometry)._repr_html_().count('type="range"') == 3
-    write_volume(tmp_path / 'v.nii.gz', np.ones((4, 5, 1), np.float32), 1.0)
+    assert lm.Reconstruction(np.zeros((8, 8, 8)), [], 1.0, geometry.grid)._repr_html_().count('type="range"') == 3
+    write_volume(tmp_path / 'v.nii.gz', np.ones((4, 5, 1), np.float32), Grid((4, 5, 1), 1.0))
     assert read_volume(tmp_path / 'v.nii.gz')._repr_html_().count('<figure') == 1  # of a single slice
 
 

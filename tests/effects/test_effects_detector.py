@@ -10,7 +10,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector, taps
 from lingo_mi.effects.focal_spot import FocalSpot, square
 from lingo_mi.effects.forward import Effects
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.view import View
 
 SHAPE = 120, 150
@@ -135,7 +135,7 @@ def test_impossible_detectors(change, match):
 
 
 def test_a_point_spread_of_no_width_changes_nothing(variant):
-    frames = CircularGeometry(DSO=100, DSD=150, nDetector=5, dDetector=1, nVoxel=4, dVoxel=1, angles=[0.0]).rays()
+    frames = CircularGeometry(DSO=100, DSD=150, nDetector=5, dDetector=1, angles=[0.0], grid=Grid(4, 1)).rays()
     image = np.random.default_rng(0).random(25).astype(np.float32)
     found = detector(psf=1e-6).blurred(mi.Float(image), View.of(frames, 0, 5, 5))
     np.testing.assert_allclose(found.numpy(), image, rtol=1e-6)

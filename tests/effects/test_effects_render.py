@@ -18,7 +18,7 @@ from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.effects.hardening import Tube, TubeParameters, hardened
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
 from lingo_mi.projectors.objects import find_objects
-from lingo_mi.reconstruction.effects_correction import corrected, linearised
+from lingo_mi.reconstruction.line_integrals import corrected, line_integrals
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import take_scan
 
@@ -391,7 +391,7 @@ def test_dead_pixels_that_are_left_in_are_filled():
     effects = Effects(detector=detector)
     dead = detector.maps((20, 24))[1]
     assert dead.any() and seen[:, dead].min() > 10
-    found = linearised(lm.Scan(geometry, seen, effects=effects), effects).projections
+    found = line_integrals(lm.Scan(geometry, seen, effects=effects)).projections
     np.testing.assert_allclose(found, np.broadcast_to(view, found.shape), atol=0.05)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba import chi2
 
+from helpers.circles import circle
 from helpers.effects import XML
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, values_of
 from lingo_mi.common.errors import InputError
@@ -14,7 +15,6 @@ from lingo_mi.effects.forward import find_effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter, _energies, smoothed
 from lingo_mi.effects.spectrum import attenuation, tube_spectrum
-from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.projectors.objects import GridInCube, find_objects
 from lingo_mi.projectors.sampling import bounds, on_grid
 from lingo_mi.projectors.sensors import view_of
@@ -116,7 +116,7 @@ def geometry(**changes):
         angles=[0.3],
         offDetector=(10.0, 20.0),
     )
-    return CircularGeometry(**settings | changes)
+    return circle(**settings | changes)
 
 
 def water_box():

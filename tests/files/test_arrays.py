@@ -48,6 +48,8 @@ def test_dimensions():
 
 @pytest.mark.parametrize('skip', [0, 1, 2])
 def test_bytes_after_others(skip):
-    assert read_exactly(io.BytesIO(b'abcdef'), 'f', skip, 3) == b'abcdef'[skip : skip + 3]
+    stream = io.BytesIO(b'abcdef')
+    stream.seek(skip)
+    assert read_exactly(stream, 'f', 3) == b'abcdef'[skip : skip + 3]
     with pytest.raises(InputError, match='end too early'):
-        read_exactly(io.BytesIO(b'abcdef'), 'f', skip + 1, 6 - skip)
+        read_exactly(stream, 'f', 4 - skip)

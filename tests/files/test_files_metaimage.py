@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.files import metaimage
+from lingo_mi.files.itk import read_metaimage
 
 SHAPE = (4, 5, 6)
 VALUES = np.random.default_rng(0).integers(0, 100, SHAPE)
@@ -24,7 +24,7 @@ def written(path, body=BODY, **changes):
 
 def refused(path, match):
     with pytest.raises(InputError, match=match) as caught:
-        metaimage.read(path)
+        read_metaimage(path)
     assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
 
 
@@ -39,7 +39,7 @@ def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
     image.SetDirection((0, -1, 0, 0.6, 0, 0.8, -0.8, 0, 0.6))
     path = tmp_path / f'v.{suffix}'
     sitk.WriteImage(image, str(path), compressed)
-    data, affine = metaimage.read(path)
+    data, affine = read_metaimage(path)
     assert data.dtype == dtype
     np.testing.assert_array_equal(data, VALUES)
     np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
@@ -48,7 +48,7 @@ def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
 
 @pytest.mark.parametrize('word', ['True', 'true', 'T', '1'])
 def test_words_for_true(tmp_path, word):
-    data, _ = metaimage.read(written(tmp_path / 'v.mha', BinaryData=word))
+    data, _ = read_metaimage(written(tmp_path / 'v.mha', BinaryData=word))
     np.testing.assert_array_equal(data, VALUES)
 
 
@@ -67,7 +67,7 @@ def test_as_simpleitk_reads_it(tmp_path, direction, place):
         **{direction: '1 0 0 0 0 1 0 -1 0', place: '-1 0 4e1'},
     )
     image = sitk.ReadImage(str(path))
-    data, affine = metaimage.read(path)
+    data, affine = read_metaimage(path)
     np.testing.assert_array_equal(data, sitk.GetArrayFromImage(image).transpose(2, 1, 0))
     np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
     np.testing.assert_allclose(affine[:3, 3], image.GetOrigin())
@@ -75,13 +75,13 @@ def test_as_simpleitk_reads_it(tmp_path, direction, place):
 
 def test_what_the_header_leaves_out(tmp_path):
     """Voxels of 1 mm along the axes, the first at the origin, as SimpleITK has it."""
-    np.testing.assert_array_equal(metaimage.read(written(tmp_path / 'v.mha'))[1], np.eye(4))
+    np.testing.assert_array_equal(read_metaimage(written(tmp_path / 'v.mha'))[1], np.eye(4))
 
 
 def test_sizes_in_the_place_of_spacings_and_other_units(tmp_path):
-    _, affine = metaimage.read(written(tmp_path / 'v.mha', ElementSize='1 2 3'))
+    _, affine = read_metaimage(written(tmp_path / 'v.mha', ElementSize='1 2 3'))
     np.testing.assert_allclose(affine, np.diag([1, 2, 3, 1]))
-    _, affine = metaimage.read(
+    _, affine = read_metaimage(
         written(tmp_path / 'v.mha', ElementSpacing='20 20 40', Offset='100 0 0', DistanceUnits='um')
     )
     np.testing.assert_allclose(affine[:3, :3], np.diag([0.02, 0.02, 0.04]))
@@ -93,9 +93,9 @@ def test_voxels_at_the_end_and_below(tmp_path):
     (tmp_path / 'below').mkdir()
     (tmp_path / 'below' / 'v.raw').write_bytes(b'skipped' + VALUES.astype('u1').tobytes('F'))
     path = written(tmp_path / 'v.mhd', b'', HeaderSize=-1, ElementDataFile='below/v.raw')
-    np.testing.assert_array_equal(metaimage.read(path)[0], VALUES)
+    np.testing.assert_array_equal(read_metaimage(path)[0], VALUES)
     written(tmp_path / 'v.mhd', b'', HeaderSize=7, ElementDataFile='below/v.raw')
-    np.testing.assert_array_equal(metaimage.read(path)[0], VALUES)
+    np.testing.assert_array_equal(read_metaimage(path)[0], VALUES)
 
 
 @pytest.mark.parametrize('n', ['4294967296', '999999999999', '-1', '100', '1e400', 'nan', '', '3 3', 'x' * 5000])
@@ -153,6 +153,6 @@ def test_no_end_of_the_header(tmp_path):
 )
 def test_types(tmp_path, name, dtype):
     """Those of the format's description; its long has 4 bytes."""
-    data, _ = metaimage.read(written(tmp_path / 'v.mha', VALUES.astype(dtype).tobytes('F'), ElementType=name))
+    data, _ = read_metaimage(written(tmp_path / 'v.mha', VALUES.astype(dtype).tobytes('F'), ElementType=name))
     assert data.dtype == dtype
     np.testing.assert_array_equal(data, VALUES)

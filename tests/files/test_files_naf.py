@@ -10,7 +10,7 @@ import pytest
 from helpers.scans import small_dataset
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import naf
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -50,7 +50,7 @@ def dumped(tmp_path, obj, protocol=4):
 
 def refused(path, match):
     with pytest.raises(InputError, match=match) as caught:
-        naf.read(path)
+        naf.read_naf(path)
     assert '\n' not in str(caught.value) and str(path) in str(caught.value)
 
 
@@ -67,7 +67,7 @@ def test_reads_every_protocol_and_both_numpy_names(tmp_path, protocol, core):
         raw = renamed(raw, other, core)
     if protocol < 5:
         assert core in raw
-    dataset = naf.read(dumped(tmp_path, raw))
+    dataset = naf.read_naf(dumped(tmp_path, raw))
     np.testing.assert_allclose(dataset.train.projections, data['train']['projections'] * 1000, rtol=1e-6)
     np.testing.assert_array_equal(dataset.volume, data['image'])
 
@@ -93,17 +93,17 @@ def renamed(raw, old, new):
 
 
 def test_units_and_orders(tmp_path):
-    g = naf.read(dumped(tmp_path, plain())).train.geometry
+    g = naf.read_naf(dumped(tmp_path, plain())).train.geometry
     assert (g.DSO, g.DSD) == (1000, 1500)
     assert g.nDetector == (4, 5) and g.dDetector == (2, 3)
-    assert g.nVoxel == (6, 7, 8) and g.dVoxel == (1, 1.5, 2)
-    assert g.offOrigin == (1, 2, 3)
+    assert g.grid.shape == (6, 7, 8) and g.grid.spacing == (1, 1.5, 2)
+    assert g.grid.centre == (1, 2, 3)
     assert g.offDetector == (20, 10)  # the file has (u, v), TIGRE gets (v, u)
     np.testing.assert_array_equal(g.angles, [0.1, 1.0, 2.0])
 
 
 def test_panel_given_as_u_v_is_told_by_the_projections(tmp_path):
-    g = naf.read(dumped(tmp_path, plain(nDetector=[5, 4], dDetector=[3.0, 2.0]))).train.geometry
+    g = naf.read_naf(dumped(tmp_path, plain(nDetector=[5, 4], dDetector=[3.0, 2.0]))).train.geometry
     assert g.nDetector == (4, 5) and g.dDetector == (2, 3)
 
 
@@ -112,7 +112,7 @@ def test_line_integrals_of_a_known_object(tmp_path):
     above the axis lies in the upper rows."""
     image = np.zeros((1, 4, 5), np.float32)
     image[0, 0, 3] = 0.006
-    dataset = naf.read(
+    dataset = naf.read_naf(
         dumped(
             tmp_path,
             plain(numTrain=1, val=..., train={'projections': image, 'angles': np.zeros(1)}, offDetector=[0, 0]),
@@ -137,21 +137,21 @@ def test_optional_keys(tmp_path):
         dVoxel=...,
         sVoxel=[6, 10.5, 16],
     )
-    dataset = naf.read(dumped(tmp_path, few))
+    dataset = naf.read_naf(dumped(tmp_path, few))
     g = dataset.train.geometry
     assert dataset.test is None and dataset.volume is None
-    assert g.mode == 'cone' and g.offOrigin == (0, 0, 0) and g.offDetector == (0, 0) and g.dVoxel == (1, 1.5, 2)
+    assert g.mode == 'cone' and g.grid.centre == (0, 0, 0) and g.offDetector == (0, 0) and g.grid.spacing == (1, 1.5, 2)
 
 
 def test_parallel_beam_needs_no_distances(tmp_path):
-    g = naf.read(dumped(tmp_path, plain(mode='parallel', DSO=..., DSD=...))).train.geometry
+    g = naf.read_naf(dumped(tmp_path, plain(mode='parallel', DSO=..., DSD=...))).train.geometry
     assert g.mode == 'parallel'
 
 
 def test_held_out_views_may_be_called_test(tmp_path):
     data = plain()
     data['test'] = data.pop('val')
-    assert len(naf.read(dumped(tmp_path, data)).test) == 2
+    assert len(naf.read_naf(dumped(tmp_path, data)).test) == 2
 
 
 def assert_same(a, b):
@@ -163,14 +163,14 @@ def assert_same(a, b):
 
 
 def test_round_trip(tmp_path):
-    naf.write(tmp_path / 'a.pickle', small_dataset())
-    assert_same(naf.read(tmp_path / 'a.pickle'), small_dataset())
+    naf.write_naf(tmp_path / 'a.pickle', small_dataset())
+    assert_same(naf.read_naf(tmp_path / 'a.pickle'), small_dataset())
     assert os.listdir(tmp_path) == ['a.pickle']
 
 
 def test_the_written_file_is_an_ordinary_pickle_for_numpy_1_and_2(tmp_path):
     path = tmp_path / 'a.pickle'
-    naf.write(path, small_dataset())
+    naf.write_naf(path, small_dataset())
     raw = path.read_bytes()
     assert b'_core' not in raw and b'numpy.core' not in raw
     data = pickle.loads(raw)
@@ -183,7 +183,7 @@ def test_fortran_and_big_endian_arrays_and_scalars(tmp_path):
     data = plain(DSO=np.float32(1000), DSD=np.float64(1500), numTrain=np.int64(3))
     p = data['train']['projections']
     data['train']['projections'] = np.asfortranarray(p).astype('>f8')
-    dataset = naf.read(dumped(tmp_path, data))
+    dataset = naf.read_naf(dumped(tmp_path, data))
     np.testing.assert_allclose(dataset.train.projections, p * 1000, rtol=1e-6)
 
 
@@ -362,15 +362,15 @@ def test_contradictions(tmp_path, name):
 def test_write_refuses(tmp_path):
     dataset = small_dataset()
     with pytest.raises(InputError, match='cannot be written'):
-        naf.write(tmp_path / 'no folder' / 'a.pickle', dataset)
+        naf.write_naf(tmp_path / 'no folder' / 'a.pickle', dataset)
     other = Scan(
         CircularGeometry(
-            DSO=900, DSD=1400, nDetector=(4, 6), dDetector=(1.5, 2.5), nVoxel=(5, 6, 7), dVoxel=(1, 2, 4), angles=[0.0]
+            DSO=900, DSD=1400, nDetector=(4, 6), dDetector=(1.5, 2.5), angles=[0.0], grid=Grid((5, 6, 7), (1, 2, 4))
         ),
         np.ones((1, 4, 6)),
     )
     with pytest.raises(InputError, match='one scanner'):
-        naf.write(tmp_path / 'a.pickle', Dataset(dataset.train, other))
+        naf.write_naf(tmp_path / 'a.pickle', Dataset(dataset.train, other))
     assert not list(tmp_path.iterdir())
 
 

@@ -1,6 +1,7 @@
 """NIfTI and Analyze: as nibabel reads them, and headers that lie."""
 
 import gzip
+import struct
 import tracemalloc
 
 import nibabel
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.files import nifti
+from lingo_mi.files.nifti import read_nifti
 
 SHAPE = (4, 5, 6)
 VALUES = np.random.default_rng(0).integers(-50, 100, SHAPE)
@@ -31,7 +32,7 @@ def test_as_nibabel_reads_it(tmp_path, kind, dtype, slope):
         nibabel.save(image, tmp_path / name)
         (tmp_path / 'v.mat').unlink(missing_ok=True)
         expected = nibabel.load(tmp_path / name)
-        data, affine, _ = nifti.read(tmp_path / name)
+        data, affine, _ = read_nifti(tmp_path / name)
         wanted = np.asanyarray(expected.dataobj)
         assert data.dtype == wanted.dtype
         np.testing.assert_array_equal(data, wanted)
@@ -56,7 +57,7 @@ def test_a_header_that_claims_more_than_there_is(tmp_path, name, shape):
     path = claiming(tmp_path / name, shape)
     tracemalloc.start()
     with pytest.raises(InputError, match='claims|too early'):
-        nifti.read(path)
+        read_nifti(path)
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
 
@@ -64,23 +65,38 @@ def test_a_header_that_claims_more_than_there_is(tmp_path, name, shape):
 def test_extensions_and_what_follows_are_not_unpacked(tmp_path):
     """A few hundred kilobytes that would unpack to hundreds of megabytes."""
     content = np.ones(SHAPE, np.float32).tobytes()
-    nifti.read(claiming(tmp_path / 'v.nii.gz', SHAPE, content))
+    read_nifti(claiming(tmp_path / 'v.nii.gz', SHAPE, content))
     for path in (
         claiming(tmp_path / 'after.nii.gz', SHAPE, content + bytes(100 << 20)),
         claiming(tmp_path / 'before.nii.gz', SHAPE, bytes(100 << 20), vox_offset=2**40),
     ):
         tracemalloc.start()
         with pytest.raises(InputError, match='more data follow|cannot hold'):
-            nifti.read(path)
+            read_nifti(path)
         assert tracemalloc.get_traced_memory()[1] < 10e6
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz'])
+def test_an_extension_is_passed_over(tmp_path, name):
+    """One of a hundred megabytes, which a file of kilobytes can hold."""
+    start = 100 << 20 if name.endswith('.gz') else 1 << 10
+    size = start - 352
+    extension = struct.pack('<ii', size, 4) + bytes(size - 8)
+    content = np.arange(120, dtype=np.float32).tobytes()
+    path = claiming(tmp_path / name, SHAPE, extension + content, vox_offset=start)
+    tracemalloc.start()
+    data, _, _ = read_nifti(path)
+    assert tracemalloc.get_traced_memory()[1] < 10e6
+    tracemalloc.stop()
+    np.testing.assert_array_equal(data.ravel('F'), np.arange(120))
 
 
 @pytest.mark.parametrize('fields', [dict(vox_offset=np.nan), dict(vox_offset=-1), dict(datatype=128), dict(dim=9)])
 def test_fields_that_make_no_sense(tmp_path, fields):
     path = claiming(tmp_path / 'v.nii', SHAPE, bytes(480), **fields)
     try:
-        data, _, _ = nifti.read(path)
+        data, _, _ = read_nifti(path)
     except InputError as error:
         assert '\n' not in str(error)
     else:  # a colour, which the caller refuses

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.files import nrrd
+from lingo_mi.files.itk import read_nrrd
 
 SHAPE = (4, 5, 6)
 VALUES = np.random.default_rng(0).integers(0, 100, SHAPE)
@@ -33,7 +33,7 @@ def test_as_simpleitk_writes_it(tmp_path, suffix, compressed, dtype):
     image.SetDirection((0, -1, 0, 0.6, 0, 0.8, -0.8, 0, 0.6))
     path = tmp_path / f'v.{suffix}'
     sitk.WriteImage(image, str(path), compressed)
-    data, affine = nrrd.read(path)
+    data, affine = read_nrrd(path)
     assert data.dtype == dtype
     np.testing.assert_array_equal(data, VALUES)
     np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
@@ -48,7 +48,7 @@ def test_spaces_as_simpleitk_reads_them(tmp_path, space):
     changes = {'space': space} if space else {'space dimension': '3'}
     changes |= {'space directions': '(0,2,0) (-0.5,0,0) (0,0,3)', 'space origin': '(7,8,-9)'}
     image = sitk.ReadImage(str(written(tmp_path / 'v.nrrd', changes=changes)))
-    data, affine = nrrd.read(tmp_path / 'v.nrrd')
+    data, affine = read_nrrd(tmp_path / 'v.nrrd')
     np.testing.assert_array_equal(data, sitk.GetArrayFromImage(image).transpose(2, 1, 0))
     np.testing.assert_allclose(affine[:3, :3], np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing())
     np.testing.assert_allclose(affine[:3, 3], image.GetOrigin())
@@ -58,12 +58,12 @@ def test_packings_and_byte_orders(tmp_path):
     for encoding, pack in (('raw', bytes), ('gz', gzip.compress), ('bzip2', bz2.compress)):
         body = pack(VALUES.astype('>i2').tobytes('F'))
         path = written(tmp_path / 'v.nrrd', body, dict(type='int16', endian='big', encoding=encoding, spacings='1 2 3'))
-        data, affine = nrrd.read(path)
+        data, affine = read_nrrd(path)
         np.testing.assert_array_equal(data, VALUES)
         np.testing.assert_array_equal(np.diag(affine), [1, 2, 3, 1])
         with pytest.raises(InputError, match='truncated|unpacked'):
             path.write_bytes(path.read_bytes()[:-5])
-            nrrd.read(path)
+            read_nrrd(path)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_packings_and_byte_orders(tmp_path):
 )
 def test_headers_that_lie(tmp_path, changes, match):
     with pytest.raises(InputError, match=match) as caught:
-        nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))
+        read_nrrd(written(tmp_path / 'v.nrrd', changes=changes))
     assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
 
 
@@ -107,7 +107,7 @@ def test_no_header(tmp_path):
     for content in (b'', b'NRRD', b'NRRD0004', b'NRRD0004\n' + b'a: b\n' * 40000):
         (tmp_path / 'v.nrrd').write_bytes(content)
         with pytest.raises(InputError):
-            nrrd.read(tmp_path / 'v.nrrd')
+            read_nrrd(tmp_path / 'v.nrrd')
 
 
 @pytest.mark.parametrize('space', [False, True])
@@ -116,20 +116,20 @@ def test_units_of_length(tmp_path, space):
     changes |= {'space units': '"um" "um" "um"'}
     if not space:
         changes = {'spacings': '20 20 40', 'units': '"um" "um" "um"'}
-    _, affine = nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))
+    _, affine = read_nrrd(written(tmp_path / 'v.nrrd', changes=changes))
     np.testing.assert_allclose(affine[:3, :3], np.diag([0.02, 0.02, 0.04]))
     np.testing.assert_allclose(affine[:3, 3], [0.1 if space else 0, 0, 0])
     for units in ('"inch" "inch" "inch"', '"mm" "mm" "um"'):
         name = 'space units' if space else 'units'
         with pytest.raises(InputError, match='units must be one of'):
-            nrrd.read(written(tmp_path / 'v.nrrd', changes=changes | {name: units}))
+            read_nrrd(written(tmp_path / 'v.nrrd', changes=changes | {name: units}))
 
 
 def test_what_the_header_leaves_out(tmp_path):
     """Voxels of 1 mm, the first at the origin; a kind may be none."""
-    np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd'))[1], np.eye(4))
+    np.testing.assert_array_equal(read_nrrd(written(tmp_path / 'v.nrrd'))[1], np.eye(4))
     changes = {'space': 'LPS', 'space directions': '(2,0,0) (0,3,0) (0,0,4)', 'kinds': 'none domain ???'}
-    np.testing.assert_array_equal(nrrd.read(written(tmp_path / 'v.nrrd', changes=changes))[1], np.diag([2, 3, 4, 1]))
+    np.testing.assert_array_equal(read_nrrd(written(tmp_path / 'v.nrrd', changes=changes))[1], np.diag([2, 3, 4, 1]))
 
 
 # https://teem.sourceforge.net/nrrd/format.html#type
@@ -151,6 +151,6 @@ NAMES_OF_TYPES = {
 def test_types(tmp_path, dtype):
     body = VALUES.astype(dtype).tobytes('F')
     for name in NAMES_OF_TYPES[dtype]:
-        data, _ = nrrd.read(written(tmp_path / 'v.nrrd', body, {'type': name, 'endian': 'little'}))
+        data, _ = read_nrrd(written(tmp_path / 'v.nrrd', body, {'type': name, 'endian': 'little'}))
         assert data.dtype == dtype, name
         np.testing.assert_array_equal(data, VALUES)

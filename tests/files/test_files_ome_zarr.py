@@ -9,7 +9,7 @@ import pytest
 import lingo_mi as lm
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.slabs import write_slabs
-from lingo_mi.files.volumes import first_voxel, read_volume
+from lingo_mi.files.volumes import read_volume
 
 zarr = pytest.importorskip('zarr')
 SCALE = dict(type='scale', scale=[2.0, 1.5, 1.0])
@@ -44,11 +44,11 @@ def test_what_is_written_is_read_unchanged(tmp_path, volume):
         offOrigin=(3, -4, 5),
         angles=[0.0],
     )
-    write_slabs(tmp_path / 'v.ome.zarr', g, [volume], 'density per mm')
+    write_slabs(tmp_path / 'v.ome.zarr', g.grid, [volume], 'density per mm')
     found = read_volume(tmp_path / 'v.ome.zarr')
     np.testing.assert_array_equal(found.data, volume)
     assert found.unit == 'density per mm' and found.spacing == (1, 1.5, 2)
-    np.testing.assert_allclose(found.affine[:3, 3], first_voxel(g))
+    np.testing.assert_allclose(found.affine[:3, 3], g.grid.first_voxel)
 
 
 @pytest.mark.parametrize('version', [2, 3])

@@ -6,7 +6,7 @@ import pytest
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import plain_yaml
-from lingo_mi.files.plain_yaml import load
+from lingo_mi.files.plain_yaml import read_yaml
 
 
 def written(folder, text):
@@ -17,7 +17,7 @@ def written(folder, text):
 
 def test_plain_data(tmp_path):
     text = 'DSO: 1000\nDSD: 1.5e+3\nnDetector: [4, 5]\nmode: cone\nposes:\n- [1, 2]\n- [3, 4]\n'
-    assert load(written(tmp_path, text)) == dict(
+    assert read_yaml(written(tmp_path, text)) == dict(
         DSO=1000, DSD=1500.0, nDetector=[4, 5], mode='cone', poses=[[1, 2], [3, 4]]
     )
 
@@ -52,7 +52,7 @@ BOMB = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
 def test_refuses_in_one_line(tmp_path, text, match):
     start = time.monotonic()
     with pytest.raises(InputError, match=match) as caught:
-        load(written(tmp_path, text))
+        read_yaml(written(tmp_path, text))
     assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
     assert time.monotonic() - start < 5
 
@@ -60,10 +60,10 @@ def test_refuses_in_one_line(tmp_path, text, match):
 def test_limits(tmp_path, monkeypatch):
     monkeypatch.setattr(plain_yaml, 'MOST_VALUES', 20)
     with pytest.raises(InputError, match='more than 20 values; put poses'):
-        load(written(tmp_path, f'a: {list(range(30))}'))
+        read_yaml(written(tmp_path, f'a: {list(range(30))}'))
     monkeypatch.setattr(plain_yaml, 'MOST_BYTES', 1 << 20)
     with pytest.raises(InputError, match='larger than 1 MiB'):
-        load(written(tmp_path, 'a: 1 #' + ' ' * (1 << 20)))
+        read_yaml(written(tmp_path, 'a: 1 #' + ' ' * (1 << 20)))
     (tmp_path / 'scan.yml').write_bytes(b'\xff')
     with pytest.raises(InputError, match='not valid YAML'):
-        load(tmp_path / 'scan.yml')
+        read_yaml(tmp_path / 'scan.yml')

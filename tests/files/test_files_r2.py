@@ -58,17 +58,17 @@ def folder(tmp_path, vol_key='vol', **changes):
 
 def refused(path, match, where='meta_data.json'):
     with pytest.raises(InputError, match=match) as caught:
-        r2.read(path)
+        r2.read_r2(path)
     assert '\n' not in str(caught.value) and where in str(caught.value)
 
 
 @pytest.mark.parametrize('vol_key', ['vol', 'ct'])
 def test_reads_its_own_layout(tmp_path, vol_key):
     images = folder(tmp_path, vol_key)
-    dataset = r2.read(tmp_path)
+    dataset = r2.read_r2(tmp_path)
     g = dataset.train.geometry
     assert (g.DSO, g.DSD, g.nDetector, g.dDetector) == (5, 7, (4, 6), (1, 0.5))
-    assert (g.nVoxel, g.dVoxel, g.offOrigin) == ((5, 6, 8), (0.2, 0.25, 0.25), (0.1, 0.2, 0.3))
+    assert (g.grid.shape, g.grid.spacing, g.grid.centre) == ((5, 6, 8), (0.2, 0.25, 0.25), (0.1, 0.2, 0.3))
     assert g.offDetector == (0.5, 0.4)  # the file has (u, v)
     np.testing.assert_array_equal(g.angles, [0.1, 1.1, 2.1])
     np.testing.assert_array_equal(dataset.train.projections, images['proj_train'])
@@ -78,7 +78,7 @@ def test_reads_its_own_layout(tmp_path, vol_key):
 
 def test_optional_parts(tmp_path):
     folder(tmp_path, vol=..., proj_test=[], offOrigin=..., offDetector=..., mode=...)
-    dataset = r2.read(tmp_path)
+    dataset = r2.read_r2(tmp_path)
     assert dataset.test is None and dataset.volume is None and dataset.train.geometry.mode == 'cone'
 
 
@@ -88,8 +88,8 @@ def test_round_trip(tmp_path, mode):
 
     a = small_dataset()
     a = Dataset(*(Scan(replace(s.geometry, mode=mode), s.projections) for s in (a.train, a.test)), a.volume)
-    r2.write(tmp_path / 'scan', a)
-    b = r2.read(tmp_path / 'scan')
+    r2.write_r2(tmp_path / 'scan', a)
+    b = r2.read_r2(tmp_path / 'scan')
     for x, y in ((a.train, b.train), (a.test, b.test)):
         assert vars(x.geometry) | {'angles': 0} == vars(y.geometry) | {'angles': 0}
         np.testing.assert_array_equal(x.geometry.angles, y.geometry.angles)
@@ -99,7 +99,7 @@ def test_round_trip(tmp_path, mode):
 
 
 def test_writes_what_its_reader_looks_up(tmp_path):
-    r2.write(tmp_path / 'scan', small_dataset())
+    r2.write_r2(tmp_path / 'scan', small_dataset())
     meta = json.loads((tmp_path / 'scan' / 'meta_data.json').read_text())
     assert {
         'DSD',
@@ -179,38 +179,38 @@ def test_missing_and_damaged_files(tmp_path):
 
 
 def test_write_refuses_a_folder_in_use(tmp_path):
-    r2.write(tmp_path / 'scan', small_dataset())
+    r2.write_r2(tmp_path / 'scan', small_dataset())
     with pytest.raises(InputError, match='exists already'):
-        r2.write(tmp_path / 'scan', small_dataset())
+        r2.write_r2(tmp_path / 'scan', small_dataset())
     (tmp_path / 'file').touch()
     for path in (tmp_path / 'file', tmp_path / 'file' / 'scan', tmp_path / 'none' / 'scan'):
         with pytest.raises(InputError, match='exists already|cannot be written'):
-            r2.write(path, small_dataset())
+            r2.write_r2(path, small_dataset())
     assert sorted(p.name for p in tmp_path.iterdir()) == ['file', 'scan']
 
 
 def test_numbers_nested_too_deep(tmp_path):
     folder = tmp_path / 'a'
-    r2.write(folder, small_dataset())
+    r2.write_r2(folder, small_dataset())
     meta = folder / 'meta_data.json'
     content = meta.read_text()
     for deep in (600, 100_000):
         meta.write_text(re.sub(r'"DSO": [\d.]+', f'"DSO": {"[" * deep}1{"]" * deep}', content))
         with pytest.raises(InputError, match='DSO must be numbers|not valid JSON') as caught:
-            r2.read(folder)
+            r2.read_r2(folder)
         assert len(str(caught.value)) < 300
 
 
 @pytest.mark.parametrize('name', ['/etc/hostname', '../v.npy', 3, None, ''])
 def test_files_elsewhere(tmp_path, name):
     folder = tmp_path / 'a'
-    r2.write(folder, small_dataset())
+    r2.write_r2(folder, small_dataset())
     meta = folder / 'meta_data.json'
     content = json.loads(meta.read_text())
     content['proj_train'][0]['file_path'] = name
     meta.write_text(json.dumps(content))
     with pytest.raises(InputError, match='beside it'):
-        r2.read(folder)
+        r2.read_r2(folder)
 
 
 def test_one_image_listed_many_times(tmp_path, monkeypatch):

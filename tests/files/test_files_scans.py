@@ -15,7 +15,9 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.geometry import Geometry
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.reconstruction import CGLS
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -64,7 +66,7 @@ def test_an_earlier_scan_stays_whole_where_the_disk_is_full(tmp_path, monkeypatc
     old, calls = small_dataset().train, []
     old = replace(old, valid=np.arange(old.projections.size).reshape(old.projections.shape) > 0)
     write_scan(tmp_path / 'a.npy', old, 'npy')
-    before, write = {p.name: p.read_bytes() for p in tmp_path.iterdir()}, arrays.write
+    before, write = {p.name: p.read_bytes() for p in tmp_path.iterdir()}, arrays.write_npy_in_place
 
     def full(*args):
         calls.append(args)
@@ -72,9 +74,9 @@ def test_an_earlier_scan_stays_whole_where_the_disk_is_full(tmp_path, monkeypatc
             raise OSError(errno.ENOSPC, 'No space left on device')
         write(*args)
 
-    monkeypatch.setattr(arrays, 'write', full)
+    monkeypatch.setattr(arrays, 'write_npy_in_place', full)
     new = replace(
-        old, geometry=old.geometry.with_volume(5, 2.0), valid=np.flip(old.valid), projections=old.projections + 1
+        old, geometry=old.geometry.on(Grid(5, 2.0)), valid=np.flip(old.valid), projections=old.projections + 1
     )
     with pytest.raises(InputError, match='No space left'):
         write_scan(tmp_path / 'a.npy', new, 'npy')
@@ -128,7 +130,7 @@ def npy(tmp_path, projections=PROJECTIONS, suffix='.yml', **changes):
 def test_geometry_file_beside(tmp_path, suffix):
     dataset = read_scan(npy(tmp_path, suffix=suffix))
     g = dataset.train.geometry
-    assert (g.nDetector, g.dDetector, g.dVoxel, g.offDetector) == ((4, 5), (2, 3), (1, 1.5, 2), (10, 20))
+    assert (g.nDetector, g.dDetector, g.grid.spacing, g.offDetector) == ((4, 5), (2, 3), (1, 1.5, 2), (10, 20))
     np.testing.assert_allclose(np.degrees(g.angles), [0, 120, 240])
     np.testing.assert_array_equal(dataset.train.projections, PROJECTIONS.astype(np.float32))
 
@@ -302,7 +304,7 @@ def test_htc_geometry(tmp_path):
     scan = read_scan(htc(tmp_path)).train
     g = scan.geometry
     assert (g.nDetector, g.dDetector) == ((1, 6), (0.2, 0.2))
-    assert (g.nVoxel, g.dVoxel) == ((512, 512, 1), (0.1483,) * 3)
+    assert (g.grid.shape, g.grid.spacing) == ((512, 512, 1), (0.1483,) * 3)
     # the last of their angles repeats the first
     np.testing.assert_allclose(np.degrees(g.angles), [-90, 0, 90, 180])
     np.testing.assert_array_equal(scan.projections[:, 0], np.arange(24).reshape(4, 6))
@@ -345,7 +347,7 @@ def walnut(tmp_path, **changes):
 def test_walnut_geometry(tmp_path):
     scan = read_scan(walnut(tmp_path)).train
     g, rays = scan.geometry, scan.geometry.rays()
-    assert (g.nDetector, g.dDetector, g.nVoxel, g.dVoxel) == ((5, 6), (0.4, 0.5), (128,) * 3, (0.305,) * 3)
+    assert (g.nDetector, g.dDetector, g.grid.shape, g.grid.spacing) == ((5, 6), (0.4, 0.5), (128,) * 3, (0.305,) * 3)
     # theirs: source DSO (-sin a, cos a, 0), columns along (cos a, sin a), which are turned round here
     for view, a in enumerate(np.radians([0, -90, -180, -270])):
         np.testing.assert_allclose(rays.source[view], 210.66 * np.array([-np.sin(a), np.cos(a), 0]), atol=1e-9)
@@ -377,7 +379,7 @@ def test_the_voxels_of_a_scene_are_used_with_measured_projections(tmp_path):
         ({}, (128,) * 3, (0.305,) * 3),
     ):
         scanner = mi.load_dict({'type': 'ct_scanner', 'projections': str(path), **given})
-        assert (scanner.geometry.nVoxel, scanner.geometry.dVoxel) == (count, size)
+        assert (scanner.geometry.grid.shape, scanner.geometry.grid.spacing) == (count, size)
         assert scanner.dataset.train.geometry is scanner.geometry
 
 
@@ -390,9 +392,9 @@ def test_measured_walnut(data):
     scan = Scan(scan.geometry.binned(4), scan.projections.reshape(120, 64, 4, 64, 4).mean((2, 4))).subset(
         range(0, 120, 3)
     )
-    scan = replace(scan, geometry=scan.geometry.with_volume(64, 0.61))
+    scan = scan.on(Grid(64, 0.61, scan.geometry.grid.centre))
     other = replace(scan, geometry=replace(scan.geometry, angles=-scan.geometry.angles))
-    residual, wrong = (CGLS(niter=8).run(s).residuals[-1] for s in (scan, other))
+    residual, wrong = (run_algorithm(s, CGLS(niter=8)).residuals[-1] for s in (scan, other))
     assert residual < 0.05 and wrong > 1.5 * residual
 
 

@@ -12,7 +12,9 @@ from helpers.script import FIT, SCENE, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.slabs import write_slabs
-from lingo_mi.files.volumes import first_voxel, read_volume, write_volume
+from lingo_mi.files.volumes import read_volume, write_volume
+from lingo_mi.geometry.grid import Grid
+from lingo_mi.reconstruction.run import run_algorithm
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 
@@ -42,8 +44,8 @@ def slabs(volume, thickness):
 def test_nifti(tmp_path, name):
     """Byte for byte what the whole volume gives, but for what gzip keeps of the name and the time."""
     g, v = geometry((7, 6, 11)), noise((7, 6, 11))
-    write_slabs(tmp_path / name, g, slabs(v, 4))
-    write_volume(tmp_path / 'whole.nii', v, g.dVoxel, first_voxel(g), 'density per mm')
+    write_slabs(tmp_path / name, g.grid, slabs(v, 4))
+    write_volume(tmp_path / 'whole.nii', v, g.grid, 'density per mm')
     if name.endswith('.nii'):
         assert (tmp_path / name).read_bytes() == (tmp_path / 'whole.nii').read_bytes()
     found, whole = read_volume(tmp_path / name), read_volume(tmp_path / 'whole.nii')
@@ -56,7 +58,7 @@ def test_nifti(tmp_path, name):
 def test_ome_zarr(tmp_path, thickness):
     zarr = pytest.importorskip('zarr')
     g, v = geometry((140, 30, 43)), noise((140, 30, 43))
-    write_slabs(tmp_path / 'v.ome.zarr', g, slabs(v, thickness))
+    write_slabs(tmp_path / 'v.ome.zarr', g.grid, slabs(v, thickness))
     group = zarr.open_group(str(tmp_path / 'v.ome.zarr'), mode='r')
     np.testing.assert_array_equal(np.asarray(group['0'][:]).transpose(2, 1, 0), v)
     level, want = 1, v.transpose(2, 1, 0)
@@ -68,19 +70,19 @@ def test_ome_zarr(tmp_path, thickness):
     assert level == 3
     (image,) = group.attrs['ome']['multiscales']
     assert [axis['name'] for axis in image['axes']] == ['z', 'y', 'x'] and image['axes'][0]['unit'] == 'millimeter'
-    corner = first_voxel(g)[::-1]
+    corner = g.grid.first_voxel[::-1]
     for i, dataset in enumerate(image['datasets']):
         scale, place = (t[t['type']] for t in dataset['coordinateTransformations'])
-        np.testing.assert_allclose(scale, np.array(g.dVoxel)[::-1] * 2**i)
+        np.testing.assert_allclose(scale, np.array(g.grid.spacing)[::-1] * 2**i)
         # The outer corner of all levels is the same.
-        np.testing.assert_allclose(np.array(place) - np.array(scale) / 2, corner - np.array(g.dVoxel)[::-1] / 2)
+        np.testing.assert_allclose(np.array(place) - np.array(scale) / 2, corner - np.array(g.grid.spacing)[::-1] / 2)
 
 
 def test_ome_zarr_is_valid(tmp_path):
     """By the models of the specification, written by others."""
     models = pytest.importorskip('ome_zarr_models.v05')
     zarr = pytest.importorskip('zarr')
-    write_slabs(tmp_path / 'v.ome.zarr', geometry((70, 20, 10)), slabs(noise((70, 20, 10)), 10))
+    write_slabs(tmp_path / 'v.ome.zarr', geometry((70, 20, 10)).grid, slabs(noise((70, 20, 10)), 10))
     image = models.Image.from_zarr(zarr.open_group(str(tmp_path / 'v.ome.zarr'), mode='r'))
     assert len(image.ome_attributes.multiscales[0].datasets) == 2
 
@@ -90,17 +92,17 @@ def test_bad_slabs(tmp_path, name):
     g, v = geometry((70, 6, 11)), noise((70, 6, 11))
     for bad in (slabs(v[:, :, :10], 4), slabs(v[:, :5], 4), slabs(np.concatenate([v, v], 2), 6), slabs(v * np.nan, 4)):
         with pytest.raises(InputError, match='slab|NaN'):
-            write_slabs(tmp_path / name, g, bad)
+            write_slabs(tmp_path / name, g.grid, bad)
         assert not any(tmp_path.iterdir())
     with pytest.raises(InputError, match='NIfTI'):
-        write_slabs(tmp_path / 'v.tif', g, slabs(v, 4))
+        write_slabs(tmp_path / 'v.tif', g.grid, slabs(v, 4))
 
 
 @pytest.mark.parametrize('thickness', [1, 5, 8, 24])
 def test_fdk(thickness):
     g = geometry((24, 20, 16), (4.0, 5.0, 6.0))
     scan = lm.simulate(noise((24, 20, 16)), g, progress=False).train
-    whole = lm.FDK().run(scan).volume
+    whole = run_algorithm(scan, lm.FDK()).volume
     found = np.concatenate(list(lm.FDK().slabs(scan, thickness)), 2)
     assert np.abs(found - whole).max() < 2e-6 * np.abs(whole).max()
 
@@ -109,7 +111,7 @@ def test_a_cloud(tmp_path):
     (tmp_path / 'tiny.xml').write_text(SCENE)
     data = lm.simulate(tmp_path / 'tiny.xml')
     result = lm.fit(data, 'fast', iterations=15, n_points=150, progress=False)
-    grid = data.train.geometry.with_volume((30, 26, 50), (0.8, 0.9, 0.5))
+    grid = Grid((30, 26, 50), (0.8, 0.9, 0.5))
     whole = result.volume(grid)
     result.save_volume(tmp_path / 'v.nii', grid, slab=7)
     assert np.abs(read_volume(tmp_path / 'v.nii').data - whole).max() < 2e-6 * whole.max() and whole.max() > 0
@@ -122,7 +124,7 @@ def test_completed_views_need_no_volume(tmp_path, monkeypatch):
     scene.write_text(SCENE)
     data = lm.simulate(scene)
     lm.fit(data, 'fast', iterations=10, n_points=100, progress=False).save(tmp_path / 'fit')
-    large = data.train.geometry.with_volume((120, 120, 24), 1)
+    large = data.train.geometry.on(Grid((120, 120, 24), 1))
     write_scan(tmp_path / 'scan.npy', lm.Scan(large, data.train.projections), 'npy')
     given = '--projections', tmp_path / 'scan.npy', '--algorithm', 'sart', '-D', 'niter=1'
     views = '--complete', tmp_path / 'fit' / 'result.xml', '--views', 12
@@ -202,7 +204,7 @@ from lingo_mi.files.slabs import write_slabs
 def go(nz, out):
     g = lm.Geometry.cone(DSO=1000, DSD=1500, nDetector=64, dDetector=8, nVoxel=(256, 256, nz), dVoxel=1, angles=np.arange(8.0))
     scan = lm.Scan(g, np.ones((8, 64, 64), np.float32))
-    write_slabs(out, g, lm.FDK().slabs(scan, 16))
+    write_slabs(out, g.grid, lm.FDK().slabs(scan, 16))
 
 def peak():
     return 1024 * next(int(l.split()[1]) for l in open('/proc/self/status') if l.startswith('VmHWM'))

@@ -8,19 +8,20 @@ import zlib
 import numpy as np
 import pytest
 
-from helpers.checkpoints import contents, write_as_before
-from helpers.fits import SHORT, assert_equal_states, geometry, some_points, tiny_scan
+from helpers.checkpoints import contents, rewrite
+from helpers.fits import SHORT, geometry, tiny_scan
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting import checkpoint, checkpoint_schema
-from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting import checkpoint_schema
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.loop import run
 
-SETTINGS = SHORT.changed(iterations=3, n_points=60, average=0.5, rate_pose=(1e-3, 1e-3), densify_from=100)
+METHOD = SHORT.changed(iterations=3, average=0.5, rate_pose=(1e-3, 1e-3), densify_from=100)
 ARRAYS = (
     *(f'{group}.{k}' for group in ('values', 'first', 'second') for k in ('centre', 'scale', 'rotation', 'density')),
     *(f'array.average.{k}' for k in ('centre', 'scale', 'rotation', 'density')),
     *(f'array.poses.{k}' for k in ('turn', 'shift', 'first', 'second', 'steps')),
-    *('gradient', 'seen', 'born', 'array.initial', 'array.order'),
+    *('gradient', 'visits', 'born', 'array.initial', 'array.order'),
 )
 WAYS = {
     'missing': None,
@@ -38,20 +39,20 @@ WAYS = {
     'changed': lambda a: a + a.dtype.type(1),
 }
 PLAIN = (
+    'method',
+    'settings',
+    'scanner',
+    'scan',
+    'unit',
     'seed',
     'rng',
     'iteration',
     'seconds',
     'history',
     'info',
-    'settings',
-    'unit',
     'effects',
-    'views',
-    'scanner',
-    'signal',
-    'moments',
-    'traits',
+    'search',
+    'seen',
 )
 VALUES = None, 'text', '', -1, 0, 1.5, float('nan'), float('inf'), 10**400, True, [], [1], {}, {'a': 1}, [{}]
 LEGAL = {  # a fit could have left these
@@ -61,7 +62,6 @@ LEGAL = {  # a fit could have left these
     'info': [{}, {'a': 1}],
     'unit': [1.5],
     'effects': [True],
-    'signal': [-1, 0, 1.5],
 }
 
 
@@ -69,7 +69,7 @@ LEGAL = {  # a fit could have left these
 def whole(tmp_path_factory):
     """The path of a checkpoint with averages and poses, and its entries."""
     scan, path = tiny_scan(geometry()), tmp_path_factory.mktemp('whole') / 'fit.npz'
-    run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path)
+    run(scan, METHOD, seed=3, path=path)
     return path, contents(path)
 
 
@@ -90,7 +90,7 @@ def refused(tmp_path):
 
 def line(path):
     with pytest.raises(InputError) as caught:
-        checkpoint.load(path)
+        Checkpoint.load(path)
     message = str(caught.value)
     assert message.startswith(f'{path}: ') and '\n' not in message and len(message) < 300 + len(str(path))
     return message.removeprefix(f'{path}: ')
@@ -118,7 +118,7 @@ def test_the_test_knows_every_entry(whole):
 
 @pytest.mark.parametrize('name', ARRAYS)
 def test_altered_arrays(whole, refused, tmp_path, name):
-    """With the checksum that was; and without, as in a checkpoint of an earlier program, where the alteration shows."""
+    """With the checksum that was; and with a right one, where the alteration shows."""
     path, content = whole
     for way in WAYS:
         bad = altered(content, name, way)
@@ -127,33 +127,30 @@ def test_altered_arrays(whole, refused, tmp_path, name):
         assert refused(bad)
         sound = name == 'array.order' and way in ('empty', 'shorter') or name == 'array.initial' and way == 'shorter'
         sound |= way == 'changed' and name not in ('array.order', 'array.poses.steps')
-        write_as_before(tmp_path / 'old.npz', bad)
+        rewrite(tmp_path / 'rewritten.npz', bad)
         if sound:
-            checkpoint.load(tmp_path / 'old.npz')
+            Checkpoint.load(tmp_path / 'rewritten.npz')
         else:
-            assert 'checksum' not in line(tmp_path / 'old.npz'), way
+            assert 'checksum' not in line(tmp_path / 'rewritten.npz'), way
 
 
 @pytest.mark.parametrize('name', PLAIN)
 def test_altered_plain_values(whole, refused, tmp_path, name):
     _, content = whole
     extra = json.loads(str(content['extra']))
-    path = tmp_path / 'old.npz'
+    path = tmp_path / 'rewritten.npz'
     for value in VALUES:
         bad = extra | {name: value}
         if bad == extra:
             continue
         assert refused(content | {'extra': np.array(json.dumps(bad))})
-        write_as_before(path, content, bad)
+        rewrite(path, content, bad)
         if any(value == legal and type(value) is type(legal) for legal in LEGAL.get(name, ())):
-            checkpoint.load(path)
+            Checkpoint.load(path)
         else:
             assert line(path), value
-    write_as_before(path, content, {k: v for k, v in extra.items() if k != name})
-    if name in ('unit', 'effects', 'moments', 'traits'):  # not in the first checkpoints
-        checkpoint.load(path)
-    else:
-        assert f'{name} is missing' in line(path)
+    rewrite(path, content, {k: v for k, v in extra.items() if k != name})
+    assert f'{name} is missing' in line(path)
 
 
 def test_a_history_of_one_gaussian(whole, tmp_path):
@@ -161,19 +158,19 @@ def test_a_history_of_one_gaussian(whole, tmp_path):
     extra = json.loads(str(content['extra']))
     for count in (1, 0):
         extra['history'][0]['gaussians'] = count
-        write_as_before(tmp_path / 'old.npz', content, extra)
+        rewrite(tmp_path / 'rewritten.npz', content, extra)
         if count:
-            checkpoint.load(tmp_path / 'old.npz')
+            Checkpoint.load(tmp_path / 'rewritten.npz')
         else:
-            assert 'history has no Gaussians' in line(tmp_path / 'old.npz')
+            assert 'history has no Gaussians' in line(tmp_path / 'rewritten.npz')
 
 
 def test_the_least_state_of_a_generator(whole, tmp_path):
     _, content = whole
     extra = json.loads(str(content['extra']))
     extra['rng'] |= {'state': {'state': 0, 'inc': 0}, 'has_uint32': 0, 'uinteger': 0}
-    write_as_before(tmp_path / 'old.npz', content, extra)
-    assert checkpoint.load(tmp_path / 'old.npz')
+    rewrite(tmp_path / 'rewritten.npz', content, extra)
+    assert Checkpoint.load(tmp_path / 'rewritten.npz')
 
 
 @pytest.mark.parametrize(
@@ -190,7 +187,14 @@ def test_the_least_state_of_a_generator(whole, tmp_path):
         ('settings', 'lambda_tv', [None, 'x', float('nan'), -1, 10**400, [1, 2]]),
         ('settings', 'iterations', [None, 2, 0, 1.5, 10**400]),
         ('settings', 'rate_pose', [[0, 0], [1], 'x']),
-        ('settings', 'render', ['alpha', 'x', 3]),
+        ('settings', 'start', ['random', 'x', 3]),
+        ('settings', 'densify', ['halve', 'opacities', None]),
+        ('scan', 'views', [None, 0, 4, 3.0, True]),
+        ('scan', 'signal', [None, 'x', float('nan'), 10**400]),
+        ('scan', 'moments', [None, 3, [], [1, 2], ['x', 0, 0], [0, 0, float('inf')]]),
+        ('scan', 'valid', ['x', 3, True]),
+        ('scan', 'effects', ['x', 3, True]),
+        ('scan', 'more', [1]),
         ('scanner', 'type', [None, 'bitmap']),
         ('scanner', 'filename', ['/etc/passwd']),
         ('scanner', 'poses', ['/etc/passwd', '1', 'nan', '../1']),
@@ -204,8 +208,8 @@ def test_altered_parts_of_plain_values(whole, tmp_path, name, key, values):
     for value in values:
         extra = json.loads(str(content['extra']))
         extra[name][key] = value
-        write_as_before(tmp_path / 'old.npz', content, extra)
-        assert line(tmp_path / 'old.npz'), value
+        rewrite(tmp_path / 'rewritten.npz', content, extra)
+        assert line(tmp_path / 'rewritten.npz'), value
 
 
 @pytest.mark.parametrize(
@@ -229,18 +233,18 @@ def test_altered_history(whole, tmp_path, entry, value):
     _, content = whole
     extra = json.loads(str(content['extra']))
     extra['history'][0][entry] = value
-    write_as_before(tmp_path / 'old.npz', content, extra)
-    assert 'history' in line(tmp_path / 'old.npz')
+    rewrite(tmp_path / 'rewritten.npz', content, extra)
+    assert 'history' in line(tmp_path / 'rewritten.npz')
 
 
 def test_what_does_not_belong_there(whole, refused, tmp_path):
     _, content = whole
     for more in ('values.hue', 'array.share', 'strange', 'array.poses.more'):
         assert 'checksum' in refused({**content, more: np.zeros(3)})
-        write_as_before(tmp_path / 'old.npz', {**content, more: np.zeros(3)})
-        assert more in line(tmp_path / 'old.npz')
-    write_as_before(tmp_path / 'old.npz', content, json.loads(str(content['extra'])) | {'more': 1})
-    assert 'more' in line(tmp_path / 'old.npz')
+        rewrite(tmp_path / 'rewritten.npz', {**content, more: np.zeros(3)})
+        assert more in line(tmp_path / 'rewritten.npz')
+    rewrite(tmp_path / 'rewritten.npz', content, json.loads(str(content['extra'])) | {'more': 1})
+    assert 'more' in line(tmp_path / 'rewritten.npz')
 
 
 def test_extra_that_is_no_json(whole, refused, tmp_path):
@@ -248,8 +252,10 @@ def test_extra_that_is_no_json(whole, refused, tmp_path):
     texts = '', 'x', '[' * 100_000, '{}', '[]', '3', 'null', '{"iteration": ' + '9' * 5000 + '}'
     for extra in (*(np.array(text) for text in texts), np.zeros(3), np.array(b'{}')):
         assert refused({**content, 'extra': extra})
-        np.savez(tmp_path / 'old.npz', **{**{k: v for k, v in content.items() if k != 'checksum'}, 'extra': extra})
-        assert line(tmp_path / 'old.npz')
+        np.savez(
+            tmp_path / 'rewritten.npz', **{**{k: v for k, v in content.items() if k != 'checksum'}, 'extra': extra}
+        )
+        assert line(tmp_path / 'rewritten.npz')
 
 
 def test_checksums(whole, refused):
@@ -257,16 +263,12 @@ def test_checksums(whole, refused):
     assert 'checksum is missing' in refused({k: v for k, v in content.items() if k != 'checksum'})
     for wrong in ('', 'f' * 32, str(content['checksum'])[::-1], 3, np.zeros(5)):
         assert 'checksum' in refused({**content, 'checksum': np.array(wrong)})
-    later = json.loads(str(content['extra'])) | {'version': 2}
-    bare = {k: v for k, v in content.items() if k != 'checksum'}
-    assert 'version is 2' in refused({**bare, 'extra': np.array(json.dumps(later))})
 
 
-@pytest.mark.parametrize('name', ['unit', 'effects'])
-def test_a_checkpoint_with_a_version_has_all_of_it(whole, tmp_path, name):
+@pytest.mark.parametrize('name', PLAIN)
+def test_plain_values_are_checked_without_the_file(whole, name):
     _, content = whole
     extra = json.loads(str(content['extra']))
-    assert 'version' in extra
     short = {k: v for k, v in extra.items() if k != name}
     arrays = {k: v for k, v in content.items() if k not in ('extra', 'checksum')}
     with pytest.raises(InputError, match=f'{name} is missing'):
@@ -310,7 +312,7 @@ def test_entries_twice(whole, tmp_path):
     path = tmp_path / 'twice.npz'
     path.write_bytes(whole[0].read_bytes())
     with zipfile.ZipFile(path, 'a') as archive, pytest.warns(UserWarning, match='Duplicate'):
-        archive.writestr('seen.npy', archive.read('seen.npy'))
+        archive.writestr('visits.npy', archive.read('visits.npy'))
     assert 'twice' in line(path)
 
 
@@ -320,15 +322,17 @@ def test_files_that_are_no_files(tmp_path):
         assert 'no regular file' in line(path)
 
 
-def test_earlier_checkpoints_are_read(whole, tmp_path):
-    path, content = whole
-    write_as_before(tmp_path / 'old.npz', content)
-    (new, extra, arrays), (old, extra_of_old, arrays_of_old) = map(checkpoint.load, (path, tmp_path / 'old.npz'))
-    assert_equal_states(new, old)
-    assert extra == extra_of_old and 'version' not in extra and arrays.keys() == arrays_of_old.keys()
-    scan = tiny_scan(geometry())
-    assert_equal_states(
-        run(scan, SETTINGS, None, seed=3, path=tmp_path / 'old.npz').state, Fitted.from_checkpoint(path).state
-    )
-    assert_equal_states(Fitted.from_checkpoint(tmp_path / 'old.npz').state, Fitted.from_checkpoint(path).state)
-    assert 'checksum' in contents(tmp_path / 'old.npz')  # written anew
+@pytest.mark.parametrize('version', [None, 1, 3, 2.5, '2', True])
+def test_other_versions_are_refused(whole, tmp_path, version):
+    """Those of earlier programs, of which the first had neither version nor checksum, and of later ones."""
+    _, content = whole
+    extra, path = json.loads(str(content['extra'])), tmp_path / 'checkpoint.npz'
+    before = {k: v for k, v in extra.items() if k != 'version'}
+    rewrite(path, content, before | {'version': version} if version else before)
+    assert f'its version is {version!r}, but this program reads 2; start again' in line(path)
+    for read in (Fit.load, lambda path: run(tiny_scan(geometry()), METHOD, seed=3, path=path, resume=True)):
+        with pytest.raises(InputError, match=r'but this program reads 2; start again$') as caught:
+            read(path)
+        assert '\n' not in str(caught.value)
+    np.savez(path, **{k: v for k, v in content.items() if k != 'checksum'})
+    assert 'its checksum is missing; start again' in line(path)

@@ -11,28 +11,26 @@ import pytest
 
 from helpers.effect_parts import detector, rendered_from_files, stepper_of, tube
 from helpers.effects import XML
-from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
+from helpers.fits import SHORT, assert_equal_states, geometry, stop_at, tiny_scan
 from helpers.script import fit
 from lingo_mi.common.errors import InputError
-from lingo_mi.completion.clouds import FittedCloud
 from lingo_mi.effects.focal_spot import FocalSpot
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.files.images import read_exr
 from lingo_mi.fitting import losses
-from lingo_mi.fitting.fitted import Fitted
-from lingo_mi.fitting.initial import initial_cloud
+from lingo_mi.fitting.corrections.poses import gathered, place
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.loss_scale import loss_scale
 from lingo_mi.fitting.measured import weights_of
-from lingo_mi.fitting.poses import gathered, place
-from lingo_mi.fitting.step import Stepper
+from lingo_mi.fitting.step import GaussianStepper
 from lingo_mi.fitting.view_loss import evaluate
+from lingo_mi.lingo.loss_scale import loss_scale
 from lingo_mi.projectors.backprop import Cuts, leaves, pass_on
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.splat import splat
-from lingo_mi.reconstruction.effects_correction import linearised
+from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.simulate import take_scan
@@ -55,8 +53,8 @@ def kernels(function):
 
 
 def plain_view(self, gaussians, target, batch):
-    """`Stepper._view` with no code of an effect in it: footprints, splat, loss, derivatives."""
-    s, extent, view = self.settings.loss, self.settings.model.extent, target.view
+    """`GaussianStepper._compare` with no code of an effect in it: footprints, splat, loss, derivatives."""
+    s, extent, view = self.method.loss, self.method.extent, target.view
     cut = Cuts()
     footprints = project(gaussians, view, extent, cut=cut)
     leaf = leaves(footprints.values)
@@ -89,10 +87,10 @@ def plain_view(self, gaussians, target, batch):
 def test_absent_costs_nothing(monkeypatch, effects, changes):
     """Without effects to model, a fit launches the kernels of a step that has never heard of them, in their order."""
     scan = replace(tiny_scan(geometry(3)), effects=effects)
-    settings = SHORT.changed(iterations=5, densify_from=100, **changes)
-    found = kernels(lambda: run(scan, settings, some_points(scan.geometry), seed=3))
-    monkeypatch.setattr(Stepper, '_view', plain_view)
-    assert found == kernels(lambda: run(scan, settings, some_points(scan.geometry), seed=3))
+    method = SHORT.changed(iterations=5, densify_from=100, **changes)
+    found = kernels(lambda: run(scan, method, seed=3))
+    monkeypatch.setattr(GaussianStepper, '_compare', plain_view)
+    assert found == kernels(lambda: run(scan, method, seed=3))
 
 
 @physics
@@ -155,15 +153,15 @@ def test_derivatives_by_differences(name):
 
     def loss(values):
         state.values = values
-        return float(stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)[0][0])
+        return float(stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
 
     values = dict(state.values)
     for v in values.values():
         dr.enable_grad(v)
     state.values = values
-    gaussians = state.gaussians(stepper.settings)
+    gaussians = stepper.forward.gaussians(state.values)
     leaf = leaves(gaussians)
-    stepper._view(leaf, target, 1)
+    stepper._compare(leaf, target, 1)
     pass_on(gaussians, map(dr.grad, leaf))
     rng = np.random.default_rng(1)
     for key, h in (('density', 2e-2), ('scale', 2e-2), ('centre', 4e-3)):
@@ -186,7 +184,7 @@ def test_derivatives_by_the_pose_through_bundles():
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
         place(target.view, target.rays)
-        stepper._view(leaves(state.gaussians(stepper.settings)), target, 1)
+        stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)
         found.append(np.concatenate(list(gathered(target.view).values())))
     np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
 
@@ -202,12 +200,12 @@ def test_hardening_is_inverted_for_initial_clouds():
     effects = Effects(tube(), None, None)
     bands = effects.tube.signal(['soft tissue'])
     hard = replace(clean, projections=np.stack([bands.hardened(p) for p in clean.projections]), effects=effects)
-    np.testing.assert_allclose(effects.linearised(hard).projections, clean.projections, atol=1e-5)
-    settings = SHORT.changed(init='lingo', n_points=50, init_density='fdk')
-    expected, found = (initial_cloud(scan, settings, seed=2) for scan in (clean, hard))
+    np.testing.assert_allclose(effects.without_hardening(hard.projections), clean.projections, atol=1e-5)
+    method = SHORT.changed(start='masks', n_points=50, density='fdk')
+    expected, found = (method.starting_cloud(scan, seed=2) for scan in (clean, hard))
     np.testing.assert_allclose(found.density, expected.density, rtol=1e-3)
     np.testing.assert_allclose(found.points, expected.points)
-    ignored = initial_cloud(hard, settings.changed(effects='ignore'), seed=2)
+    ignored = method.changed(effects='ignore').starting_cloud(hard, seed=2)
     assert not np.allclose(ignored.density, expected.density, rtol=1e-2)
 
 
@@ -221,8 +219,8 @@ def test_the_volume_is_at_the_reference_energy():
     hard = replace(clean, projections=bands.hardened(clean.projections), effects=effects)
     volumes = []
     for scan, change in ((clean, 'model'), (hard, 'model'), (hard, 'ignore')):
-        settings = SHORT.changed(iterations=60, effects=change, densify_from=1000, init='lingo', n_points=100)
-        fitted = run(scan, settings, initial_cloud(scan, settings), seed=3)
+        method = SHORT.changed(iterations=60, effects=change, densify_from=1000, start='masks', n_points=100)
+        fitted = run(scan, method, seed=3)
         volumes.append(fitted.volume())
     errors = [np.linalg.norm(v - volumes[0]) / np.linalg.norm(volumes[0]) for v in volumes[1:]]
     assert errors[0] < 0.3 * errors[1] and errors[1] > 0.03
@@ -230,7 +228,7 @@ def test_the_volume_is_at_the_reference_energy():
 
 def test_dead_pixels_are_left_out():
     scan = replace(tiny_scan(geometry(3)), effects=Effects(None, None, detector(dead=0.1)))
-    masks = [Stepper(scan, SHORT.changed(effects=e)).targets[0].valid for e in ('model', 'ignore')]
+    masks = [SHORT.changed(effects=e).stepper(scan).targets[0].valid for e in ('model', 'ignore')]
     dead = scan.effects.detector.maps(scan.geometry.nDetector)[1]
     np.testing.assert_array_equal(masks[0].numpy(), ~dead.ravel())
     assert masks[1] is None and 0 < dead.sum() < dead.size
@@ -243,19 +241,19 @@ def test_noise_is_weighed():
     g, effects = geometry(2), Effects(None, None, seen)
     valid = np.ones(p.shape, bool)
     valid[:, 5:7, 8:20] = False
-    scan, settings = Scan(g, np.where(valid, p, np.nan), valid, effects), SHORT.changed(weights='noise')
-    weights = weights_of(scan, settings)
+    scan, method = Scan(g, np.where(valid, p, np.nan), valid, effects), SHORT.changed(weights='noise')
+    weights = weights_of(scan, 'noise')
     noisy = np.stack([seen.measure(np.exp(-p[0]), view) for view in range(400)])[:, 12:]
     inner = [slice(8 * i + 1, 8 * i + 7) for i in range(4)]
     spread = np.array([(noisy * weights[0, 12:])[:, :, at].std() for at in inner])
     np.testing.assert_allclose(spread, spread[0], rtol=0.04)  # of the second order: 100 photons
     np.testing.assert_allclose((weights * scan.projections).max(), 3, rtol=1e-6)
     np.testing.assert_allclose(weights[0, 5:7, 9:15], weights[0, 20, 12], rtol=1e-6)
-    target = Stepper(scan, settings).targets[0]
+    target = method.stepper(scan).targets[0]
     np.testing.assert_allclose(target.masked(target.pixels / target.weights).numpy(), target.pixels.numpy(), rtol=1e-6)
     for without in (None, Effects(None, None, detector(psf=1.0))):
         with pytest.raises(InputError, match='weights=noise needs a ct_detector with photons or bits'):
-            Stepper(replace(scan, effects=without), settings)
+            method.stepper(replace(scan, effects=without))
 
 
 def test_rounding_is_weighed():
@@ -277,10 +275,10 @@ def test_saturated_pixels_pull_only_from_above():
     scan = replace(scan, projections=np.stack([effects.detector.measure(v, i) for i, v in enumerate(light)]))
     dark = scan.projections > least + 1e-6
     assert 0.1 < dark.mean() < 0.9
-    linear = linearised(scan, effects).projections
+    linear = line_integrals(scan).projections
     np.testing.assert_array_equal(linear[~dark], 0)
     np.testing.assert_array_equal(linear[dark], scan.projections[dark])
-    model, view = Stepper(scan, SHORT).model.signal, Stepper(scan, SHORT).targets[0].view
+    model, view = SHORT.stepper(scan).model.signal, SHORT.stepper(scan).targets[0].view
     factor = model.factor.numpy()[0]
     for shift, slope in ((-0.01, 0), (0.01, 1)):
         p = mi.Float(((least + shift) / factor).ravel())
@@ -296,10 +294,10 @@ def test_resumed_fit_is_the_same_fit(tmp_path, variant):
     """Also between two looks at the shares of two materials."""
     scan = tiny_scan(geometry(3))
     scan = replace(scan, projections=scan.projections / 50, effects=EFFECTS['two materials']())
-    whole, path = run(scan, SHORT, some_points(scan.geometry), seed=3), tmp_path / 'fit.npz'
+    whole, path = run(scan, SHORT, seed=3), tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
-        run(scan, SHORT, some_points(scan.geometry), seed=3, path=path, progress=stop_at(15))
-    again = run(scan, SHORT, None, seed=3, path=path)
+        run(scan, SHORT, seed=3, path=path, progress=stop_at(15))
+    again = run(scan, SHORT, seed=3, path=path, resume=True)
     if variant.startswith('llvm'):
         assert_equal_states(again.state, whole.state)
 
@@ -344,17 +342,19 @@ def test_what_a_fit_leaves_behind(tmp_path):
 def test_what_cannot_be_modelled(effects, match):
     scan = replace(tiny_scan(geometry(3)), effects=effects())
     with pytest.raises(InputError, match=match):
-        Stepper(scan, SHORT)
-    Stepper(scan, SHORT.changed(effects='ignore'))
+        SHORT.stepper(scan)
+    SHORT.changed(effects='ignore').stepper(scan)
 
 
-def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path):
+def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path, monkeypatch):
+    """Which stand in result.xml beside it."""
     effects, path = Effects(None, None, detector(psf=15.0)), tmp_path / 'fit.npz'
     scan = replace(tiny_scan(geometry(3)), effects=effects)
-    done = run(scan, SHORT.changed(iterations=2), some_points(scan.geometry), path=path)
+    done = run(scan, SHORT.changed(iterations=2), path=path)
     with pytest.raises(InputError, match='modelled effects'):
-        Fitted.from_checkpoint(path)
-    again = Fitted.from_checkpoint(path, effects)
+        Fit.load(path)
+    monkeypatch.setattr('lingo_mi.fitting.save.write_report', lambda *_: None)
+    again = Fit.load(done.save(tmp_path / 'fit'))
     np.testing.assert_allclose(again.render(scan.geometry), done.render(scan.geometry), rtol=1e-5, atol=1e-5)
 
 
@@ -364,5 +364,5 @@ def test_a_cloud_stands_for_all_shapes():
     made = Tube.of(TubeParameters(kvp=120.0, material='water', materials=dict(bolt='Al'), split='.04, .09'))
     scan = replace(tiny_scan(geometry(8)), effects=Effects(made))
     scan = replace(scan, projections=scan.projections / 20)
-    fitted = run(scan, SHORT.changed(iterations=4, densify_from=100), some_points(scan.geometry), seed=3)
-    assert FittedCloud.of(fitted).effects.tube.made_of('cloud') == ('water', 'Al')
+    fitted = run(scan, SHORT.changed(iterations=4, densify_from=100), seed=3)
+    assert fitted.model.effects.of_cloud().tube.made_of('cloud') == ('water', 'Al')

@@ -1,25 +1,27 @@
 """The step to stop at: the search for it, the fit that ends there, resuming either, and what cannot be searched."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.checkpoints import contents, write_as_before
-from helpers.fits import SHORT, assert_equal_states, geometry, some_points, stop_at, tiny_scan
+from helpers.checkpoints import contents, rewrite
+from helpers.fits import SHORT, assert_equal_states, geometry, stop_at, tiny_scan
 from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting import checkpoint
-from lingo_mi.fitting.bounded import bounded
-from lingo_mi.fitting.fitted import Fitted
+from lingo_mi.fitting import loop
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.recipes import METHODS
-from lingo_mi.fitting.step import Stepper
-from lingo_mi.fitting.stopping import Search
-from lingo_mi.results.measure import measure, summary
+from lingo_mi.fitting.measure import measure, summary
+from lingo_mi.fitting.methods.by_name import METHODS
+from lingo_mi.fitting.stopping import HeldOut, sentence
 
-SETTINGS = SHORT.changed(iterations=160, stop='on', stop_every=10, stop_patience=30, average=0.9)
+METHOD = SHORT.changed(
+    start='fdk', n_points=2000, iterations=160, stop='on', stop_every=10, stop_patience=30, average=0.9
+)
 
 
 def noisy(photons=200.0, views=12):
@@ -37,7 +39,7 @@ def scan():
 
 @pytest.fixture(scope='module')
 def whole(scan):
-    return run(scan, SETTINGS, some_points(scan.geometry), seed=3)
+    return run(scan, METHOD, seed=3)
 
 
 def test_it_stops_at_the_step_of_the_least_error(whole):
@@ -50,8 +52,8 @@ def test_it_stops_at_the_step_of_the_least_error(whole):
 def test_its_steps_are_those_of_a_fit_without_a_search(scan, whole, tmp_path, sums_in_order):
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
-        run(scan, SETTINGS.changed(stop='off'), some_points(scan.geometry), 3, path=path, progress=stop_at(whole.steps))
-    plain = Fitted.from_checkpoint(path)
+        run(scan, METHOD.changed(stop='off'), 3, path=path, progress=stop_at(whole.steps))
+    plain = Fit.load(path)
     for name, values in whole.state.values.items():
         np.testing.assert_array_equal(values, plain.state.values[name])
 
@@ -81,50 +83,58 @@ def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
     searched_enough.wanted = len(whole.search['errors'])
     progress = dict(search=stop_at(25), between=searched_enough, fit=fitting(20))[where]
     with pytest.raises(KeyboardInterrupt):
-        run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path, progress=progress)
+        run(scan, METHOD, seed=3, path=path, progress=progress)
     if where != 'fit':
         with pytest.raises(InputError, match='still searches for the step to stop at'):
-            Fitted.from_checkpoint(path)
-    again = run(scan, SETTINGS, None, seed=3, path=path)
+            Fit.load(path)
+    again = run(scan, METHOD, seed=3, path=path, resume=True)
     assert_equal_states(again.state, whole.state)
     assert again.search == whole.search
-    stored = Fitted.from_checkpoint(path)
+    stored = Fit.load(path)
     assert stored.search == whole.search and stored.steps == whole.steps
     np.testing.assert_array_equal(stored.state.values['centre'], whole.state.values['centre'])
 
 
-def test_the_search_has_the_rates_of_the_fit(scan):
+def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
     """Those of alpha compositing are in units of the radius of the scene, which fewer views tell a little otherwise."""
-    given = METHODS['3dgs'].changed(stop='on')
-    used = Stepper(scan, bounded(given, scan)).settings.adam.rate_centre
-    assert Search(scan, given).stepper().settings.adam.rate_centre == pytest.approx(used, rel=0.1)
-    assert used[0] > 2 * given.adam.rate_centre[0]
+    given, searched = METHODS['3dgs'].changed(stop='on'), []
+
+    def running(scan, seen, method, seed, stored, search, own):
+        searched.append(own.stepper(seen).method)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, 'Running', running)
+    with pytest.raises(KeyboardInterrupt):
+        run(scan, given)
+    used = given.bounded(scan).stepper(scan).method.rates.rate_centre
+    assert searched[0].rates.rate_centre == pytest.approx(used, rel=0.1)
+    assert used[0] > 2 * given.rates.rate_centre[0]
 
 
 def test_what_is_told(scan, whole):
-    numbers = measure(whole).numbers
-    assert numbers['iterations'] == whole.steps and numbers['search']['kept'] == whole.steps
+    numbers = measure(whole)
+    assert numbers['iterations'] == whole.steps and numbers['search']['best'] == whole.steps
     assert numbers['stopping'] == f'stopped at step {whole.steps}: held-out error did not fall for 30 steps more'
     assert numbers['stopping'] in summary(numbers)
     seen = []
-    run(scan, SETTINGS.changed(iterations=10), some_points(scan.geometry), progress=lambda done, **f: seen.append(f))
+    run(scan, METHOD.changed(iterations=10), progress=lambda done, **f: seen.append(f))
     assert [('held_out' in f, f.get('stops_at')) for f in seen] == [(True, None)] * 10 + [(False, 10)] * 10
 
 
 def test_a_search_to_the_end(scan):
-    found = run(scan, SETTINGS.changed(iterations=20), some_points(scan.geometry), seed=3)
-    assert found.steps == 20 and found.search['said'] == 'took all 20 steps: the held-out error fell to the end'
+    found = run(scan, METHOD.changed(iterations=20), seed=3)
+    assert found.steps == 20 and sentence(found.search) == 'took all 20 steps: the held-out error fell to the end'
 
 
 def test_auto_is_for_scans_whose_noise_is_known(scan):
-    auto = SETTINGS.changed(stop='auto')
-    assert bounded(auto, scan).stopping.stop == 'on'
-    for other, settings in (
+    auto = METHOD.changed(stop='auto')
+    assert auto.bounded(scan).stopping.stop == 'on'
+    for other, method in (
         (replace(scan, effects=None), auto),
         (scan.subset([0, 1, 2]), auto),
         (scan, auto.changed(rate_pose=(1e-3, 1e-3))),
     ):
-        assert bounded(settings, other).stopping.stop == 'off'
+        assert method.bounded(other).stopping.stop == 'off'
     assert {name for name, s in METHODS.items() if s.stopping.stop != 'off'} <= {'fast'}
 
 
@@ -140,21 +150,26 @@ def test_auto_is_for_scans_whose_noise_is_known(scan):
 )
 def test_bad_options(views, changes, message):
     with pytest.raises(InputError) as caught:
-        bounded(SETTINGS.changed(**changes), noisy(views=views))
+        METHOD.changed(**changes).bounded(noisy(views=views))
     assert message in str(caught.value) and '\n' not in str(caught.value)
 
 
-def test_views_that_are_held_out_are_not_seen(scan):
-    search = Search(scan, SETTINGS)
-    assert len(search.seen) == 10 and len(search.held_out) == 2
-    seen = {view.tobytes() for view in search.seen.projections}
-    assert not any(view.tobytes() in seen for view in search.held_out.projections)
+def test_views_that_are_held_out_are_not_seen(scan, tmp_path, sums_in_order):
+    """Neither by the start nor by the steps: whatever they show, the search is at the same state."""
+    held_out = HeldOut(scan, METHOD)
+    assert len(held_out.seen) == 10 and len(held_out.views) == 2
+    seen = {view.tobytes() for view in held_out.seen.projections}
+    assert not any(view.tobytes() in seen for view in held_out.views.projections)
     other = scan.projections.copy()
     other[[2, 7]] += 1  # those held out
-    start = search.begin(search.stepper().start(some_points(scan.geometry), np.random.default_rng(0)), 3)[1]
-    changed = Search(replace(scan, projections=other), SETTINGS)
-    again = changed.begin(changed.stepper().start(some_points(scan.geometry), np.random.default_rng(0)), 3)[1]
-    assert_equal_states(start, again)
+    path, states = tmp_path / 'fit.npz', []
+    for each in (scan, replace(scan, projections=other)):
+        with pytest.raises(KeyboardInterrupt):
+            run(each, METHOD.changed(start='edges', n_points=60), seed=3, path=path, progress=stop_at(8))
+        stored = Checkpoint.load(path)
+        assert stored.searching and stored.seen == 10
+        states.append(stored.state)
+    assert_equal_states(*states)
 
 
 @pytest.mark.parametrize('where', ['search', 'fit'])
@@ -162,32 +177,57 @@ def test_altered_checkpoints(scan, tmp_path, where):
     path = tmp_path / 'fit.npz'
     progress = stop_at(25) if where == 'search' else fitting(20)
     with pytest.raises(KeyboardInterrupt):
-        run(scan, SETTINGS, some_points(scan.geometry), seed=3, path=path, progress=progress)
+        run(scan, METHOD, seed=3, path=path, progress=progress)
     content = contents(path)
-    names = [name for name in content if name.startswith('array.search.')]
-    assert len(names) == (4 if where == 'fit' else 8)
-    write_as_before(tmp_path / 'old.npz', content | {'array.search.rows': np.ones(7)})  # of earlier programs
-    checkpoint.load(tmp_path / 'old.npz')
-    for name in names:
-        old = content[name]
-        gone = [] if name == 'array.search.views' else [None]  # which checkpoints of earlier programs lack
-        for bad in (*gone, old[:0], old[..., None], old.astype(complex), old - 1000 if old.ndim == 1 else old[:-1]):
-            altered = {k: v for k, v in content.items() if k != name} | ({} if bad is None else {name: bad})
-            write_as_before(tmp_path / 'old.npz', altered)
-            with pytest.raises(InputError, match='not a checkpoint of a fit, or it is damaged'):
-                checkpoint.load(tmp_path / 'old.npz')
+    extra = json.loads(str(content['extra']))
+    search, steps, errors = extra['search'], extra['search']['iterations'], extra['search']['errors']
+    assert extra['seen'] == (10 if where == 'search' else 12) and len(steps) == len(errors) > 1
+    rewrite(path, content, extra)
+    Checkpoint.load(path)
+    bad = [
+        dict(search=None),
+        dict(search={k: v for k, v in search.items() if k != 'best'}),
+        *(dict(search=search | change) for change in (
+            dict(best=None),
+            dict(best=-10),
+            dict(best=steps[-1] + 10),
+            dict(best=steps[0] + 1),
+            dict(iterations=steps[::-1]),
+            dict(iterations=steps[:-1]),
+            dict(iterations=[0, *steps[1:]]),
+            dict(iterations=[*steps[:-1], 170]),
+            dict(iterations=[str(step) for step in steps]),
+            dict(iterations=None),
+            dict(errors=errors[:-1]),
+            dict(errors=[-error for error in errors]),
+            dict(errors=[float('nan'), *errors[1:]]),
+            dict(errors=None),
+            dict(more=1),
+        )),
+        dict(seen=0),
+        dict(seen=13),
+        dict(seen=None),
+        dict(seen=12 if where == 'search' else 5),
+        dict(settings=extra['settings'] | dict(stop='off')),
+        {'iteration': 15 if where == 'search' else search['best'] + 1},
+    ]  # fmt: skip
+    for change in bad:
+        rewrite(path, content, extra | change)
+        with pytest.raises(InputError, match='not a checkpoint of a fit, or it is damaged') as caught:
+            Checkpoint.load(path)
+        assert '\n' not in str(caught.value), change
 
 
 def test_views_without_a_valid_pixel_do_not_count(scan, tmp_path):
     """They are no views to hold out, and a search that sees fewer goes on from its checkpoint."""
     valid = np.ones(scan.projections.shape, bool)
     valid[3] = False
-    path, settings = tmp_path / 'fit.npz', SETTINGS.changed(fit_air='view')
+    path, method = tmp_path / 'fit.npz', METHOD.changed(start='points', fit_air='view')
     with pytest.raises(KeyboardInterrupt):
-        run(replace(scan, valid=valid), settings, some_points(scan.geometry), path=path, progress=stop_at(15))
-    assert run(replace(scan, valid=valid), settings, None, path=path).search is not None
+        run(replace(scan, valid=valid), method, path=path, progress=stop_at(15))
+    assert run(replace(scan, valid=valid), method, path=path, resume=True).search is not None
     valid[3:] = False
     few = replace(scan, valid=valid)
-    assert bounded(SETTINGS.changed(stop='auto'), few).stopping.stop == 'off'
+    assert METHOD.changed(stop='auto').bounded(few).stopping.stop == 'off'
     with pytest.raises(InputError, match='at least 4 with valid pixels, but the scan has 3'):
-        bounded(SETTINGS, few)
+        METHOD.bounded(few)

@@ -12,11 +12,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from helpers.circles import circle
 from helpers.same import adds_in_any_order, assert_same
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.functional import project, voxelize
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.upload import uploaded_tensor
 from lingo_mi.studies import oracle
@@ -37,11 +38,9 @@ def scan(mode='cone', nVoxel=(11, 9, 10)):
         DSD=750,
         nDetector=(24, 31),
         dDetector=(7, 6),
-        nVoxel=nVoxel,
-        dVoxel=(9, 10, 8),
         angles=circular(3),
         mode=mode,
-        offOrigin=(4, -3, 2),
+        grid=Grid(nVoxel, (9, 10, 8), (4, -3, 2)),
     )
 
 
@@ -155,7 +154,7 @@ def test_the_closed_form_agrees():
 @pytest.mark.parametrize('nVoxel', [(11, 9, 10), (6, 1, 13)])
 def test_voxels(kind, nVoxel):
     g, cloud = scan(nVoxel=nVoxel), gaussians()
-    axes = [o + d * (np.arange(n) - (n - 1) / 2) for o, d, n in zip(g.offOrigin, g.dVoxel, nVoxel)]
+    axes = [o + d * (np.arange(n) - (n - 1) / 2) for o, d, n in zip(g.grid.centre, g.grid.spacing, nVoxel)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), -1).reshape(-1, 3)
     weights = np.float32(np.random.default_rng(0).normal(size=nVoxel)).astype(float)
 
@@ -281,9 +280,7 @@ def test_within_a_jitted_function_of_jax():
 def test_a_training_loop_in_torch():
     """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
     torch = framework('torch')
-    g = CircularGeometry(
-        DSO=500, DSD=750, nDetector=(32, 32), dDetector=6, nVoxel=(16,) * 3, dVoxel=8, angles=circular(8)
-    )
+    g = CircularGeometry(DSO=500, DSD=750, nDetector=(32, 32), dDetector=6, angles=circular(8), grid=Grid((16,) * 3, 8))
     rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
     measured = torch.tensor(project(*truth, g, extent=8.0), device=_device())
     grid = voxelize(*truth, g, extent=8.0)
@@ -401,7 +398,7 @@ def test_bad_extent(extent):
 @pytest.mark.parametrize('count', [100_000, 1_000_000])
 def test_results_larger_than_memory(count):
     huge = dict(nDetector=count, nVoxel=count, dDetector=1e-6, dVoxel=1e-6)
-    geometry = CircularGeometry(DSO=5, DSD=7, angles=[0.0, 1.0], **huge)
+    geometry = circle(DSO=5, DSD=7, angles=[0.0, 1.0], **huge)
     for function in (project, voxelize):
         with pytest.raises(InputError, match='do not fit into this process'):
             function(*GOOD, geometry)
@@ -438,11 +435,10 @@ def test_a_fresh_process(kind):
     program = f"""
 import sys, {make.partition('.')[0]}
 from lingo_mi.functional import project, voxelize
-from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.geometry.trajectories import circular
+from lingo_mi.geometry import Geometry, Grid, circular
 cloud = [{make}(x) for x in ([[0.0, 1.0, 2.0]], [[9.0, 8.0, 7.0]], [[0.0, 0.0, 0.0, 1.0]], [0.5])]
-geometry = CircularGeometry(
-    DSO=500, DSD=750, nDetector=(8, 9), dDetector=20, nVoxel=(4, 5, 6), dVoxel=20, angles=circular(2)
+geometry = Geometry.cone(
+    DSO=500, DSD=750, nDetector=(8, 9), dDetector=20, grid=Grid((4, 5, 6), 20), angles=circular(2)
 )
 print(project(*cloud, geometry).shape, voxelize(*cloud, geometry).shape, *sorted({{'torch', 'jax'}} & set(sys.modules)))
 """

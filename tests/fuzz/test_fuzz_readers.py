@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.fitting import checkpoint
+from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.studies.fuzz import corpus, pool
 from lingo_mi.studies.fuzz.child import verdict
 from lingo_mi.studies.fuzz.page import page
@@ -55,7 +55,7 @@ def test_an_entry_of_a_checkpoint_whose_header_has_no_end(tmp_path):
     members['born.npy'] = members['born.npy'].replace(b'}', b'(')
     (tmp_path / 'c.npz').write_bytes(corpus.zipped(members))
     with pytest.raises(InputError, match='no array'):
-        checkpoint.load(tmp_path / 'c.npz')
+        Checkpoint.load(tmp_path / 'c.npz')
 
 
 def test_a_case_is_made_again_from_its_number(tmp_path):

@@ -8,8 +8,7 @@ import pytest
 
 from helpers.poses import to_matrices
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry import astra, rtk
-from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry import CircularGeometry, Geometry, Grid, PosedGeometry, astra, rtk
 from lingo_mi.geometry.matrices import from_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, scanner_rays
@@ -29,8 +28,9 @@ def same_rays(a: Rays, b: Rays, tolerance=1e-9):
 
 
 def same_grid(a: Geometry, b: Geometry):
-    for name in ('mode', 'nDetector', 'nVoxel', 'dVoxel', 'offOrigin'):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert (a.mode, a.nDetector) == (b.mode, b.nDetector)
+    for x, y in ((a.grid.shape, b.grid.shape), (a.grid.spacing, b.grid.spacing), (a.grid.centre, b.grid.centre)):
+        np.testing.assert_array_equal(x, y)
 
 
 def scanner(parallel=False, **motion):
@@ -52,7 +52,7 @@ def test_circles(make):
     parallel = make == Geometry.parallel
     g = make(**numbers, offDetector=(4.0, -5.0), offOrigin=(1.0, -2.0, 3.0))
     assert isinstance(g, CircularGeometry) and g.mode == ('parallel' if parallel else 'cone')
-    assert (g.offOrigin, g.offDetector) == ((1, -2, 3), (4, -5))
+    assert (g.grid.centre, g.offDetector) == ((1, -2, 3), (4, -5))
     same_rays(g.rays(), scanner(parallel, offDetector=(4.0, -5.0)), 0)
 
 
@@ -60,9 +60,11 @@ def test_one_number_stands_for_all():
     g = Geometry.cone(
         DSO=9, DSD=14, nDetector=8, dDetector=2, nVoxel=4, dVoxel=0.5, angles=0.3, offOrigin=1, offDetector=2
     )
-    assert g.nDetector == (8, 8) and g.dDetector == (2, 2) and g.nVoxel == (4, 4, 4) and g.dVoxel == (0.5,) * 3
-    assert g.offOrigin == (1, 1, 1) and g.offDetector == (2, 2) and len(g) == 1
-    assert g.sDetector == (16, 16) and g.sVoxel == (2, 2, 2) and g.scale == 1
+    assert (
+        g.nDetector == (8, 8) and g.dDetector == (2, 2) and g.grid.shape == (4, 4, 4) and g.grid.spacing == (0.5,) * 3
+    )
+    assert g.grid.centre == (1, 1, 1) and g.offDetector == (2, 2) and len(g) == 1
+    assert g.sDetector == (16, 16) and g.grid.size == (2, 2, 2) and g.grid.scale == 1
     turned = Geometry.cone(**CONE, rotDetector=0.1)
     same_rays(turned.rays(), scanner(rotDetector=(0.1, 0.1, 0.1)))
 
@@ -97,7 +99,7 @@ def test_helix_by_hand():
 
 def test_poses_choose_their_kind():
     circle = Geometry.from_poses(scanner(offDetector=(4.0, -5.0)), PANEL['nDetector'], **GRID, offOrigin=(1, 2, 3))
-    assert isinstance(circle, CircularGeometry) and circle.offOrigin == (1, 2, 3)
+    assert isinstance(circle, CircularGeometry) and circle.grid.centre == (1, 2, 3)
     np.testing.assert_allclose([circle.DSO, circle.DSD, *circle.offDetector], [900, 1400, 4, -5])
     posed = Geometry.from_poses(scanner(tilt=0.1), PANEL['nDetector'], **GRID)
     assert isinstance(posed, PosedGeometry)
@@ -150,12 +152,12 @@ def test_methods_of_both_kinds(tilt):
     both = some.joined(g)
     assert type(both) is kind and len(both) == 5
     same_rays(both.rays(), f[[2, 0, 0, 1, 2]])
-    finer = g.with_volume((10, 12, 14), 0.5)
-    assert type(finer) is kind and finer.nVoxel == (10, 12, 14) and finer.dVoxel == (0.5,) * 3
+    finer = g.on(Grid((10, 12, 14), 0.5, g.grid.centre))
+    assert type(finer) is kind and finer.grid.shape == (10, 12, 14) and finer.grid.spacing == (0.5,) * 3
     same_rays(finer.rays(), f, 0)
     n = g.normalised_rays()
     np.testing.assert_allclose(n.source, (f.source - (1, -2, 3)) * 2 / 21)
-    assert g.half.max() == 1
+    assert g.grid.half.max() == 1
 
 
 @pytest.mark.parametrize('tilt', [0.0, 0.1])
@@ -237,7 +239,7 @@ def test_tigre_repeats_its_numbers():
         mode='cone',
     )
     g = Geometry.from_tigre(vars(geo), np.stack([ANGLES, 0 * ANGLES, 0 * ANGLES], 1))
-    assert isinstance(g, CircularGeometry) and (g.DSO, g.DSD, g.offOrigin) == (900, 1400, (1, -2, 3))
+    assert isinstance(g, CircularGeometry) and (g.DSO, g.DSD, g.grid.centre) == (900, 1400, (1, -2, 3))
     same_rays(g.rays(), scanner(offDetector=(4.0, -5.0)), 0)
 
 
@@ -261,10 +263,10 @@ def test_tigre_moves_the_object():
     """An offOrigin a view: the object at its place there is seen as TIGRE sees it."""
     moves = np.array([[3.0, -2.0, 1.0], [0.0, 4.0, 2.0], [-1.0, 0.0, 5.0]])  # (z, y, x)
     g = Geometry.from_tigre(tigre(offOrigin=moves), ANGLES)
-    np.testing.assert_allclose(g.offOrigin, moves.mean(0)[::-1])
+    np.testing.assert_allclose(g.grid.centre, moves.mean(0)[::-1])
     point = np.array([2.0, -1.0, 3.0])
     for view in range(3):
-        here = g.rays().project([point + g.offOrigin], view)
+        here = g.rays().project([point + g.grid.centre], view)
         there = scanner().project([point + moves[view, ::-1]], view)
         np.testing.assert_allclose(here, there, atol=1e-9)
 
@@ -338,8 +340,8 @@ def geom_2vec(proj_geom):
 @pytest.mark.parametrize('kind', PLAIN)
 def test_astra_circles(kind):
     g = Geometry.from_astra(PLAIN[kind], VOLUME)
-    assert isinstance(g, CircularGeometry) and g.offOrigin == (1, -2, 3)
-    assert (g.nVoxel, g.dVoxel, g.nDetector, g.dDetector) == ((5, 6, 7), (1, 2, 3), (20, 24), (1.5, 2))
+    assert isinstance(g, CircularGeometry) and g.grid.centre == (1, -2, 3)
+    assert (g.grid.shape, g.grid.spacing, g.nDetector, g.dDetector) == ((5, 6, 7), (1, 2, 3), (20, 24), (1.5, 2))
     # The same by its vectors, whose rows are found to be a circle's once they are turned round.
     again = Geometry.from_astra(geom_2vec(PLAIN[kind]), VOLUME)
     assert isinstance(again, CircularGeometry)
@@ -366,7 +368,7 @@ def test_astra_vectors_both_ways(parallel):
     for sign in (1, -1) if parallel else (1,):  # a parallel beam may be given either way
         turned = vectors * ([sign] * 3 + [1] * 9)
         g = Geometry.from_astra(proj | dict(Vectors=turned), **GRID)
-        assert isinstance(g, PosedGeometry) and g.nVoxel == (5, 6, 7)
+        assert isinstance(g, PosedGeometry) and g.grid.shape == (5, 6, 7)
         same_rays(g.rays(), f)
 
 
@@ -375,9 +377,9 @@ def test_astra_vectors_both_ways(parallel):
     [
         (dict(type='fanflat'), dict(vol_geom=VOLUME), "must be of the type cone, .*not 'fanflat'"),
         (dict(type='cone'), dict(vol_geom=VOLUME), 'has no Distance'),
-        (PLAIN['cone'], {}, 'either vol_geom or both'),
-        (PLAIN['cone'], dict(vol_geom=VOLUME, **GRID), 'either vol_geom or both'),
-        (PLAIN['cone'], dict(nVoxel=4), 'either vol_geom or both'),
+        (PLAIN['cone'], {}, 'needs its voxels'),
+        (PLAIN['cone'], dict(vol_geom=VOLUME, **GRID), 'needs its voxels'),
+        (PLAIN['cone'], dict(nVoxel=4), 'needs its voxels'),
         (PLAIN['cone'], dict(vol_geom=dict(GridRowCount=4, GridColCount=4)), 'three dimensions'),
         (dict(type='cone_vec', DetectorRowCount=2, DetectorColCount=2, Vectors=[[1, 2]]), GRID, '12 numbers'),
     ],
@@ -420,7 +422,7 @@ def test_rtk_object_and_file(tmp_path):
     same_grid(g, Geometry.cone(**CONE, offOrigin=(1, -2, 3)))
     same_rays(g.rays(), scanner(offDetector=(4.0, -5.0)))
     f = scanner(**MOTION)
-    rtk.write(tmp_path / 'g.xml', f, PANEL['nDetector'])
+    rtk.write_rtk(tmp_path / 'g.xml', f, PANEL['nDetector'])
     for path in (tmp_path / 'g.xml', str(tmp_path / 'g.xml')):
         again = Geometry.from_rtk(path, **PANEL, **GRID)
         assert isinstance(again, PosedGeometry)

@@ -5,11 +5,14 @@ import warnings
 import numpy as np
 import pytest
 
+from helpers import circles
 from helpers.bodies import BODIES
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry.grid import grid_of
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix, rotation, scanner_rays, spread
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
 PANEL = dict(nDetector=(24, 30), dDetector=(2.5, 2.0))
@@ -19,7 +22,7 @@ POINTS = np.random.default_rng(0).uniform(-15, 15, (20, 3))
 
 
 def circle(mode='cone', **changes):
-    return CircularGeometry(**{**dict(DSO=300.0, DSD=450.0, angles=ANGLES, mode=mode), **PANEL, **GRID, **changes})
+    return circles.circle(**{**dict(DSO=300.0, DSD=450.0, angles=ANGLES, mode=mode), **PANEL, **GRID, **changes})
 
 
 def moving(**changes):
@@ -47,7 +50,7 @@ def test_circle_by_its_formula(mode):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_poses_of_a_circle_are_that_circle(mode):
     g = circle(mode, offDetector=(4.0, -7.0), offOrigin=(1.0, -2.0, 3.0))
-    same = Geometry.from_poses(g.rays(), g.nDetector, g.nVoxel, g.dVoxel, g.offOrigin)
+    same = Geometry.from_poses(g.rays(), g.nDetector, grid=g.grid)
     assert isinstance(same, CircularGeometry) and same.mode == mode
     np.testing.assert_allclose(same.dDetector, g.dDetector, rtol=1e-14)
     np.testing.assert_allclose(pixels(same.rays()), pixels(g.rays()), atol=1e-10)
@@ -99,15 +102,15 @@ def test_no_motion_is_the_circle(change):
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_offset_panel_is_a_shifted_crop(mode):
-    from lingo_mi.projectors.grid import project
+    from lingo_mi.projectors.grid import project_volume
 
     volume = np.random.default_rng(1).random(GRID['nVoxel'])
-    wide = project(volume, circle(mode, nDetector=(24, 40)))
+    wide = project_volume(volume, circle(mode, nDetector=(24, 40)))
     # Ten columns fewer on the left, as if the panel were narrower and moved along u by five; two rows up.
-    off = project(volume, circle(mode, nDetector=(20, 30), offDetector=(2 * 2.5, 5 * 2.0)))
+    off = project_volume(volume, circle(mode, nDetector=(20, 30), offDetector=(2 * 2.5, 5 * 2.0)))
     np.testing.assert_allclose(off, wide[:, :20, 10:], rtol=2e-5, atol=2e-5 * wide.max())
     # The same, each view with another offset.
-    each = project(
+    each = project_volume(
         volume,
         Geometry.per_view(
             DSO=300.0,
@@ -172,10 +175,10 @@ def test_tigres_euler_angles_and_moving_object():
         np.testing.assert_allclose(f.project(POINTS, view), still.project(POINTS @ turn.T, 0), atol=1e-10)
     origin = np.random.default_rng(3).normal(size=(5, 3))
     g = moving(offOrigin=origin)
-    np.testing.assert_allclose(g.offOrigin, origin.mean(0))
+    np.testing.assert_allclose(g.grid.centre, origin.mean(0))
     for view in range(5):  # the object's points, relative to the centre of the grid, follow offOrigin
         np.testing.assert_allclose(
-            g.rays().project(POINTS + g.offOrigin, view),
+            g.rays().project(POINTS + g.grid.centre, view),
             circle().rays().project(POINTS + origin[view], view),
             atol=1e-10,
         )
@@ -250,7 +253,7 @@ def test_binned_views_see_the_same():
 
 def test_normalised_frames_of_poses():
     g = moving(tilt=0.3, offOrigin=(4.0, -5.0, 6.0))
-    points = (POINTS - g.offOrigin) * g.scale
+    points = (POINTS - g.grid.centre) * g.grid.scale
     np.testing.assert_allclose(pixels(g.normalised_rays(), points), pixels(g.rays()), atol=1e-9)
 
 
@@ -259,9 +262,9 @@ def test_filtered_backprojection_refuses_other_poses():
 
     g = moving(tilt=0.3)
     with pytest.raises(InputError, match='on a circle about z'):
-        FDK().run(Scan(g, np.ones((5, 24, 30))))
+        run_algorithm(Scan(g, np.ones((5, 24, 30))), FDK())
     scan = Scan(moving(angles=circular(5), tilt=0.0), np.ones((5, 24, 30)))
-    assert FDK().run(scan).volume.shape == g.nVoxel
+    assert run_algorithm(scan, FDK()).volume.shape == g.grid.shape
 
 
 # ---- bad input ---------------------------------------------------------------------------------------------
@@ -304,7 +307,7 @@ def test_bad_poses():
     with pytest.raises(InputError, match='view 0 has a beam along its panel'):
         Geometry.from_poses(Rays(p.u, p.corner, p.u, p.v, True), **GRID, nDetector=(24, 30))
     # Angles and beam cannot contradict the poses: they follow from them.
-    few = PosedGeometry(poses=f[:2], **GRID, nDetector=(24, 30))
+    few = PosedGeometry(poses=f[:2], grid=grid_of(GRID), nDetector=(24, 30))
     assert len(few) == len(few.angles) == 2 and few.mode == 'cone'
     with pytest.raises(InputError, match='parallel and of a cone'):
         few.joined(circle('parallel'))
@@ -317,7 +320,7 @@ def test_bad_poses():
 def test_counts_are_whole_numbers(name, count):
     count = count[:2] if name == 'nDetector' and isinstance(count, tuple) else count
     scan = dict(DSO=100, DSD=150, nDetector=32.0, dDetector=1, nVoxel=np.float32(24), dVoxel=1, angles=[0.0])
-    assert Geometry.cone(**scan).nVoxel == (24, 24, 24)
+    assert Geometry.cone(**scan).grid.shape == (24, 24, 24)
     with pytest.raises(InputError, match=f'{name} must be whole numbers'):
         Geometry.cone(**scan | {name: count})
 

@@ -6,10 +6,10 @@ import warnings
 import numpy as np
 import pytest
 
+from helpers.circles import circle
 from helpers.poses import to_matrices
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry import limits
-from lingo_mi.geometry.base import CircularGeometry, Geometry, PosedGeometry
+from lingo_mi.geometry import Geometry, Grid, PosedGeometry, limits
 from lingo_mi.geometry.matrices import from_matrices
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import circular, helix
@@ -30,7 +30,7 @@ BEAMS = {
     ),
     'helix': (Geometry.helix, CONE | dict(pitch=3), (*CONE, 'pitch', *MOTION)),
     'per_view': (Geometry.per_view, CONE, (*CONE, 'mode', *MOTION)),
-    'circle': (CircularGeometry, CONE, (*CONE, 'mode', 'offDetector', 'offOrigin')),
+    'circle': (circle, CONE, (*CONE, 'mode', 'offDetector', 'offOrigin')),
 }
 
 
@@ -60,7 +60,9 @@ def finite_or_refused(make):
             assert np.isfinite(array).all()
         for array in (normalised.source, normalised.corner, normalised.u, normalised.v):
             assert (np.abs(array) <= 1e13).all()  # whose products of three are finite in float32
-        assert np.isfinite([*geometry.sVoxel, *geometry.sDetector, geometry.scale, geometry.DSO, geometry.DSD]).all()
+        assert np.isfinite(
+            [*geometry.grid.size, *geometry.sDetector, geometry.grid.scale, geometry.DSO, geometry.DSD]
+        ).all()
         geometry.binned(2), geometry.subset([0]), geometry.joined(geometry), repr(geometry)
     return geometry
 
@@ -104,7 +106,7 @@ def test_usual_numbers_are_far_from_the_limits():
 
 def test_poses():
     rays = Geometry.cone(**CONE).rays()
-    grid = dict(nDetector=(6, 8), nVoxel=8, dVoxel=1)
+    panel = dict(nDetector=(6, 8), grid=Grid(8, 1))
     for name, value, parallel in itertools.product(('source', 'corner', 'u', 'v'), EXTREME, (False, True)):
         arrays = dict(source=rays.source, corner=rays.corner, u=rays.u, v=rays.v)
         try:
@@ -112,9 +114,9 @@ def test_poses():
             arrays[name][1, 2] = value
         except (TypeError, ValueError, OverflowError):
             arrays[name] = value
-        finite_or_refused(lambda: Geometry.from_poses(Rays(**arrays, parallel=parallel), **grid))
+        finite_or_refused(lambda: Geometry.from_poses(Rays(**arrays, parallel=parallel), **panel))
     arrays = (np.full((2, 3), 1e12 * s) for s in (1, 2, 3, 4))
-    finite_or_refused(lambda: PosedGeometry(poses=Rays(*arrays, parallel=False), **grid))
+    finite_or_refused(lambda: PosedGeometry(poses=Rays(*arrays, parallel=False), **panel))
 
 
 def test_matrices():

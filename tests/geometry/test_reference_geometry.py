@@ -25,10 +25,10 @@ from scipy.ndimage import zoom
 
 from helpers.bodies import BODIES, Ellipsoids
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.geometry.base import CircularGeometry, Geometry
-from lingo_mi.geometry.rtk import write as write_rtk
+from lingo_mi.geometry import CircularGeometry, Geometry, Grid
+from lingo_mi.geometry.rtk import write_rtk as write_rtk
 from lingo_mi.geometry.trajectories import helix, rotation
-from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.joseph import Joseph
 
 try:
@@ -99,9 +99,9 @@ class RTK:
     def volume(self, values):
         g, stack = self.g, self.empty()
         image = itk.image_from_array(np.ascontiguousarray(values.transpose(0, 2, 1), np.float32))  # [x, z, y] of ours
-        step, size = np.array(g.dVoxel)[[1, 2, 0]], np.array(g.nVoxel)[[1, 2, 0]]
+        step, size = np.array(g.grid.spacing)[[1, 2, 0]], np.array(g.grid.shape)[[1, 2, 0]]
         image.SetSpacing([float(x) for x in step])
-        image.SetOrigin([float(x) for x in np.array(g.offOrigin)[[1, 2, 0]] - (size - 1) / 2 * step])
+        image.SetOrigin([float(x) for x in np.array(g.grid.centre)[[1, 2, 0]] - (size - 1) / 2 * step])
         filter = rtk.JosephForwardProjectionImageFilter[type(stack), type(image)].New()
         filter.SetInput(0, stack)
         filter.SetInput(1, image)
@@ -134,7 +134,7 @@ def test_ellipsoids_are_exact(name, tmp_path):
 
 def smooth(g):
     """A volume of ellipsoids with soft edges, zero at the border: [x, y, z]."""
-    axes = [(np.arange(n) + 0.5 - n / 2) * d for n, d in zip(g.nVoxel, g.dVoxel)]
+    axes = [(np.arange(n) + 0.5 - n / 2) * d for n, d in zip(g.grid.shape, g.grid.spacing)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), -1)
     out = 0.0
     for centre, shape, density in BODIES.bodies:
@@ -147,7 +147,7 @@ def difference(name, n, folder):
     g = geometry(name, n)
     volume = smooth(g)
     expected = RTK(g, folder).volume(volume)
-    return np.linalg.norm(project(volume, g) - expected) / np.linalg.norm(expected)
+    return np.linalg.norm(project_volume(volume, g) - expected) / np.linalg.norm(expected)
 
 
 def test_a_volume_agrees_to_second_order(name, tmp_path):
@@ -176,7 +176,7 @@ def wide(name):
 
 
 def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
-    image = project(abdomen, Geometry.per_view(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0))
+    image = project_volume(abdomen, Geometry.per_view(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0))
     errors = []
     for finer in (1, 2, 4):
         shape = tuple(finer * (n - 1) + 1 for n in abdomen.shape)
@@ -191,7 +191,7 @@ def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
 
 @pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, offset', 'parallel, offset'])
 def test_joseph_is_rtks(name, tmp_path, abdomen):
-    g = CircularGeometry(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0)
+    g = CircularGeometry(**wide(name), grid=Grid(abdomen.shape, 6.0))
     expected = RTK(g, tmp_path).volume(abdomen)
     found = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
     found = found.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
+from helpers.circles import circle
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Scan
 
@@ -20,7 +20,7 @@ def geometry(mode='cone', angles=None, **changes):
         offOrigin=(5.0, -4.0, 3.0),
         offDetector=(4.0, -7.0),
     )
-    return CircularGeometry(**{**settings, **changes})
+    return circle(**{**settings, **changes})
 
 
 def ellipsoids(geo, *bodies):
@@ -38,7 +38,7 @@ def ellipsoids(geo, *bodies):
 
 
 def centres(geo):
-    axes = [(np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geo.nVoxel, geo.dVoxel, geo.offOrigin)]
+    axes = [(np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geo.grid.shape, geo.grid.spacing, geo.grid.centre)]
     return np.stack(np.meshgrid(*axes, indexing='ij'), -1)
 
 
@@ -51,7 +51,7 @@ def ball_errors(volume, geo):
     near = np.linalg.norm(x - BALL[0], axis=-1)
     inside = near < 30  # farther out, the faint shading of what a cone misses weighs by its distance
     place = np.average(x[inside], axis=0, weights=volume[inside])
-    return volume[near < 12].mean() / 0.02 - 1, np.max(np.abs(place - BALL[0]) / geo.dVoxel)
+    return volume[near < 12].mean() / 0.02 - 1, np.max(np.abs(place - BALL[0]) / geo.grid.spacing)
 
 
 def assert_ball(volume, geo):

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 
+from lingo_mi.fitting.checkpoint import _Crc, checksum_of
+
 
 def contents(path):
     """All entries of a checkpoint, by name."""
@@ -11,12 +13,10 @@ def contents(path):
         return dict(file)
 
 
-def write_as_before(path, content, extra=None):
-    """Write entries as earlier versions did, with neither version nor checksum. extra: other plain values."""
+def rewrite(path, content, extra=None):
+    """Write entries with a right checksum, so that all other checks are reached. extra: other plain values."""
     content = {k: v for k, v in content.items() if k != 'checksum'}
-    if extra is None and 'extra' in content:
-        extra = json.loads(str(content['extra']))
     if extra is not None:
-        known = {k: v for k, v in extra.items() if k != 'version'} if isinstance(extra, dict) else extra
-        content['extra'] = np.array(json.dumps(known))
-    np.savez(path, **content)
+        content['extra'] = np.array(json.dumps(extra))
+    checksum = checksum_of((k, _Crc.of(v)) for k, v in content.items())
+    np.savez(path, **content, checksum=np.array(checksum))

@@ -7,7 +7,7 @@ import sys
 import time
 
 # Workers that draw no report, which takes longer than a tiny fit.
-PRELOAD = 'import lingo_mi\nfrom lingo_mi.results import save\nsave.write_report = lambda *_: None\n'
+PRELOAD = 'import lingo_mi\nfrom lingo_mi.fitting import save\nsave.write_report = lambda *_: None\n'
 
 
 @contextlib.contextmanager

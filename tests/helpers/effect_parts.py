@@ -8,7 +8,6 @@ from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.state import start
-from lingo_mi.fitting.step import Stepper
 from lingo_mi.scan import Scan
 from lingo_mi.scene.load import load_scene
 
@@ -26,23 +25,22 @@ def stepper_of(effects, views=3, **changes):
     g = geometry(views)
     # Line integrals of order one; the measured views lie above the rendered ones everywhere, for differences of L1.
     scan = Scan(g, tiny_scan(g).projections / 50 + 3, effects=effects)
-    settings = SHORT.changed(extent=7, **changes)
-    stepper, points = Stepper(scan, settings), some_points(g, 40)
-    return stepper, DeviceState(start(points.points, points.spacing * 2, points.density * 0.1, settings))
+    stepper, points = SHORT.changed(extent=7, **changes).stepper(scan), some_points(g, 40)
+    return stepper, DeviceState(start(points.points, points.spacing * 2, points.density * 0.1, stepper.forward))
 
 
 def rendered_from_files(stepper, state, effects, folder):
     """The stepper's views by Mitsuba's integrator, from the scene and the cloud that a fit writes."""
     from lingo_mi.files.ply import write_ply
+    from lingo_mi.fitting.scene_file import write_scene
     from lingo_mi.fitting.state import activate
-    from lingo_mi.results.scene_file import write_scene
 
     g, share = stepper.geometry, stepper.model.shares(state)
-    centre, scale, rotation, density = activate(state.host(), stepper.settings)
+    centre, scale, rotation, density = activate(state.host(), stepper.forward)
     write_ply(
         folder / 'gaussians.ply',
-        centre / g.scale,
-        scale / g.scale,
+        centre / g.grid.scale,
+        scale / g.grid.scale,
         rotation,
         density * stepper.model.unit,
         None if share is None else share.numpy(),

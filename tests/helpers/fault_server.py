@@ -14,7 +14,7 @@ from pathlib import Path
 class Server:
     """A context of `run(task, arguments, folder, at, kind)`: exit status, standard error and the number of calls that write.
 
-    task        'fit', 'reconstruct', 'tables', or 'save': `load_result(arguments[0]).save(arguments[1], force=True)`
+    task        'fit', 'reconstruct', 'tables', or 'save': `load_fit(arguments[0]).save(arguments[1], force=True)`
     folder      below which calls are counted; None: none are
     at, kind    see `write_faults.Faults`; its `failed`, of the last command, is an attribute
     """
@@ -54,7 +54,7 @@ def work(request, calls):
 
     def save():
         use_variant('llvm_ad_mono')
-        lm.load_result(arguments[0]).save(arguments[1], force=True)
+        lm.load_fit(arguments[0]).save(arguments[1], force=True)
 
     arguments = request['arguments']
     sys.argv = [request['task'], *arguments, '--variant', 'llvm_ad_mono']
@@ -77,7 +77,7 @@ def serve():
     import nibabel  # noqa: F401 - loaded once for all children
     import skimage.metrics  # noqa: F401
 
-    import lingo_mi.results.save
+    import lingo_mi.fitting.save
     import lingo_mi.scene.load
     import lingo_mi.studies.tables.report  # noqa: F401
     from lingo_mi.cli import fit, reconstruct, tables  # noqa: F401

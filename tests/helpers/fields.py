@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from lingo_mi.fitting.recipes import NAF
-from lingo_mi.lingo.initialise import InitialCloud
+from lingo_mi.fitting.methods.naf import NAF
 
-SMALL = NAF.changed(
+SMALL = NAF().changed(
     iterations=12,
     field_levels=4,
     field_entries=2**10,
@@ -19,18 +18,13 @@ SMALL = NAF.changed(
 )
 
 
-def no_points():
-    """The initial cloud of a field."""
-    return InitialCloud(np.zeros((0, 3)), None, np.zeros(0))
-
-
-def random_state(settings, seed=0, amplitude=0.5):
+def random_state(method, seed=0, amplitude=0.5):
     """A state with features that are far from 0, so that the field varies."""
     from lingo_mi.fitting.field.network import Network
     from lingo_mi.fitting.state import State
 
     rng = np.random.default_rng(seed)
-    values = Network(settings.neural).initial(rng)
+    values = Network(method.field).initial(rng)
     values['features'] = rng.uniform(-amplitude, amplitude, values['features'].shape).astype(np.float32)
     zeros = {k: np.zeros_like(v) for k, v in values.items()}
     return State(

@@ -1,17 +1,40 @@
 """What tests share with fit."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
-from lingo_mi.fitting.recipes import R2
-from lingo_mi.geometry.base import CircularGeometry
+from helpers.circles import circle
+from lingo_mi.fitting.methods.r2 import R2
+from lingo_mi.fitting.start.start import Start, StartingCloud
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.phantoms.gaussians import Cloud
 from lingo_mi.scan import Scan
 
-SHORT = R2.changed(
+
+def some_points(g, n=60, seed=1):
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (n, 3)) * np.minimum(g.grid.half, 1)
+    if g.grid.shape[2] == 1:
+        points[:, 2] = 0
+    return StartingCloud(points, np.full(n, 0.1), np.full(n, 0.08))
+
+
+@dataclass(frozen=True)
+class Points(Start):
+    """`some_points`, whatever the projections."""
+
+    RANGES: ClassVar = dict(seed=(0, 1e9), n=(1, 1e6))
+    name: ClassVar = 'points'
+
+    seed: int = 1
+    n: int = 60
+
+    def cloud(self, scan, rng, render, unit):
+        return some_points(scan.geometry, self.n, self.seed)
+
+
+SHORT = R2(start=Points()).changed(
     normalise=True,
     iterations=30,
     densify_from=5,
@@ -38,7 +61,7 @@ def geometry(views=3, **changes):
         dVoxel=(8.0, 8.0, 8.0),
         angles=circular(views, 180, start=10),
     )
-    return CircularGeometry(**{**settings, **changes})
+    return circle(**{**settings, **changes})
 
 
 def tiny_scan(g, flat=False):
@@ -51,13 +74,6 @@ def tiny_scan(g, flat=False):
     cloud = Cloud(centres, scales, rng.normal(size=(8, 4)) * turn, rng.uniform(0.2, 1, 8))
     cloud = replace(cloud, quaternions=cloud.quaternions / np.linalg.norm(cloud.quaternions, axis=1, keepdims=True))
     return Scan(g, cloud.project(g))
-
-
-def some_points(g, n=60, seed=1):
-    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (n, 3)) * np.minimum(g.half, 1)
-    if g.nVoxel[2] == 1:
-        points[:, 2] = 0
-    return InitialCloud(points, np.full(n, 0.1), np.full(n, 0.08))
 
 
 def error_of(fitted, scan):

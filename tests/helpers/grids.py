@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
+from helpers.circles import circle
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.grid import scatter, view_table, view_walk, whole_box
 
@@ -22,15 +22,15 @@ def scan(mode='cone', n=4, **changes):
         offOrigin=(3.0, -2.0, 1.0),
         offDetector=(2.0, -4.0),
     )
-    return CircularGeometry(**{**settings, **changes})
+    return circle(**{**settings, **changes})
 
 
 def backproject(projections, geometry):
-    """The transpose of `grid.project`, view by view: float32 [x, y, z], in units of the projections [view, v, u] times mm."""
+    """The transpose of `grid.project_volume`, view by view: float32 [x, y, z] in units of projections [view, v, u] times mm."""
     n_v, n_u = geometry.nDetector
-    target = dr.zeros(mi.Float, int(np.prod(geometry.nVoxel)))
+    target = dr.zeros(mi.Float, int(np.prod(geometry.grid.shape)))
     for image, row in zip(np.asarray(projections, np.float32), view_table(geometry)):
-        walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.nVoxel))
-        scatter(target, length * mi.Float(image.T.ravel()), geometry.nVoxel, walk)
+        walk, length = view_walk(geometry, mi.Float(row), *whole_box(geometry.grid.shape))
+        scatter(target, length * mi.Float(image.T.ravel()), geometry.grid.shape, walk)
         dr.eval(target)
-    return target.numpy().reshape(geometry.nVoxel)
+    return target.numpy().reshape(geometry.grid.shape)

@@ -10,8 +10,8 @@ def matrix(geometry, axes: int = 2) -> np.ndarray:
 
     axes   among how many the main one is, from x on
     """
-    frames, size, voxel = geometry.rays(), np.array(geometry.nVoxel), np.array(geometry.dVoxel)
-    first = np.array(geometry.offOrigin) + (voxel - geometry.sVoxel) / 2
+    frames, size, voxel = geometry.rays(), np.array(geometry.grid.shape), np.array(geometry.grid.spacing)
+    first = np.array(geometry.grid.centre) + (voxel - geometry.grid.size) / 2
     rows = []
     for view in range(len(geometry)):
         for v in range(geometry.nDetector[0]):
@@ -43,7 +43,7 @@ def assert_pair(kind: type, geometry, matrix: np.ndarray, masked: bool) -> None:
     masked   with a third of the pixels left out, whatever stands in them
     """
     rng = np.random.default_rng(0)
-    x, y = rng.normal(size=geometry.nVoxel), rng.normal(size=(3, *geometry.nDetector))
+    x, y = rng.normal(size=geometry.grid.shape), rng.normal(size=(3, *geometry.nDetector))
     valid = rng.random(y.shape) < (0.67 if masked else 2)
     A, J = matrix * valid.reshape(-1, 1), kind(geometry, valid if masked else None)
     views = [2, 0]

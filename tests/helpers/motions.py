@@ -14,7 +14,7 @@ def posed(motion, mode='cone'):
     geo = scan(mode, n=3)
     rays = geo.rays()
     rays = replace(rays, **motion(rays, np.random.default_rng(5)))
-    return Geometry.from_poses(rays, geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
+    return Geometry.from_poses(rays, geo.nDetector, grid=geo.grid)
 
 
 def climbing(rays, _):

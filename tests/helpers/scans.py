@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.scan import Dataset, Scan
 
 
@@ -15,11 +15,9 @@ def small_dataset(mode: str = 'cone') -> Dataset:
         DSD=1400,
         nDetector=(4, 6),
         dDetector=(1.5, 2.5),
-        nVoxel=(5, 6, 7),
-        dVoxel=(1, 2, 3),
         angles=[0.1, 0.7, 3.0],
-        offOrigin=(1, -2, 3),
         offDetector=(4, -5),
+        grid=Grid((5, 6, 7), (1, 2, 3), (1, -2, 3)),
     )
     return Dataset(
         Scan(geometry, rng.random((3, 4, 6)) + 1),

@@ -54,7 +54,7 @@ def run(script, *args, report=False, variant=True):
     """
     out, err = io.StringIO(), io.StringIO()
     argv = [str(script), *map(str, args), *(['--variant', mi.variant()] if variant and '--variant' not in args else [])]
-    drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.results.save.write_report')
+    drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.fitting.save.write_report')
     with drawn, mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             runpy.run_path(str(script), run_name='__main__')

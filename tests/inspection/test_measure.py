@@ -1,6 +1,5 @@
 """A sound scan raises no alarm; what is wrong is noticed, and a small error is measured."""
 
-import re
 import warnings
 from dataclasses import replace
 
@@ -10,9 +9,14 @@ from scipy import ndimage
 
 import lingo_mi as lm
 from helpers.object_scan import scanned
+from lingo_mi.cli.findings_text import advice, facts
 from lingo_mi.inspection.jitter import outline_jitter
-from lingo_mi.inspection.measure import look
+from lingo_mi.inspection.measure import measure
 from lingo_mi.inspection.sheet import draw
+
+
+def advised(scan):
+    return advice(scan, measure(scan))
 
 
 @pytest.fixture(scope='module')
@@ -24,23 +28,22 @@ def foot():
 @pytest.mark.parametrize('name', ['foot', 'chest', 'shepp_logan', pytest.param('gaussians', marks=pytest.mark.slow)])
 @pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
 def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
-    assert look(scanned(name, mode, views, total)).advice == []
+    assert advised(scanned(name, mode, views, total)) == []
 
 
 def only(scan, words):
-    (advice,) = look(scan).advice
-    assert words in advice
-    return look(scan)
+    (line,) = advised(scan)
+    assert words in line
+    return measure(scan)
 
 
 def test_axis_offset_is_measured(foot):
     """Three columns, to a tenth."""
     moved = lm.Scan(foot.geometry, np.roll(foot.projections, 3, 2))
-    found = only(moved, 'the axis is off: add')
-    shift = float(next(fact for fact in found.facts if fact.startswith('axis')).split()[1])
+    shift = only(moved, 'the axis is off: add').orbit.shift
     assert shift == pytest.approx(-3 * foot.geometry.dDetector[1], abs=0.1 * foot.geometry.dDetector[1])
     mended = lm.Scan(replace(foot.geometry, offDetector=(0, shift)), moved.projections)
-    assert look(mended).advice == []
+    assert advised(mended) == []
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
@@ -69,40 +72,37 @@ def test_sense_and_unit_of_angles(foot):
 
 def test_air_and_truncation(foot):
     found = only(lm.Scan(foot.geometry, foot.projections + 3), 'instead of 0: import again with --air')
-    assert found.air == pytest.approx(3, abs=0.1)
+    assert found.border.air == pytest.approx(3, abs=0.1)
     cut = lm.Scan(replace(foot.geometry, nDetector=(110, 40)), foot.projections[:, :, 28:68])
-    assert any('left or right edge' in line and '-D outside=ignore' in line for line in look(cut).advice)
+    assert measure(cut).border.cut_sides > len(cut) / 2
+    assert any('left or right edge' in line and '-D outside=ignore' in line for line in advised(cut))
 
 
 def test_pixels_that_are_not_valid_disagree_with_nothing(foot):
     valid = np.ones(foot.projections.shape, bool)
     valid[:, :, 30] = False
-    assert only_disagreement(replace(foot, valid=valid)) < only_disagreement(foot) + 0.5  # 5.6 where they count as air
+    found, whole = measure(replace(foot, valid=valid)).orbit, measure(foot).orbit
+    assert found.disagreement < whole.disagreement + 0.005  # 0.056 where they count as air
     valid[:, :, 31] = False
-    assert any('not valid' in line for line in look(replace(foot, valid=valid)).facts)
-
-
-def only_disagreement(scan):
-    """Percent."""
-    (line,) = (line for line in look(scan).facts if 'disagree' in line)
-    return float(re.search(r'([\d.]+) ?%', line)[1])
+    assert measure(replace(foot, valid=valid)).orbit.obstacle == 'gaps'
 
 
 def test_scans_of_nothing_and_of_few_pixels(foot):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        assert not any('nan' in line for line in look(replace(foot, projections=0 * foot.projections)).facts)
+        dark = replace(foot, projections=0 * foot.projections)
+        assert not any('nan' in line for line in facts(dark, measure(dark)))
     row = foot.subset(slice(10))
-    assert not any('clipped' in line for line in look(lm.Scan(row.geometry.binned(1), row.projections)).advice)
+    assert measure(lm.Scan(row.geometry.binned(1), row.projections)).clipped is None
 
 
 def test_the_wrong_sign_is_said_and_drawn(foot, tmp_path):
     scan = replace(foot, projections=-foot.projections)
-    found = look(scan)
-    assert any('give -ln(I / I0)' in line for line in found.advice)
+    found = measure(scan)
+    assert any('give -ln(I / I0)' in line for line in advice(scan, found))
     draw(tmp_path / 'sheet.png', scan, found)
     assert (tmp_path / 'sheet.png').stat().st_size > 10_000
-    assert not any('-ln' in line for line in look(foot).advice)
+    assert not measure(foot).negative
 
 
 @pytest.mark.parametrize('start', [90.0, 300.0])
@@ -110,15 +110,15 @@ def test_the_arc_of_views_that_are_given_as_poses(start):
     angles = np.radians(start + np.linspace(0, 180, 20, endpoint=False))
     sizes = dict(DSO=500, DSD=750, nDetector=(16, 24), dDetector=4.0, nVoxel=16, dVoxel=2.0)
     circle = lm.Geometry.cone(angles=angles, **sizes)
-    posed = lm.Geometry.from_poses(circle.rays(), circle.nDetector, 16, 2.0)
+    posed = lm.Geometry.from_poses(circle.rays(), circle.nDetector, nVoxel=16, dVoxel=2.0)
     p = np.ones((20, 16, 24), np.float32)
     for geometry in (circle, posed):
-        assert any('angles: 180 degrees in all' in line for line in look(lm.Scan(geometry, p)).facts)
+        assert measure(lm.Scan(geometry, p)).orbit.turn == pytest.approx(np.pi)
 
 
 def test_air_of_single_views(foot):
     p = foot.projections + np.linspace(-1, 1, len(foot))[:, None, None] * 0.05 * foot.projections.max()
-    assert any('-D fit_air=view' in line for line in look(lm.Scan(foot.geometry, p)).advice)
+    assert any('-D fit_air=view' in line for line in advised(lm.Scan(foot.geometry, p)))
 
 
 def test_noise(foot):
@@ -126,8 +126,7 @@ def test_noise(foot):
     rng = np.random.default_rng(0)
     p = foot.projections / foot.projections.max() * 2
     noisy = -np.log(rng.poisson(2e4 * np.exp(-p)) / 2e4)
-    fact = next(fact for fact in look(lm.Scan(foot.geometry, noisy)).facts if fact.startswith('noise'))
-    assert float(fact.split(' of ')[1].split()[0]) == pytest.approx(2e4, rel=0.2)
+    assert measure(lm.Scan(foot.geometry, noisy)).photons == pytest.approx(2e4, rel=0.2)
 
 
 @pytest.fixture(scope='module')
@@ -135,16 +134,14 @@ def dense():
     return scanned('foot', views=90)
 
 
-@pytest.mark.parametrize(('deviation', 'advised'), [(0.4, False), (1.5, True)])
-def test_jitter_is_measured(dense, deviation, advised):
+@pytest.mark.parametrize(('deviation', 'unsteady'), [(0.4, False), (1.5, True)])
+def test_jitter_is_measured(dense, deviation, unsteady):
     """To 30 %, of 90 views."""
     by = np.random.default_rng(0).normal(0, deviation, (len(dense), 2))
     moved = np.stack([ndimage.shift(v, s, order=1) for v, s in zip(dense.projections, by)])
-    found = look(lm.Scan(dense.geometry, moved))
-    fact = next(fact for fact in found.facts if fact.startswith('jitter'))
-    rows = float(fact.split(' pixels along rows')[0].split()[-1])
-    assert rows == pytest.approx(deviation, rel=0.3)
-    assert any('-D rate_pose' in line for line in found.advice) == advised
+    scan = lm.Scan(dense.geometry, moved)
+    assert measure(scan).jitter[0] == pytest.approx(deviation, rel=0.3)
+    assert any('-D rate_pose' in line for line in advised(scan)) == unsteady
 
 
 def test_a_steady_outline(dense):
@@ -156,25 +153,26 @@ def test_a_steady_outline(dense):
 def test_parallel_views_have_one_mass():
     scan = scanned('foot', 'parallel')
     gain = 1 + 0.1 * np.sin(np.arange(len(scan)))
-    found = only(lm.Scan(scan.geometry, scan.projections * gain[:, None, None]), 'the mass of the views differs by 7')
-    assert found.advice and not look(scan).advice
+    only(lm.Scan(scan.geometry, scan.projections * gain[:, None, None]), 'the mass of the views differs by 7')
+    assert advised(scan) == []
 
 
 def test_a_short_arc_does_not_tell_the_axis():
     scan = scanned('foot', views=40)
     for first in (0, 10, 25):
-        assert look(scan.subset(np.arange(first, first + 10))).advice == []
+        part = scan.subset(np.arange(first, first + 10))
+        assert advised(part) == [] and measure(part).orbit.short
 
 
 def test_views_of_one_angle(foot):
     same = replace(foot.geometry, angles=np.zeros(len(foot)))
-    assert 'all views have the same angle' in look(replace(foot, geometry=same)).advice[0]
+    assert 'all views have the same angle' in advised(replace(foot, geometry=same))[0]
 
 
 def test_lengths_in_other_units(foot):
     wide = replace(foot.geometry, dDetector=(1000 * foot.geometry.dDetector[0], 1000 * foot.geometry.dDetector[1]))
     assert any(
-        'give DSO, DSD and the size of the pixels in mm' in line for line in look(replace(foot, geometry=wide)).advice
+        'give DSO, DSD and the size of the pixels in mm' in line for line in advised(replace(foot, geometry=wide))
     )
 
 
@@ -182,6 +180,5 @@ def test_lengths_in_other_units(foot):
 def test_an_air_level_that_is_not_0(foot, level):
     """Flats of more exposure than the views, which is no object that fills the panel."""
     lifted = replace(foot, projections=foot.projections + np.float32(level * foot.projections.max()))
-    found = look(lifted)
-    assert found.air == pytest.approx(level * foot.projections.max(), rel=0.02)
-    assert [advice[:6] for advice in found.advice] == ['air is']
+    assert measure(lifted).border.air == pytest.approx(level * foot.projections.max(), rel=0.02)
+    assert [line[:6] for line in advised(lifted)] == ['air is']

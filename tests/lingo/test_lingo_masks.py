@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from helpers.circles import circle
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.lingo import voxel_filter
@@ -27,7 +27,7 @@ def scan(mode='cone', n=5, **changes):
         offOrigin=(0.1, 0.0, -0.05),
         offDetector=(0.043, 0.1),
     )
-    return CircularGeometry(**{**settings, **changes})
+    return circle(**{**settings, **changes})
 
 
 def random_masks(n, shape, rng):
@@ -160,11 +160,11 @@ def test_valid_voxels(monkeypatch, blocks, mode, misses, outside):
         monkeypatch.setattr(voxel_filter, 'CHUNK', 100)
         monkeypatch.setattr(voxel_filter, 'BLOCK', 3)
     geometry = scan(mode, dDetector=(0.1037, 0.0911), nVoxel=(9, 7, 6))  # panel too small
-    frames, grid = geometry.normalised_rays(), geometry.nVoxel
+    frames, grid = geometry.normalised_rays(), geometry.grid.shape
     found = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
-    low, high = valid_voxels(frames, found, grid, geometry.half, misses, outside)
+    low, high = valid_voxels(frames, found, grid, geometry.grid.half, misses, outside)
     for cells, images in (low, found.low), (high, found.high):
-        expected = literal_filter(frames, images, grid, geometry.half, misses, outside == 'ignore')
+        expected = literal_filter(frames, images, grid, geometry.grid.half, misses, outside == 'ignore')
         assert cells.tolist() == expected
     assert 0 < len(low) < np.prod(grid) and len(high) < len(low)
 
@@ -173,8 +173,8 @@ def test_points_outside_the_image_are_removed_not_clamped():
     geometry = scan(nDetector=(24, 4), offDetector=(0.0, 0.0), offOrigin=(0.0, 0.0, 0.0))
     frames, ones = geometry.normalised_rays(), np.ones((5, 24, 4), bool)
     full = Masks(ones, ones, np.zeros(5), np.zeros(5))
-    strict, _ = valid_voxels(frames, full, geometry.nVoxel, geometry.half)
-    tolerant, _ = valid_voxels(frames, full, geometry.nVoxel, geometry.half, outside='ignore')
+    strict, _ = valid_voxels(frames, full, geometry.grid.shape, geometry.grid.half)
+    tolerant, _ = valid_voxels(frames, full, geometry.grid.shape, geometry.grid.half, outside='ignore')
     assert len(strict) < len(tolerant)
 
 
@@ -182,18 +182,18 @@ def test_valid_voxels_errors():
     geometry = scan()
     found = random_masks(4, geometry.nDetector, np.random.default_rng(0))
     with pytest.raises(InputError, match='one a view'):
-        valid_voxels(geometry.normalised_rays(), found, (4, 4, 4), geometry.half)
+        valid_voxels(geometry.normalised_rays(), found, (4, 4, 4), geometry.grid.half)
     with pytest.raises(InputError, match='outside'):
-        valid_voxels(geometry.normalised_rays()[:4], found, (4, 4, 4), geometry.half, outside='clamp')
+        valid_voxels(geometry.normalised_rays()[:4], found, (4, 4, 4), geometry.grid.half, outside='clamp')
 
 
 def test_occupancy_and_scaling():
     geometry = scan(nVoxel=(40, 40, 40), dVoxel=(0.05,) * 3, n=2)
     frames = geometry.normalised_rays()
     found = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
-    expected = len(literal_filter(frames, found.low, (16, 16, 16), geometry.half)) / 16**3
+    expected = len(literal_filter(frames, found.low, (16, 16, 16), geometry.grid.half)) / 16**3
     assert 0 < expected < 1
-    assert occupancy(frames, found, geometry.half, geometry.nVoxel) == expected
+    assert occupancy(frames, found, geometry.grid.half, geometry.grid.shape) == expected
     assert scale_factor(0.3) == 0.3 * 20 and scale_factor(0.01) == 1 and scale_factor(0.5, V_S=10) == 5
     assert scaled_grid((256, 256, 178), 2.5) == (102, 102, 71)
     assert scaled_grid((256, 256, 178), 1.0) == (256, 256, 178)
@@ -212,7 +212,10 @@ def test_occupancy_of_a_single_slice():
     ones = np.ones((5, 1, 60), bool)
     assert (
         occupancy(
-            geometry.normalised_rays(), Masks(ones, ones, np.zeros(5), np.zeros(5)), geometry.half, geometry.nVoxel
+            geometry.normalised_rays(),
+            Masks(ones, ones, np.zeros(5), np.zeros(5)),
+            geometry.grid.half,
+            geometry.grid.shape,
         )
         == 1
     )

@@ -210,14 +210,6 @@ def test_views_on_threads_keep_their_order_and_few_are_taken_in_advance():
         list(metrics._each(lambda i: 1 // i, ((0,),), 1))
 
 
-def test_names_of_earlier_results_become_todays():
-    old = dict(psnr_2d=1, psnr_2d_r2=2, ssim_2d=3, ssim_2d_absolute=4, psnr_3d=5, psnr_3d_absolute=6, ipsd=None)
-    now = dict(psnr_2d=1, psnr_2d_r2=2, ssim_2d_r2=3, ssim_2d=4, psnr_3d_r2=5, psnr_3d=6, ipsd=None)
-    assert metrics.current_names(old) == now == metrics.current_names(now)
-    assert metrics.current_names({}) == {}
-    assert metrics.current_names(dict(psnr_3d=5, ssim_3d=6)) == dict(psnr_3d_r2=5, ssim_3d_r2=6)
-
-
 @pytest.mark.parametrize('name', ['psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d'])
 def test_the_plain_name_is_the_absolute_form(pair, name):
     """In a unit of which 1 is no full scale, with a wrong gain."""

@@ -11,7 +11,7 @@ import pytest
 
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.phantoms import chest, foot, gaussians, mesh, shepp_logan
 from lingo_mi.phantoms import x3d_scan as scanning
 
@@ -35,10 +35,9 @@ def _geometry(mode='cone', angles=(0.0, 0.7, 2.3), pixels=16, pixel=21.0, size=6
         DSD=1500.0,
         nDetector=(pixels, pixels + 4),
         dDetector=(pixel, pixel),
-        nVoxel=(size,) * 3,
-        dVoxel=(256 / size,) * 3,
         angles=np.array(angles),
         mode=mode,
+        grid=Grid((size,) * 3, (256 / size,) * 3),
     )
 
 
@@ -70,7 +69,7 @@ def test_form(made, name):
         assert p.name == name and p.data.dtype == np.float32 and p.data.shape == (size,) * 3
         assert np.isfinite(p.data).all() and p.data.min() == 0 and 0.3 < p.data.max() <= 1
         assert (p.data == 0).mean() > 0.2
-        assert np.allclose(np.add(p.origin, np.multiply(p.spacing, size - 1)), np.negative(p.origin))
+        assert np.allclose(p.grid.first_voxel, -np.multiply(p.spacing, size - 1) / 2)
     side = {'chest': 380}.get(name, 256)
     assert made[name, 64].spacing == (side / 64,) * 3
 
@@ -158,7 +157,7 @@ def test_projections_against_line_sums(made, name, mode):
 
 
 def test_ellipsoid_chord():
-    ball = shepp_logan.Ellipsoids(np.array([2.0]), np.zeros((1, 3)), np.eye(3)[None] / 50)
+    ball = shepp_logan.UniformEllipsoids(np.array([2.0]), np.zeros((1, 3)), np.eye(3)[None] / 50)
     image = ball.project(_geometry(pixels=1, pixel=1e-3, angles=(0.3,)))
     assert np.allclose(image[0, 0], 200)
 
@@ -192,7 +191,7 @@ def test_gaussian_projection_is_the_closed_form(mode):
 
 
 def test_gaussians_refuse_a_source_inside():
-    geometry = CircularGeometry(DSO=40.0, DSD=300.0, nDetector=4, dDetector=1.0, nVoxel=8, dVoxel=32.0, angles=[0.0])
+    geometry = CircularGeometry(DSO=40.0, DSD=300.0, nDetector=4, dDetector=1.0, angles=[0.0], grid=Grid(8, 32.0))
     with pytest.raises(InputError, match='enlarge DSO'):
         gaussians.cloud(100).project(geometry)
     with pytest.raises(InputError, match='at least one'):
@@ -212,7 +211,7 @@ def test_flange_is_a_solid(tmp_path):
 def test_scan_of_a_phantom(made):
     phantom = made['shepp_logan', 64]
     g = scanning.default_geometry(phantom, [0.0])
-    assert (g.DSD, g.DSO, g.nDetector, g.dDetector, g.sVoxel) == (1500, 1000, (512, 512), (1, 1), (256, 256, 256))
+    assert (g.DSD, g.DSO, g.nDetector, g.dDetector, g.grid.size) == (1500, 1000, (512, 512), (1, 1), (256, 256, 256))
     calls = []
     dataset = scanning.scan(phantom, 2, progress=lambda *a: calls.append(a))
     assert calls[-1] == (4, 4) and dataset.volume is phantom.data

@@ -14,11 +14,10 @@ from helpers.same import assert_same
 from helpers.scenes import SCANNER, block, cloud_of, ellipsoids, grid, load, render, transform, values_of
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import write_ply
-from lingo_mi.fitting.cloud_model import CloudModel
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.recipes import R2
+from lingo_mi.fitting.methods.r2 import R2
 from lingo_mi.fitting.state import start
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.studies import oracle
 from lingo_mi.studies.oracle import Cloud, relative
@@ -46,9 +45,8 @@ def scanner_geometry(sensor=SCANNER):
         DSO=sensor['DSO'],
         DSD=sensor['DSD'],
         angles=np.radians(numbers('angles')),
-        nVoxel=8,
-        dVoxel=0.25,
         **{name: numbers(name) for name in ('nDetector', 'dDetector', 'offDetector')},
+        grid=Grid(8, 0.25),
     )
 
 
@@ -354,12 +352,10 @@ def asymmetric(mode, offset):
         DSD=600.0,
         nDetector=(120, 100),
         dDetector=(2.1, 2.7),
-        nVoxel=(40, 44, 48),
-        dVoxel=(4.0, 4.0, 4.0),
         angles=np.radians([0.0, 90.0]),
         mode=mode,
         offDetector=(13.0, -9.0) if offset else (0.0, 0.0),
-        offOrigin=(6.0, -7.0, 8.0) if offset else (0.0, 0.0, 0.0),
+        grid=Grid((40, 44, 48), (4.0, 4.0, 4.0), (6.0, -7.0, 8.0) if offset else (0.0, 0.0, 0.0)),
     )
 
 
@@ -376,16 +372,16 @@ def test_axes(axis, mode, offset):
     for image, angle in zip(images, (0, 90)):
         np.testing.assert_allclose(middle(image), expected_pixel(point, angle, g), atol=0.05)
 
-    settings = R2.changed(extent=6.0, scale_min=1e-4, scale_max=0.5)
-    normalised = (point - g.offOrigin) * g.scale
-    state = DeviceState(start(normalised[None], np.array([4 * g.scale]), np.array([0.1]), settings))
-    model = CloudModel(settings, g, 1.0)
+    method = R2().changed(extent=6.0, scale_min=1e-4, scale_max=0.5)
+    normalised = (point - g.grid.centre) * g.grid.scale
+    state = DeviceState(start(normalised[None], np.array([4 * g.grid.scale]), np.array([0.1]), method.forward))
+    model = method.model(g, 1.0)
     np.testing.assert_allclose(model.render(state, g), images, rtol=2e-4, atol=1e-5)
 
     volume = model.volume(state)
-    assert volume.shape == g.nVoxel
+    assert volume.shape == g.grid.shape
     mean = [(volume * i).sum() / volume.sum() for i in np.indices(volume.shape)]
-    np.testing.assert_allclose(mean, (point - g.offOrigin) / 4 + np.array(g.nVoxel) / 2 - 0.5, atol=0.01)
+    np.testing.assert_allclose(mean, (point - g.grid.centre) / 4 + np.array(g.grid.shape) / 2 - 0.5, atol=0.01)
 
 
 # ------------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.alpha import composite, flatten
 from lingo_mi.projectors.view import View
@@ -21,11 +21,10 @@ def geometry(mode='cone'):
         DSD=750.0,
         nDetector=(22, 37),
         dDetector=(18.0, 18.0),
-        nVoxel=(32, 32, 32),
-        dVoxel=(8.0, 8.0, 8.0),
         angles=circular(3, 360, start=20),
         mode=mode,
         offDetector=(7.0, -4.0),
+        grid=Grid((32, 32, 32), (8.0, 8.0, 8.0)),
     )
 
 

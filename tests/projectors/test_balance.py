@@ -14,7 +14,7 @@ from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.mesh import MeshPaths
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases.clouds import scanner
 from lingo_mi.studies.hard_cases.measuring import on_device
@@ -61,7 +61,8 @@ def test_images(sharing, mode):
 @by_sharing
 def test_voxels(sharing):
     low, step, shape = np.array([-1.0, -0.9, -0.8]), np.array([0.15, 0.26, 0.18]), (13, 7, 9)
-    cloud, grid = random_cloud(np.random.default_rng(1), 8, size=0.2), Grid(*map(vector64, (low, step)), shape, sharing)
+    cloud = random_cloud(np.random.default_rng(1), 8, size=0.2)
+    grid = Lattice(*map(vector64, (low, step)), shape, sharing)
     values, gradients, weights = differentiated(cloud, lambda *x: voxelize(*x, grid, 6.0))
     z, y, x = np.indices(shape[::-1])
     points = low + (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) * step

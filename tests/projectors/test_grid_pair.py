@@ -13,11 +13,12 @@ from helpers.grids import backproject, scan
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular, helix
-from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.tilted_joseph import TiltedJoseph
 from lingo_mi.reconstruction import ALGORITHMS, SART
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
@@ -27,7 +28,7 @@ def moved(geo, shift=0.0, turn=(0.0, 0.0, 0.0)):
     n = len(geo)
     turns = Rotation.from_rotvec(np.tile(turn, (n, 1))).as_matrix()
     shifts = np.broadcast_to(np.reshape(shift, (-1, 1)) * [0, 0, 1.0], (n, 3))
-    return Geometry.from_poses(geo.rays().moved(turns, shifts), geo.nDetector, geo.nVoxel, geo.dVoxel, geo.offOrigin)
+    return Geometry.from_poses(geo.rays().moved(turns, shifts), geo.nDetector, grid=geo.grid)
 
 
 def laminography(geo):
@@ -46,13 +47,13 @@ def test_a_matrix_and_its_transpose(mode, masked):
     rng, n = np.random.default_rng(0), geo.nDetector
     valid = rng.random((3, *n)) < 0.7 if masked else np.ones((3, *n), bool)
     A, chosen = GridPair(geo, valid if masked else None), [2, 0]
-    x, y = rng.random(geo.nVoxel), rng.normal(size=(2, *n)) * valid[chosen]
+    x, y = rng.random(geo.grid.shape), rng.normal(size=(2, *n)) * valid[chosen]
 
     def images(projections):
         return projections.transpose(0, 2, 1).ravel()
 
     found, paths = A.forward(mi.Float(np.float32(x).ravel()), chosen)
-    expected, boxes = ((project(v, geo) * valid)[chosen] for v in (x, np.ones_like(x)))
+    expected, boxes = ((project_volume(v, geo) * valid)[chosen] for v in (x, np.ones_like(x)))
     np.testing.assert_allclose(found.numpy(), images(expected), atol=2e-6 * expected.max())
     np.testing.assert_allclose(paths.numpy(), images(boxes), atol=2e-6 * boxes.max())
     anything = y if not masked else np.where(valid[chosen], y, 7.0)  # what stands in pixels left out counts for nothing
@@ -95,7 +96,7 @@ def test_which_projector_a_scan_gets():
 def test_helix(name, views, options):
     """Two turns that climb by 20 mm each."""
     geo = spiral(geometry(angles=4 * np.pi * np.arange(views) / views), 20.0)
-    assert_ball(ALGORITHMS[name](**options).run(ellipsoids(geo, BALL)).volume, geo)
+    assert_ball(run_algorithm(ellipsoids(geo, BALL), ALGORITHMS[name](**options)).volume, geo)
 
 
 def test_pixels_left_out_count_for_nothing():
@@ -104,11 +105,13 @@ def test_pixels_left_out_count_for_nothing():
     whole = ellipsoids(geo, BALL)
     valid = np.random.default_rng(0).random(whole.projections.shape) < 0.75
     dead = replace(whole, projections=np.where(valid, whole.projections, np.nan), valid=valid)
-    result = SART(3).run(dead)
+    result = run_algorithm(dead, SART(3))
     assert_ball(result.volume, geo)
     assert result.residuals[-1] < 0.1
     with pytest.raises(AssertionError):
-        assert_ball(SART(3).run(replace(whole, projections=np.where(valid, whole.projections, 0))).volume, geo)
+        assert_ball(
+            run_algorithm(replace(whole, projections=np.where(valid, whole.projections, 0)), SART(3)).volume, geo
+        )
 
 
 def test_kernels_serve_any_views():
@@ -116,8 +119,8 @@ def test_kernels_serve_any_views():
     geo = laminography(scan(n=5))
     measured = Scan(geo, np.random.default_rng(0).random((5, *geo.nDetector)).astype(np.float32))
     for algorithm in ('sart', 'cgls'):
-        ALGORITHMS[algorithm](niter=2).run(measured)
+        run_algorithm(measured, ALGORITHMS[algorithm](niter=2))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            ALGORITHMS[algorithm](niter=3).run(measured.subset([0, 2, 3]))
+            run_algorithm(measured.subset([0, 2, 3]), ALGORITHMS[algorithm](niter=3))
             assert all(k['cache_hit'] for k in dr.kernel_history([dr.KernelType.JIT]))

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.grids import backproject, scan
 from lingo_mi.common.errors import InputError
-from lingo_mi.projectors.grid import Lines, line_integrals, project, view_rays, view_table
+from lingo_mi.projectors.grid import Lines, line_integrals, project_volume, view_rays, view_table
 
 
 def interpolate(volume, box_min, voxel, points):
@@ -122,13 +122,13 @@ def test_rays_start_and_end():
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_project_against_quadrature(mode):
     geometry = scan(mode)
-    volume = np.random.default_rng(2).random(geometry.nVoxel)
-    frames, result = geometry.rays(), project(volume, geometry)
+    volume = np.random.default_rng(2).random(geometry.grid.shape)
+    frames, result = geometry.rays(), project_volume(volume, geometry)
     assert result.shape == (4, 17, 21) and result.dtype == np.float32
-    box_min = np.array(geometry.offOrigin) - np.array(geometry.sVoxel) / 2
+    box_min = np.array(geometry.grid.centre) - np.array(geometry.grid.size) / 2
     for view, row, column in [(0, 8, 10), (1, 4, 7), (2, 11, 15), (3, 7, 3)]:
         o, d = frames.through(view, column + 0.5, row + 0.5)
-        expected = quadrature(volume, box_min, np.array(geometry.dVoxel), [o], [d])
+        expected = quadrature(volume, box_min, np.array(geometry.grid.spacing), [o], [d])
         np.testing.assert_allclose(result[view, row, column], expected[0], rtol=2e-5)
     assert np.count_nonzero(result) > 100
 
@@ -139,29 +139,29 @@ def test_backproject_is_the_transpose(mode, shape):
     geometry = scan(mode, nVoxel=shape)
     rng = np.random.default_rng(5)
     x, y = rng.normal(size=shape), rng.normal(size=(4, 17, 21))
-    ax, aty = project(x, geometry).astype(float), backproject(y, geometry).astype(float)
+    ax, aty = project_volume(x, geometry).astype(float), backproject(y, geometry).astype(float)
     assert abs(np.vdot(ax, y) - np.vdot(x, aty)) < 1e-5 * np.linalg.norm(ax) * np.linalg.norm(y)
 
 
 def test_empty_margins_change_nothing():
     geometry = scan(nVoxel=(12, 13, 11), dVoxel=(3.0, 3.0, 3.0))
-    volume = np.zeros(geometry.nVoxel)
+    volume = np.zeros(geometry.grid.shape)
     volume[4:7, 5:6, 8:11] = np.random.default_rng(0).random((3, 1, 3)) + 1
     whole = volume + 1e-30  # nothing is empty, nothing is clipped
-    np.testing.assert_allclose(project(volume, geometry), project(whole, geometry), rtol=1e-5, atol=1e-5)
-    assert not project(np.zeros(geometry.nVoxel), geometry).any()
+    np.testing.assert_allclose(project_volume(volume, geometry), project_volume(whole, geometry), rtol=1e-5, atol=1e-5)
+    assert not project_volume(np.zeros(geometry.grid.shape), geometry).any()
 
 
 def test_derivatives_in_both_modes():
     geometry = scan(n=1)
     rng = np.random.default_rng(7)
-    x, dx = rng.random(geometry.nVoxel), rng.normal(size=geometry.nVoxel)
+    x, dx = rng.random(geometry.grid.shape), rng.normal(size=geometry.grid.shape)
     origin, direction, t_min = view_rays(mi.Float(view_table(geometry)[0]), *geometry.nDetector)
-    half = np.array(geometry.sVoxel) / 2
+    half = np.array(geometry.grid.size) / 2
     weight = rng.normal(size=geometry.nDetector)
 
     def run(data):
-        return line_integrals(data, geometry.nVoxel, -half, half, Lines(origin, direction, t_min))
+        return line_integrals(data, geometry.grid.shape, -half, half, Lines(origin, direction, t_min))
 
     data = mi.Float(np.float32(x).ravel())
     dr.enable_grad(data)
@@ -173,7 +173,7 @@ def test_derivatives_in_both_modes():
     dr.enable_grad(data)
     data.grad = mi.Float(np.float32(dx).ravel())
     derivative = dr.forward_to(run(data)).numpy().reshape(geometry.nDetector[::-1]).T
-    np.testing.assert_allclose(derivative, project(dx, geometry)[0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(derivative, project_volume(dx, geometry)[0], rtol=1e-4, atol=1e-4)
 
 
 def test_axis_conventions():
@@ -189,9 +189,9 @@ def test_axis_conventions():
     )
 
     def spot(i, j, k, view):
-        volume = np.zeros(geometry.nVoxel)
+        volume = np.zeros(geometry.grid.shape)
         volume[i, j, k] = 1
-        image = project(volume, geometry)[view].astype(float)
+        image = project_volume(volume, geometry)[view].astype(float)
         rows, columns = np.indices(image.shape) + 0.5 - 40.5
         return (image * columns).sum() / image.sum(), (image * rows).sum() / image.sum()
 
@@ -206,9 +206,9 @@ def test_panel_offset_moves_the_image_the_other_way():
         nVoxel=(9, 9, 9), dVoxel=(3.0, 3.0, 3.0), dDetector=(3.0, 2.5), nDetector=(31, 31), offOrigin=(0.0, 0.0, 0.0)
     )
     geometry = scan(**settings, offDetector=(0.0, 0.0))
-    volume = np.random.default_rng(0).random(geometry.nVoxel)
-    centred = project(volume, geometry)
-    shifted = project(volume, scan(**settings, offDetector=(6.0, 5.0)))
+    volume = np.random.default_rng(0).random(geometry.grid.shape)
+    centred = project_volume(volume, geometry)
+    shifted = project_volume(volume, scan(**settings, offDetector=(6.0, 5.0)))
     # Two rows towards +z (smaller row numbers), two columns towards +u.
     np.testing.assert_allclose(shifted[:, 2:, :-2], centred[:, :-2, 2:], rtol=1e-4, atol=1e-4)
 
@@ -217,22 +217,22 @@ def test_one_kernel_for_all_views():
     geometry = scan(n=5)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        project(np.random.default_rng(0).random(geometry.nVoxel), geometry)
+        project_volume(np.random.default_rng(0).random(geometry.grid.shape), geometry)
         history = dr.kernel_history([dr.KernelType.JIT])
     assert len({kernel['hash'] for kernel in history}) == 1 and len(history) == 5
 
 
 def test_progress_is_called_for_every_view():
     calls = []
-    project(np.ones((9, 11, 7)), scan(), progress=lambda done, n: calls.append((done, n)))
+    project_volume(np.ones((9, 11, 7)), scan(), progress=lambda done, n: calls.append((done, n)))
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_errors():
     with pytest.raises(InputError, match='shape'):
-        project(np.ones((3, 3, 3)), scan())
+        project_volume(np.ones((3, 3, 3)), scan())
     with pytest.raises(InputError, match='NaN'):
-        project(np.full((9, 11, 7), np.nan), scan())
+        project_volume(np.full((9, 11, 7), np.nan), scan())
     with pytest.raises(InputError, match='values'):
         line_integrals(mi.Float([1, 2, 3]), (1, 1, 2), [0, 0, 0], [1, 1, 1], Lines(mi.Point3f(0), mi.Vector3f(1)))
 

@@ -8,8 +8,8 @@ from helpers.grids import scan
 from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, shaken, turned
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.projectors.grid import project
+from lingo_mi.geometry import CircularGeometry, Grid
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.stack import Stack
 
@@ -40,7 +40,7 @@ def test_transpose(changes):
     geometry = scan(**changes)
     J, rng = Joseph(geometry), np.random.default_rng(1)
     n = len(geometry)
-    x = rng.normal(size=geometry.nVoxel).astype(np.float32)
+    x = rng.normal(size=geometry.grid.shape).astype(np.float32)
     y = rng.normal(size=(n, *geometry.nDetector)).astype(np.float32)
     ax = J.forward(mi.Float(x.ravel()), range(n))[0].numpy().astype(float)
     aty = J.adjoint(device_images(y), range(n)).numpy().astype(float)
@@ -51,7 +51,7 @@ def test_transpose(changes):
 def test_rays_along_all_faces_of_the_volume_are_alike():
     """To the last bit on a face, they see the voxels beside it, there and back."""
     geometry = CircularGeometry(
-        DSO=8.0, DSD=8.0, nDetector=(6, 5), dDetector=1.0, nVoxel=(3, 4, 5), dVoxel=1.0, angles=[0.0], mode='parallel'
+        DSO=8.0, DSD=8.0, nDetector=(6, 5), dDetector=1.0, angles=[0.0], mode='parallel', grid=Grid((3, 4, 5), 1.0)
     )
     J, ones = Joseph(geometry), mi.Float(np.ones(60, np.float32))
     image, path = (a.numpy() for a in J.forward(ones, [0]))
@@ -65,7 +65,7 @@ def test_rays_along_all_faces_of_the_volume_are_alike():
 def test_voxels_beside_a_ray_add_nothing_whatever_they_hold():
     """Rays through voxel centres, and half a voxel beyond the outermost: the neighbours have no weight."""
     geometry = CircularGeometry(
-        DSO=8.0, DSD=8.0, nDetector=(3, 3), dDetector=1.0, nVoxel=(3, 3, 3), dVoxel=1.0, angles=[0.0], mode='parallel'
+        DSO=8.0, DSD=8.0, nDetector=(3, 3), dDetector=1.0, angles=[0.0], mode='parallel', grid=Grid((3, 3, 3), 1.0)
     )
     for i in range(9):
         row, column = i // 3, i % 3
@@ -88,13 +88,14 @@ def test_smooth_ball_against_the_exact_projector(voxels):
     """Joseph samples once a slice, which is nearly exact where the volume is smooth, however long the voxels are."""
     geometry = scan(n=6, nDetector=(30, 34), dDetector=(4.0, 4.0), **voxels)
     grid = [
-        (np.arange(n) + 0.5 - n / 2) * d + o for n, d, o in zip(geometry.nVoxel, geometry.dVoxel, geometry.offOrigin)
+        (np.arange(n) + 0.5 - n / 2) * d + o
+        for n, d, o in zip(geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre)
     ]
     x = np.stack(np.meshgrid(*grid, indexing='ij'), -1)
     volume = 0.02 / (1 + np.exp((np.linalg.norm(x - [6.0, -5.0, 4.0], axis=-1) - 25) / 2.0))
     result = Joseph(geometry).forward(mi.Float(np.float32(volume).ravel()), range(6))[0].numpy()
     result = result.reshape(6, 34, 30).transpose(0, 2, 1)
-    exact = project(volume, geometry)
+    exact = project_volume(volume, geometry)
     assert np.linalg.norm(result - exact) < 0.004 * np.linalg.norm(exact)
 
 

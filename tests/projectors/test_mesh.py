@@ -6,7 +6,7 @@ import trimesh
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.phantoms.mesh import Mesh, flange
 
@@ -144,11 +144,10 @@ def test_concave_part_with_holes(mode):
         DSD=1400,
         nDetector=SHAPE,
         dDetector=(8.0, 8.0),
-        nVoxel=(32,) * 3,
-        dVoxel=(8.0,) * 3,
         angles=[0.3, 2.0, 4.4],
         mode=mode,
         offDetector=(11.0, -7.0),
+        grid=Grid((32,) * 3, (8.0,) * 3),
     )
     part = flange()
     paths, frames = paths_of(part), geometry.rays()

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helpers.circles import circle
 from helpers.same import assert_same
 from lingo_mi.common.errors import AccuracyWarning, InputError
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.depth import deepest
@@ -35,7 +36,7 @@ def scanner(mode='cone', shape=(33, 46), angle=33.0, size=(3.2, 3.0), **changes)
     settings = dict(
         DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, nVoxel=8, dVoxel=0.25, angles=np.radians([angle])
     )
-    return CircularGeometry(**{**settings, 'mode': mode, **changes}).rays(), shape
+    return circle(**{**settings, 'mode': mode, **changes}).rays(), shape
 
 
 def tilted(parallel):
@@ -404,7 +405,7 @@ def test_needles_along_the_ray_that_cannot_be_widened_are_announced():
 
 
 def scanner_of(DSO, DSD, n, step):
-    geometry = CircularGeometry(DSO=DSO, DSD=DSD, nDetector=n, dDetector=step, nVoxel=8, dVoxel=1, angles=[0.0])
+    geometry = CircularGeometry(DSO=DSO, DSD=DSD, nDetector=n, dDetector=step, angles=[0.0], grid=Grid(8, 1))
     return geometry.rays(), 0, n, n
 
 

@@ -1,7 +1,5 @@
 """Joseph's projector for panels that lean, against the transcription, its transpose, and the exact projector."""
 
-from dataclasses import replace
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -10,7 +8,8 @@ from helpers.grids import scan
 from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, rolled, shaken, tilted, turned
 from lingo_mi.common.errors import InputError
-from lingo_mi.projectors.grid import project
+from lingo_mi.geometry.grid import Grid
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.tilted_joseph import TiltedJoseph
 
@@ -43,7 +42,7 @@ def test_against_the_transcription(geometry, masked):
 @pytest.mark.parametrize('geometry', GEOMETRIES.values(), ids=GEOMETRIES)
 def test_transpose(geometry):
     A, rng = TiltedJoseph(geometry), np.random.default_rng(1)
-    x = rng.normal(size=geometry.nVoxel).astype(np.float32)
+    x = rng.normal(size=geometry.grid.shape).astype(np.float32)
     y = rng.normal(size=(3, *geometry.nDetector)).astype(np.float32)
     ax = A.forward(mi.Float(x.ravel()), range(3))[0].numpy().astype(float)
     aty = A.adjoint(device_images(y), range(3)).numpy().astype(float)
@@ -62,30 +61,31 @@ def test_before_an_upright_panel_it_is_the_other():
 def test_slabs_add_up():
     """Each between slices of zeros, as `slab_sweeps` projects them."""
     geometry = posed(tilted(*STEEP))
-    volume = np.random.default_rng(0).random(geometry.nVoxel, dtype=np.float32)
+    volume = np.random.default_rng(0).random(geometry.grid.shape, dtype=np.float32)
     A = TiltedJoseph(geometry)
     whole, total = A.forward(mi.Float(volume.ravel()), range(3))[0].numpy(), 0
     for begin, end in ((0, 3), (3, 5), (5, 7)):
         low, high = max(begin - 1, 0), min(end + 1, 7)
         slab = volume[:, :, low:high].copy()
         slab[:, :, : begin - low], slab[:, :, end - low :] = 0, 0
-        part = A.of_slab(geometry.slab(low, high))
+        part = A.of_slab(geometry.on(geometry.grid.slab(low, high)))
         total = total + part.forward(mi.Float(slab.ravel()), range(3))[0].numpy()
     np.testing.assert_allclose(total, whole, atol=1e-5 * whole.max())
 
 
 @pytest.mark.parametrize('tilt', [SMALL, STEEP, ALONG_Z])
 def test_smooth_ball_against_the_exact_projector(tilt):
-    geometry = replace(posed(tilted(*tilt)), nVoxel=(40, 44, 36), dVoxel=(2.0, 1.8, 2.2))
+    geometry = posed(tilted(*tilt)).on(Grid((40, 44, 36), (2.0, 1.8, 2.2), posed(tilted(*tilt)).grid.centre))
     x = np.stack(
         np.meshgrid(
-            *[(np.arange(n) + 0.5 - n / 2) * d for n, d in zip(geometry.nVoxel, geometry.dVoxel)], indexing='ij'
+            *[(np.arange(n) + 0.5 - n / 2) * d for n, d in zip(geometry.grid.shape, geometry.grid.spacing)],
+            indexing='ij',
         ),
         -1,
     )
     volume = np.float32(0.02 / (1 + np.exp((np.linalg.norm(x, axis=-1) - 25) / 2.0)))
     result = TiltedJoseph(geometry).forward(mi.Float(volume.ravel()), range(3))[0].numpy()
-    exact = project(volume, geometry)
+    exact = project_volume(volume, geometry)
     assert np.linalg.norm(result.reshape(3, 21, 17).transpose(0, 2, 1) - exact) < 0.004 * np.linalg.norm(exact)
 
 

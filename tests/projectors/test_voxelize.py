@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.projectors.view import vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
 from lingo_mi.studies.oracle import Cloud, random_cloud, relative
@@ -29,7 +29,7 @@ def run(cloud, grid, weights, extent=EXTENT):
     low, step, shape = grid
     gaussians = on_device(cloud)
     dr.enable_grad(gaussians)
-    values = voxelize(*gaussians, Grid(vector64(low), vector64(step), shape), extent)
+    values = voxelize(*gaussians, Lattice(vector64(low), vector64(step), shape), extent)
     dr.backward(dr.sum(values * mi.Float(weights.tolist())))
     return values.numpy().astype(float), {n: host(dr.grad(x)) for n, x in zip(PARAMETERS, gaussians)}
 

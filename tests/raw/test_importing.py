@@ -203,7 +203,7 @@ def test_crop_binning_and_views_keep_the_rays(tmp_path, raw, scan_yml):
 
 def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
     np.save(tmp_path / 'views.npy', raw.views)
-    with pytest.raises(lm.InputError, match='no flat frames; give --flats, or the air level'):
+    with pytest.raises(lm.InputError, match='no flat frames; give flats=FILE, or the air level'):
         load(tmp_path / 'views.npy', scan_yml)
     np.save(tmp_path / 'darks.npy', raw.darks)
     with pytest.warns(UserWarning, match='brighter than the air level'):
@@ -356,7 +356,7 @@ def test_rows_of_rtk_run_up(tmp_path, named):
     p = np.random.default_rng(0).uniform(0, 2, (3, *shape)).astype(np.float32)
     np.save(tmp_path / 'frames.npy', (1000 * np.exp(-p[:, ::-1])).astype(np.float32))
     source, options = tmp_path / 'geometry.xml', dict(i0=1000.0, pixel=1.5)
-    rtk.write(source, geometry.rays(), shape)
+    rtk.write_rtk(source, geometry.rays(), shape)
     if named != 'itself':
         values, options = dict(dDetector=[1.5, 1.5], nVoxel=[8, 8, 8], dVoxel=1, poses='geometry.xml'), dict(i0=1000.0)
         source = tmp_path / 'scan.yml'
@@ -384,9 +384,9 @@ def test_the_own_grid_lies_where_the_panel_sees(tmp_path, raw, crop):
     given = save(tmp_path, raw)
     scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', crop=crop, **given).geometry
     v0, v1, u0, u1 = crop
-    assert scan.dVoxel == pytest.approx([2 / 3] * 3) and scan.nVoxel[2] == v1 - v0
-    assert scan.offOrigin == pytest.approx([0, 0, (12 - (v0 + v1) / 2) * 2 / 3])
-    assert scan.nVoxel[0] == scan.nVoxel[1] == 2 * max(20 - u0, u1 - 20)
+    assert scan.grid.spacing == pytest.approx([2 / 3] * 3) and scan.grid.shape[2] == v1 - v0
+    assert scan.grid.centre == pytest.approx([0, 0, (12 - (v0 + v1) / 2) * 2 / 3])
+    assert scan.grid.shape[0] == scan.grid.shape[1] == 2 * max(20 - u0, u1 - 20)
 
 
 def test_pixels_that_saturate_in_the_flats_are_left_out(tmp_path, raw):
@@ -523,7 +523,7 @@ def test_a_closed_shutter(tmp_path, scan_yml):
 def test_a_converter_of_fewer_bits_that_saturates(tmp_path, raw, scan_yml):
     given = save(tmp_path, raw)
     np.save(tmp_path / 'views.npy', np.minimum(raw.views, 16383))
-    with pytest.warns(UserWarning, match='6 views .* saturated: .* highest count of 16383; give --saturation 16383'):
+    with pytest.warns(UserWarning, match='6 views .* saturated: .* highest count of 16383; give saturation=16383'):
         load(tmp_path / 'views.npy', scan_yml, **given)
     flats = np.minimum(raw.flats, 16000)  # below
     np.save(tmp_path / 'flats.npy', flats)
@@ -564,7 +564,7 @@ def test_a_cut_off_edf(tmp_path, raw, scan_yml, several):
         load(path if several else path.parent, scan_yml, **save(tmp_path, raw))
 
 
-@pytest.mark.parametrize(('empty', 'message'), [('data_white', 'no flat frames; give --flats'), ('data_dark', '')])
+@pytest.mark.parametrize(('empty', 'message'), [('data_white', 'no flat frames; give flats=FILE'), ('data_dark', '')])
 def test_dxchange_with_stacks_of_no_frames(tmp_path, raw, scan_yml, empty, message):
     with pytest.importorskip('h5py').File(tmp_path / 'a.h5', 'w') as file:
         for name, stack in dict(data=raw.views, data_white=raw.flats, data_dark=raw.darks).items():

@@ -9,6 +9,7 @@ import pytest
 from helpers.balls import BALL, assert_ball, ball_errors, ellipsoids, geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction import ALGORITHMS
+from lingo_mi.reconstruction.run import run_algorithm
 
 # A panel off the axis by a few pixels, and one that reaches 110 mm on one side of the central ray, 10 mm on the other.
 PANELS = {'(4, -7) mm': (72, (4.0, -7.0)), '(4, 50) mm': (40, (4.0, 50.0))}
@@ -49,8 +50,8 @@ def check(name, views, options, mode, panel):
     columns, offset = PANELS[panel]
     geo = geometry(mode, circular(views, start=3), nDetector=(64, columns), offDetector=offset)
     scan = ellipsoids(geo, BALL)
-    volume = ALGORITHMS[name](**options).run(scan).volume
-    assert volume.shape == geo.nVoxel and volume.dtype == np.float32
+    volume = run_algorithm(scan, ALGORITHMS[name](**options)).volume
+    assert volume.shape == geo.grid.shape and volume.dtype == np.float32
     density, place = ball_errors(volume, geo)
     said = ', '.join(f'{name} = {value}' for name, value in options.items())
     print(f'\n| {name} | {said} | {mode} | {panel} | {100 * density:+.2f} | {place:.3f} |')

@@ -10,22 +10,22 @@ from scipy.ndimage import gaussian_filter
 import lingo_mi as lm
 from helpers.grids import scan as small
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.phantoms import make
-from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, run
 from lingo_mi.reconstruction.best import Trial, _best, error_map
-from lingo_mi.reconstruction.held_out import Score, Watch, split
-from lingo_mi.reconstruction.run import check_room
+from lingo_mi.reconstruction.held_out import Score, TrialWatch, split_views
+from lingo_mi.reconstruction.run import check_room, run_algorithm
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
 
 def scanner(size, spacing):
     return CircularGeometry(
-        DSO=1000.0, DSD=1500.0, nDetector=(40, 40), dDetector=4.0, nVoxel=size, dVoxel=spacing, angles=circular(20)
+        DSO=1000.0, DSD=1500.0, nDetector=(40, 40), dDetector=4.0, angles=circular(20), grid=Grid(size, spacing)
     )
 
 
@@ -33,7 +33,7 @@ def scanned(parts, photons=0.0):
     """A scan on 24^3 voxels of the phantom foot on `parts` times as many, and the truth on the voxels."""
     n = 24 * parts
     fine = make('foot', n).data * np.float32(0.08)
-    views = project(fine, scanner((n,) * 3, 3 / parts))
+    views = project_volume(fine, scanner((n,) * 3, 3 / parts))
     if photons:
         counts = np.random.default_rng(0).poisson(photons * np.exp(-views.astype(float)))
         views = -np.log(np.maximum(counts, 0.5) / photons).astype(np.float32)
@@ -45,7 +45,7 @@ def scanned(parts, photons=0.0):
 def test_which_views_are_held_out(views, held):
     geometry = small(n=views)
     scan = Scan(geometry, np.arange(views)[:, None, None] + np.zeros((views, *geometry.nDetector)))
-    kept, out = split(scan, 5)
+    kept, out = split_views(scan, 5)
     assert out.projections[:, 0, 0].tolist() == held
     assert sorted([*kept.projections[:, 0, 0], *held]) == list(range(views))
 
@@ -53,13 +53,13 @@ def test_which_views_are_held_out(views, held):
 def test_too_few_views():
     geometry = small(n=3)
     with pytest.raises(InputError, match='needs at least 4, but the scan has 3'):
-        Best().run(Scan(geometry, np.ones((3, *geometry.nDetector))))
+        run_algorithm(Scan(geometry, np.ones((3, *geometry.nDetector))), Best())
 
 
 def test_no_start():
     geometry = small(n=5)
     with pytest.raises(InputError, match='best starts from nothing'):
-        Best().run(Scan(geometry, np.ones((5, *geometry.nDetector))), start=np.ones(geometry.nVoxel))
+        run_algorithm(Scan(geometry, np.ones((5, *geometry.nDetector))), Best(), start=np.ones(geometry.grid.shape))
 
 
 def test_the_score_is_the_error_of_the_volume_smooth_or_not():
@@ -82,10 +82,10 @@ def test_the_score_is_the_error_of_the_volume_smooth_or_not():
 def test_finer_voxels_for_finer_objects_only():
     for parts in (1, 2):
         scan, truth = scanned(parts)
-        found = Best(niter=8).run(scan)
+        found = run_algorithm(scan, Best(niter=8))
         assert found.plan[found.taken].finer == parts
         assert found.volume.shape == truth.shape
-        assert psnr_3d(found.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+        assert psnr_3d(found.volume, truth) > psnr_3d(run_algorithm(scan, ASDPOCS(niter=20)).volume, truth) + 1
 
 
 @pytest.mark.parametrize('score, taken', [(1.01, 2), (1.03, 1)])
@@ -104,7 +104,7 @@ def test_a_cloud_is_taken_where_it_predicts_the_views_better(right):
             progress(k, 100)
         return lambda geometry: truth if right else np.full_like(truth, truth.mean())
 
-    found = Best(niter=2, finer=1, cloud=True).run(scan, fit=fit, progress=lambda k, *_: done.append(k))
+    found = run_algorithm(scan, Best(niter=2, finer=1, cloud=True), fit=fit, progress=lambda k, *_: done.append(k))
     assert found.plan[-1].cloud and found.plan[found.taken].cloud == right
     assert fitted == [16, 20][: 1 + right]  # the views that are kept; all of them, where it is taken
     assert done[:-1] == list(range(1, len(done)))
@@ -120,13 +120,13 @@ def test_a_slow_trial_ends_where_passes_gain_little(slow, passes):
         def __call__(self, x):
             return next(falling)
 
-    watch = Watch(Falling(), Trial('asd-pocs', 1), slow=slow)
+    watch = TrialWatch(Falling(), Trial('asd-pocs', 1), slow=slow)
     assert next(k for k in range(1, 51) if watch(k, mi.Float(0)) or k == 50) == passes
 
 
 def test_a_cloud_needs_a_fit():
     with pytest.raises(InputError, match='use lm.reconstruct'):
-        Best(cloud=True).run(scanned(1)[0])
+        run_algorithm(scanned(1)[0], Best(cloud=True))
 
 
 def test_the_cloud_is_fitted():
@@ -137,29 +137,31 @@ def test_the_cloud_is_fitted():
 
 
 def test_noise_stops_it_early():
-    clean, noisy = (Best(niter=8).run(scanned(1, photons)[0]) for photons in (0, 300.0))
+    clean, noisy = (run_algorithm(scanned(1, photons)[0], Best(niter=8)) for photons in (0, 300.0))
     assert noisy.plan[0].niter < clean.plan[0].niter
     assert [any(trial.smooth for trial in found.plan) for found in (clean, noisy)] == [False, True]
     scan, truth = scanned(1, 300.0)
-    assert psnr_3d(noisy.volume, truth) > psnr_3d(ASDPOCS(niter=20).run(scan).volume, truth) + 1
+    assert psnr_3d(noisy.volume, truth) > psnr_3d(run_algorithm(scan, ASDPOCS(niter=20)).volume, truth) + 1
 
 
 def test_with_noise_a_cloud_gets_more_total_variation_too():
     scan, truth = scanned(1, 100.0)
-    found = Best(niter=8, finer=1, cloud=True).run(scan, fit=lambda part, progress: lambda geometry: 0.9 * truth)
+    found = run_algorithm(
+        scan, Best(niter=8, finer=1, cloud=True), fit=lambda part, progress: lambda geometry: 0.9 * truth
+    )
     best = min(found.plan[1:-1], key=lambda trial: trial.score)
     assert best.smooth and found.plan[-1].smooth and found.plan[-1].name == 'refined, smooth, cloud'
 
 
 def test_the_plan_is_told_and_can_be_kept():
     scan, _ = scanned(1)
-    found = Best(niter=2, finer=1).run(scan)
+    found = run_algorithm(scan, Best(niter=2, finer=1))
     record, lines = found.record(), found.report().splitlines()
     assert [line[0] for line in lines].index('*') == found.taken == record['taken']
     assert len(lines) == len(record['tried']) == len(found.plan)
     for tried in record['tried']:
         assert tried['scores'][tried['niter'] - 1] == tried['score'] == min(tried['scores'])
-    again = Best(niter=2, finer=1).run(replace(scan))
+    again = run_algorithm(replace(scan), Best(niter=2, finer=1))
     np.testing.assert_array_equal(again.volume, found.volume)
     np.testing.assert_array_equal(again.error, found.error)
 
@@ -197,4 +199,6 @@ def test_more_than_an_array_can_hold(monkeypatch, sizes, what):
 def test_views_in_a_wrong_order_are_warned_of():
     scan, _ = scanned(1)
     with pytest.warns(UserWarning, match='held out are predicted badly'):
-        Best(niter=2).run(replace(scan, projections=scan.projections[np.random.default_rng(0).permutation(20)]))
+        run_algorithm(
+            replace(scan, projections=scan.projections[np.random.default_rng(0).permutation(20)]), Best(niter=2)
+        )

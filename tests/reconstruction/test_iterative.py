@@ -14,15 +14,16 @@ from helpers.grids import scan as small
 from helpers.matrices import matrix
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
-from lingo_mi.completion.views import complete
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.completion.views import complete_views
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics.quality import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
-from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refined
 from lingo_mi.reconstruction.asd_pocs import tv_floor, tv_gradient
 from lingo_mi.reconstruction.refined import structure
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import blocks
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
@@ -61,9 +62,9 @@ def close(result, expected):
 @pytest.mark.parametrize('blocksize, noneg', [(1, True), (2, True), (2, False), (5, True)])
 def test_sart_is_the_transcription(system, blocksize, noneg):
     scan, A, b = system
-    start = np.random.default_rng(1).random(scan.geometry.nVoxel)
-    result = OSSART(3, blocksize, 0.8, 0.9, noneg, 'ordered', tol=1e-9).run(scan, start=start)
-    without = OSSART(3, blocksize, 0.8, 0.9, noneg, 'ordered').run(scan, start=start)
+    start = np.random.default_rng(1).random(scan.geometry.grid.shape)
+    result = run_algorithm(scan, OSSART(3, blocksize, 0.8, 0.9, noneg, 'ordered', tol=1e-9), start=start)
+    without = run_algorithm(scan, OSSART(3, blocksize, 0.8, 0.9, noneg, 'ordered'), start=start)
     x = start.ravel()
     expected = [np.linalg.norm(A @ x - b) / np.linalg.norm(b)]
     for k in range(3):
@@ -83,45 +84,46 @@ def test_weighted_sart_is_that_of_the_scaled_system(system, blocksize):
     """Where weights are zero nothing changes; a factor on all of them is nothing."""
     scan, A, b = system
     rng = np.random.default_rng(1)
-    start, s = rng.random(scan.geometry.nVoxel), rng.random(scan.geometry.nVoxel) ** 3
+    start, s = rng.random(scan.geometry.grid.shape), rng.random(scan.geometry.grid.shape) ** 3
     s[:2], x = 0, start.ravel()
     for k in range(3):
         x = sart_pass(
             x, A, b, 0.8 * 0.9**k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], s=s.ravel()
         )
     for factor in (1, 1e-3):
-        found = OSSART(3, blocksize, 0.8, 0.9, True, 'ordered').run(scan, start=start, weights=factor * s)
+        found = run_algorithm(scan, OSSART(3, blocksize, 0.8, 0.9, True, 'ordered'), start=start, weights=factor * s)
         close(found, x)
         np.testing.assert_array_equal(found.volume[:2], np.float32(start[:2]))
     ones = np.full_like(s, 3)
     two = ASDPOCS(2)
-    np.testing.assert_allclose(two.run(scan, weights=ones), two.run(scan), atol=1e-5)
-    change = two.run(scan, start=start, weights=s).volume - two.run(scan, start=start).volume
+    np.testing.assert_allclose(run_algorithm(scan, two, weights=ones), run_algorithm(scan, two), atol=1e-5)
+    change = run_algorithm(scan, two, start=start, weights=s).volume - run_algorithm(scan, two, start=start).volume
     assert np.abs(change).max() > 0.1
 
 
 @pytest.mark.parametrize('value, why', [(np.nan, 'NaN'), (-1, 'negative')])
 def test_weights_that_are_none(system, value, why):
-    shape = system[0].geometry.nVoxel
+    shape = system[0].geometry.grid.shape
     for weights, reason in ((np.full(shape, value), why), (np.ones((2, *shape[1:])), 'shape')):
         with pytest.raises(InputError, match=f'weights.*{reason}'):
-            SART(1).run(system[0], weights=weights)
+            run_algorithm(system[0], SART(1), weights=weights)
 
 
 def test_blurred_sart_is_the_transcription(system):
     """What a pass changes is blurred, and then negative densities are set to zero."""
     scan, A, b = system
-    start, deviations = np.random.default_rng(1).random(scan.geometry.nVoxel), (0.7, 0.5, 0.6)
+    start, deviations = np.random.default_rng(1).random(scan.geometry.grid.shape), (0.7, 0.5, 0.6)
     for noneg in (True, False):
         x = start.ravel()
         for k in range(3):
             change = sart_pass(x, A, b, 0.8 * 0.9**k, [np.arange(i, i + 1) for i in range(5)], noneg) - x
             change = gaussian_filter(change.reshape(start.shape), deviations, radius=[int(4 * s) for s in deviations])
             x = np.maximum(x + change.ravel(), 0) if noneg else x + change.ravel()
-        close(SART(3, 0.8, 0.9, noneg, 'ordered').run(scan, start=start, blur=deviations), x)
-    np.testing.assert_array_equal(SIRT(2).run(scan, blur=(0, 0, 0)), SIRT(2).run(scan))
+        close(run_algorithm(scan, SART(3, 0.8, 0.9, noneg, 'ordered'), start=start, blur=deviations), x)
+    np.testing.assert_array_equal(run_algorithm(scan, SIRT(2), blur=(0, 0, 0)), run_algorithm(scan, SIRT(2)))
     plain, soft = (
-        ASDPOCS(1, lmbda=1e-3, tviter=1, alpha=1e-9).run(scan, start=start, blur=s).volume for s in (None, deviations)
+        run_algorithm(scan, ASDPOCS(1, lmbda=1e-3, tviter=1, alpha=1e-9), start=start, blur=s).volume
+        for s in (None, deviations)
     )
     np.testing.assert_allclose(soft - start, gaussian_filter(plain - start, deviations), atol=2e-5)
     assert np.abs(plain - soft).max() > 1e-4
@@ -130,14 +132,16 @@ def test_blurred_sart_is_the_transcription(system):
 @pytest.mark.parametrize('blur', [(1, 1), (1, -1, 1), (1, np.nan, 1), (1, 1, np.inf)])
 def test_a_blur_that_is_none(system, blur):
     with pytest.raises(InputError, match='blur must be'):
-        SART(1).run(system[0], blur=blur)
+        run_algorithm(system[0], SART(1), blur=blur)
 
 
 def test_names_of_the_family(system):
     scan, _, _ = system
-    np.testing.assert_array_equal(SIRT(2).run(scan), OSSART(2, 5, OrderStrategy='ordered').run(scan))
-    np.testing.assert_array_equal(SART(2).run(scan), OSSART(2, 1).run(scan))
-    assert np.abs(SART(1).run(scan).volume - SART(1, seed=1).run(scan).volume).max() > 0
+    np.testing.assert_array_equal(
+        run_algorithm(scan, SIRT(2)), run_algorithm(scan, OSSART(2, 5, OrderStrategy='ordered'))
+    )
+    np.testing.assert_array_equal(run_algorithm(scan, SART(2)), run_algorithm(scan, OSSART(2, 1)))
+    assert np.abs(run_algorithm(scan, SART(1)).volume - run_algorithm(scan, SART(1, seed=1)).volume).max() > 0
 
 
 def test_orders():
@@ -157,27 +161,27 @@ def test_order_strategy(system, strategy):
     blocks(scan.geometry.angles, 1, strategy, rng)  # the first draw is for a check of the name
     for _ in range(2):
         x = sart_pass(x, A, b, 0.8, blocks(scan.geometry.angles, 1, strategy, rng))
-    close(SART(2, 0.8, 1.0, OrderStrategy=strategy, seed=3).run(scan), x)
+    close(run_algorithm(scan, SART(2, 0.8, 1.0, OrderStrategy=strategy, seed=3)), x)
 
 
 @pytest.mark.parametrize('name', ['sart', 'sirt', 'asd-pocs'])
 def test_noneg(system, name):
     scan = replace(system[0], projections=system[0].projections - system[0].projections.mean())
-    kept, free = (ITERATIVE[name](niter=2, noneg=noneg).run(scan).volume for noneg in (True, False))
+    kept, free = (run_algorithm(scan, ITERATIVE[name](niter=2, noneg=noneg)).volume for noneg in (True, False))
     assert free.min() < -0.1 * free.max()
     assert kept.min() >= (-0.01 * kept.max() if name == 'asd-pocs' else 0)  # whose descent comes after
 
 
 def test_cgls_is_lsqr_and_its_residual_falls(system):
     scan, A, b = system
-    result = CGLS(12).run(scan)
+    result = run_algorithm(scan, CGLS(12))
     expected = lsqr(A.reshape(-1, A.shape[2]), b.ravel(), iter_lim=12, atol=0, btol=0, conlim=0)[0]
     np.testing.assert_allclose(result.volume.ravel(), expected, atol=2e-3 * np.abs(expected).max())
     assert len(result.residuals) == 13 and np.all(np.diff(result.residuals) < 0)
     np.testing.assert_allclose(result.residuals[-1], np.linalg.norm(A @ expected - b) / np.linalg.norm(b), rtol=1e-4)
-    start = np.random.default_rng(2).random(scan.geometry.nVoxel)
+    start = np.random.default_rng(2).random(scan.geometry.grid.shape)
     shifted = Scan(scan.geometry, (b - A @ start.ravel()).reshape(scan.projections.shape))
-    close(CGLS(4).run(scan, start=start), start.ravel() + CGLS(4).run(shifted).volume.ravel())
+    close(run_algorithm(scan, CGLS(4), start=start), start.ravel() + run_algorithm(shifted, CGLS(4)).volume.ravel())
 
 
 def squared_gradient(x):
@@ -216,8 +220,8 @@ def test_tv_gradient():
 
 def test_asd_pocs_is_the_transcription(system):
     scan, A, b = system
-    shape, maxl2err = scan.geometry.nVoxel, 0.05 * np.linalg.norm(b)
-    result = ASDPOCS(4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, OrderStrategy='ordered').run(scan)
+    shape, maxl2err = scan.geometry.grid.shape, 0.05 * np.linalg.norm(b)
+    result = run_algorithm(scan, ASDPOCS(4, 2, 0.9, 0.95, 5, 0.2, 0.5, 0.6, maxl2err, OrderStrategy='ordered'))
     x, lmbda, step, errors, decides = np.zeros(A.shape[2]), 0.9, None, [], []
     for _ in range(4):
         start = x
@@ -246,11 +250,15 @@ def test_asd_pocs_meets_exact_line_integrals(share):
     share   of the pixels that are valid
     """
     geo, rng = small(n=12), np.random.default_rng(0)
-    projections = project(rng.random(geo.nVoxel), geo)
+    projections = project_volume(rng.random(geo.grid.shape), geo)
     valid = rng.random(projections.shape) < share
     scan = Scan(geo, projections, None if share == 1 else valid)
     missed = [
-        np.linalg.norm((project(ASDPOCS(80, alpha=1e-6, exact_every=n).run(scan).volume, geo) - projections)[valid])
+        np.linalg.norm(
+            (project_volume(run_algorithm(scan, ASDPOCS(80, alpha=1e-6, exact_every=n)).volume, geo) - projections)[
+                valid
+            ]
+        )
         for n in (0, 2)
     ]
     assert missed[1] < 0.2 * missed[0]
@@ -258,21 +266,22 @@ def test_asd_pocs_meets_exact_line_integrals(share):
 
 def test_asd_pocs_stops(system):
     scan, _, _ = system
-    assert len(ASDPOCS(50, 5, 0.01, 0.8, maxl2err=1.0).run(scan).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
+    assert len(run_algorithm(scan, ASDPOCS(50, 5, 0.01, 0.8, maxl2err=1.0)).residuals) == 1 + 4  # 0.01 * 0.8^4 < 0.005
     met = dict(tviter=5, alpha=0.02, lmbda_red=1.0, alpha_red=1.0, maxl2err=1e9, OrderStrategy='ordered')
     assert (
-        len(ASDPOCS(100, 5, **met).run(scan).residuals) < 100
+        len(run_algorithm(scan, ASDPOCS(100, 5, **met)).residuals) < 100
     )  # the data are met at once: the steps come to undo each other
-    assert len(ASDPOCS(100, 5, **{**met, 'maxl2err': 1e-9}).run(scan).residuals) == 101
+    assert len(run_algorithm(scan, ASDPOCS(100, 5, **{**met, 'maxl2err': 1e-9})).residuals) == 101
 
 
 @pytest.mark.parametrize('name', ITERATIVE)
 @pytest.mark.parametrize('value', [0.0, 1.0, -1.0])
 def test_constant_projections(name, value):
     geo = small(n=2)
-    result = ITERATIVE[name](niter=2).run(Scan(geo, np.full((2, *geo.nDetector), value)))
+    scan = Scan(geo, np.full((2, *geo.nDetector), value))
+    result = ITERATIVE[name](niter=2)._run(scan)  # `run_algorithm` refuses a scan without signal
     assert np.isfinite(result.volume).all() and np.isfinite([result.residuals[0], result.residuals[-1]]).all()
-    assert result.volume.dtype == np.float32 and result.volume.shape == geo.nVoxel
+    assert result.volume.dtype == np.float32 and result.volume.shape == geo.grid.shape
     if name != 'cgls' and value <= 0 and name != 'asd-pocs':
         assert not result.volume.any()
 
@@ -284,9 +293,9 @@ def test_bad_input(name):
     with pytest.raises(InputError, match='niter'):
         make(niter=0)
     with pytest.raises(InputError, match='nVoxel'):
-        make().run(scan, start=np.zeros((3, 3, 3)))
+        run_algorithm(scan, make(), start=np.zeros((3, 3, 3)))
     with pytest.raises(InputError, match='NaN'):
-        make().run(scan, start=np.full((9, 11, 7), np.nan))
+        run_algorithm(scan, make(), start=np.full((9, 11, 7), np.nan))
     if name != 'cgls':
         with pytest.raises(InputError, match='lmbda'):
             make(lmbda=3.0)
@@ -310,7 +319,7 @@ def test_bad_input(name):
             with pytest.raises(InputError, match=f'{parameter} must be'):
                 make(**{parameter: value})
     calls = []
-    make(niter=2).run(scan, progress=lambda *a: calls.append(a))
+    run_algorithm(scan, make(niter=2), progress=lambda *a: calls.append(a))
     assert [c[:2] for c in calls] == [(1, 2), (2, 2)]
     assert calls[-1][2] is None if make is ASDPOCS else np.isfinite(calls[-1][2])
 
@@ -318,7 +327,7 @@ def test_bad_input(name):
 @pytest.mark.parametrize('algorithm', [SART(), CGLS(), ASDPOCS()])
 def test_what_is_not_finite_is_no_result(algorithm):
     with pytest.raises(InputError, match='not finite'):
-        algorithm.run(Scan(small(n=2), np.full((2, 17, 21), 1e25)))
+        run_algorithm(Scan(small(n=2), np.full((2, 17, 21), 1e25)), algorithm)
 
 
 @pytest.mark.parametrize(
@@ -356,11 +365,11 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
     """From a start that is blurred, as a cloud's, the weights find more of it again than equal ones."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(12, 180.0), 96)
-    scan = Scan(geo, project(made.data, geo))
+    scan = Scan(geo, project_volume(made.data, geo))
     start = np.asarray(gaussian_filter(made.data, 1), np.float32)
-    found = Refined(4, 0, 1).run(scan, completed=scan, sample=lambda _: start).volume
+    found = run_algorithm(scan, Refined(4, 0, 1), completed=scan, sample=lambda _: start).volume
     alike = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
-    alike = alike.run(scan, start=start).volume
+    alike = run_algorithm(scan, alike, start=start).volume
     assert psnr_3d_r2(found, made.data) > psnr_3d_r2(alike, made.data) + 1, [
         psnr_3d_r2(v, made.data) for v in (found, alike, start)
     ]
@@ -371,15 +380,15 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
     means it gives, from a start that is no better."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(30, 180.0), 96)
-    scan = Scan(geo, project(made.data, geo))
+    scan = Scan(geo, project_volume(made.data, geo))
     means = made.data.reshape(24, 2, 24, 2, 24, 2).mean((1, 3, 5))
-    coarse = replace(scan, geometry=geo.with_volume(means.shape, [2 * d for d in geo.dVoxel]))
+    coarse = scan.on(Grid(means.shape, [2 * d for d in geo.grid.spacing], geo.grid.centre))
 
-    def sample(geometry):
-        return np.kron(means, np.ones(np.array(geometry.nVoxel) // means.shape))
+    def sample(grid):
+        return np.kron(means, np.ones(np.array(grid.shape) // means.shape))
 
     found = [
-        psnr_3d_r2(Refined(3, 1, 5, finer=finer).run(coarse, completed=coarse, sample=sample).volume, means)
+        psnr_3d_r2(run_algorithm(coarse, Refined(3, 1, 5, finer=finer), completed=coarse, sample=sample).volume, means)
         for finer in (1, 2)
     ]
     assert found[1] > found[0] + 3, found
@@ -388,10 +397,10 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
 def test_no_kernel_is_compiled_after_the_first_iterations(system):
     scan, _, _ = system
     runs = [
-        lambda: SART(3).run(scan),
-        lambda: SART(3).run(scan, blur=(0.5, 0.5, 0.5)),
-        lambda: CGLS(3).run(scan),
-        lambda: ASDPOCS(3, 2).run(scan),
+        lambda: run_algorithm(scan, SART(3)),
+        lambda: run_algorithm(scan, SART(3), blur=(0.5, 0.5, 0.5)),
+        lambda: run_algorithm(scan, CGLS(3)),
+        lambda: run_algorithm(scan, ASDPOCS(3, 2)),
     ]
     for run in runs:
         run()
@@ -404,11 +413,16 @@ def test_no_kernel_is_compiled_after_the_first_iterations(system):
     assert len({k['hash'] for k in history}) < 40
 
 
-@pytest.mark.parametrize('algorithm', [FDK().run, lambda scan: complete(scan, None, 9)])
+@pytest.mark.parametrize(
+    'algorithm', [lambda scan: run_algorithm(scan, FDK()), lambda scan: complete_views(scan, None, 9)]
+)
 def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
     geo = small(n=5)
     moved = Geometry.from_poses(
-        geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]), geo.nDetector, geo.nVoxel, geo.dVoxel
+        geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]),
+        geo.nDetector,
+        nVoxel=geo.grid.shape,
+        dVoxel=geo.grid.spacing,
     )
     ones = np.ones((5, *geo.nDetector), np.float32)
     with pytest.raises(InputError, match='other poses'):
@@ -423,7 +437,10 @@ def test_what_counts_as_matched_where_fdk_cannot_say(system):
     """Nothing, so that the descent stays in bounds."""
     geo = small(n=5)
     moved = Geometry.from_poses(
-        geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]), geo.nDetector, geo.nVoxel, geo.dVoxel
+        geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]),
+        geo.nDetector,
+        nVoxel=geo.grid.shape,
+        dVoxel=geo.grid.spacing,
     )
     scan = Scan(moved, np.ones((5, *geo.nDetector), np.float32))
     assert ASDPOCS()._maxl2err(System(scan), scan) == 0
@@ -433,7 +450,7 @@ def test_what_counts_as_matched_where_fdk_cannot_say(system):
 def test_passes_between_corrections(system, monkeypatch, every, times):
     calls, correct = [], System.correct
     monkeypatch.setattr(System, 'correct', lambda self, x: calls.append(1) or correct(self, x))
-    ASDPOCS(niter=7, exact_every=every, alpha_red=1.0, tviter=1).run(system[0])
+    run_algorithm(system[0], ASDPOCS(niter=7, exact_every=every, alpha_red=1.0, tviter=1))
     assert len(calls) == times
 
 

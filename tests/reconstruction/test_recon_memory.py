@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.memory_needs import NEEDS, needed
 
@@ -19,15 +19,15 @@ import numpy as np
 from lingo_mi.common.runtime import use_variant
 use_variant('llvm_ad_mono')
 import mitsuba as mi
-from lingo_mi.geometry.base import CircularGeometry
-from lingo_mi.geometry.trajectories import circular
+from lingo_mi.geometry import CircularGeometry, Grid, circular
 from lingo_mi.reconstruction import ALGORITHMS
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 from lingo_mi.projectors.joseph import Joseph
 
 def run(size, pixels, views, offset=0):
     geometry = CircularGeometry(
-        DSO=1000., DSD=1500., nDetector=pixels, dDetector=512 / pixels, nVoxel=size, dVoxel=256 / size, angles=circular(views),
+        DSO=1000., DSD=1500., nDetector=pixels, dDetector=512 / pixels, grid=Grid(size, 256 / size), angles=circular(views),
         offDetector=(0, offset),
     )
     project = Joseph(geometry).forward(mi.Float(np.ones(size ** 3, np.float32)), np.arange(views))[0]
@@ -38,9 +38,9 @@ def run(size, pixels, views, offset=0):
     options = {'fdk': {}, 'asd-pocs': few_steps, 'refined': dict(completed_niter=1) | few_steps, 'best': dict(niter=1, finer=1)}
     algorithm = ALGORITHMS[sys.argv[1]](**options.get(sys.argv[1], dict(niter=1)))
     if sys.argv[1] == 'refined':
-        algorithm.run(few, completed=scan, sample=lambda _: ramp)
+        run_algorithm(few, algorithm, completed=scan, sample=lambda _: ramp)
     else:
-        algorithm.run(scan)
+        run_algorithm(scan, algorithm)
 
 def peak():
     return next(int(line.split()[1]) for line in open('/proc/self/status') if line.startswith('VmHWM'))
@@ -59,9 +59,8 @@ def scanned(size, pixels, views, *_):
         DSD=1500.0,
         nDetector=(pixels, pixels),
         dDetector=512 / pixels,
-        nVoxel=(size,) * 3,
-        dVoxel=256 / size,
         angles=circular(views),
+        grid=Grid((size,) * 3, 256 / size),
     )
 
 

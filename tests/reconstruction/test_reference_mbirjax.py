@@ -16,10 +16,10 @@ SCAN = dict(DSO=200, DSD=300, nDetector=(48, 64), dDetector=1.5, nVoxel=(40, 40,
 def test_projections_agree(placement):
     mbirjax = pytest.importorskip('mbirjax', reason="MBIRJAX is not installed: pip install -e '.[reference]'")
     geometry = Geometry.cone(dVoxel=1, **SCAN, **placement)
-    volume = np.zeros(geometry.nVoxel, np.float32)
+    volume = np.zeros(geometry.grid.shape, np.float32)
     volume[8:30, 12:20, 5:16], volume[20:34, 20:30, 8:12] = 0.02, 0.03
     volume = gaussian_filter(volume, 1.5)
-    ours, theirs = grid.project(volume, geometry), mbirjax_bridge.project(volume, geometry, mbirjax)
+    ours, theirs = grid.project_volume(volume, geometry), mbirjax_bridge.project(volume, geometry, mbirjax)
     assert np.abs(theirs - ours).max() < 0.007 * ours.max()
 
 

@@ -11,6 +11,7 @@ from helpers.balls import BALL, centres, ellipsoids, geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.cgls import CGLS
 from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.studies.benchmarks import rtk_bridge as rtk
@@ -30,7 +31,7 @@ def test_fdk_agrees_inside_the_field_of_view():
     """An asymmetric object, a volume off the centre, voxels and counts that differ along the axes."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan, x = ellipsoids(geo, *BODIES), centres(geo)
-    ours, theirs = FDK().run(scan).volume, rtk.reconstruct('FDK', scan, itk)
+    ours, theirs = run_algorithm(scan, FDK()).volume, rtk.reconstruct('FDK', scan, itk)
     seen = np.hypot(x[..., 0], x[..., 1]) < 55
     assert np.sqrt(np.mean((ours - theirs)[seen] ** 2)) < 0.01 * 0.02
     assert theirs[seen].std() > 0.05 * 0.02
@@ -92,7 +93,7 @@ def test_cgls_with_the_same_operators(monkeypatch, niter):
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan = ellipsoids(geo, *BODIES)
     monkeypatch.setattr(sys.modules['lingo_mi.reconstruction.cgls'], 'System', TheirSystem)
-    ours = CGLS(niter).run(scan).volume
+    ours = run_algorithm(scan, CGLS(niter)).volume
     theirs = rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter, BackProjectionFilter=JOSEPH)
     assert np.linalg.norm(theirs - ours) < 1e-5 * np.linalg.norm(theirs)
 
@@ -103,6 +104,9 @@ def test_cgls(niter, tolerance):
     projector weighs the voxels at the border, which the first gradient fills, in its own way."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan = ellipsoids(geo, *BODIES)
-    ours, theirs = CGLS(niter).run(scan), rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter)
+    ours, theirs = (
+        run_algorithm(scan, CGLS(niter)),
+        rtk.reconstruct('ConjugateGradient', scan, itk, NumberOfIterations=niter),
+    )
     assert abs(ours.residuals[-1] / residual(System(scan), theirs) - 1) < tolerance
     assert np.linalg.norm(theirs - ours.volume) < 0.08 * np.linalg.norm(theirs)

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.projectors.grid import project
+from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.reconstruction import OSSART, SART, sart_update
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
 
 def scan(voxels=(6, 5, 4), panel=(5, 7), views=4, start=0.0):
     angles = start + np.linspace(0, 2 * np.pi, views, endpoint=False)
     geometry = Geometry.cone(DSO=40, DSD=60, nDetector=panel, dDetector=2.0, nVoxel=voxels, dVoxel=1.5, angles=angles)
-    return Scan(geometry, project(np.random.default_rng(0).random(voxels), geometry))
+    return Scan(geometry, project_volume(np.random.default_rng(0).random(voxels), geometry))
 
 
 @pytest.mark.parametrize('weighted', [False, True])
@@ -36,8 +37,8 @@ def test_a_replayed_update_is_the_traced_one(voxels, panel, views, weighted):
     weights = np.random.default_rng(1).random(voxels) if weighted else None
     algorithm = OSSART(niter=3, blocksize=2, lmbda=0.7)
     with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
-        traced = algorithm.run(measured, weights=weights)
-    found = algorithm.run(measured, weights=weights)
+        traced = run_algorithm(measured, algorithm, weights=weights)
+    found = run_algorithm(measured, algorithm, weights=weights)
     assert found.residuals == traced.residuals and found.residuals[-1] < found.residuals[0]
     np.testing.assert_array_equal(found.volume, traced.volume)
 
@@ -46,14 +47,14 @@ def test_scans_of_one_size_share_a_recording(monkeypatch):
     replay = Replay(sart_update._replayed)
     monkeypatch.setattr(sart_update, '_REPLAY', replay)
     for start in (0.0, 0.1, 0.2):
-        SART(niter=3).run(scan(start=start))
+        run_algorithm(scan(start=start), SART(niter=3))
     assert [recording.n_recordings for recording in replay.recordings.values()] == [1]
 
 
 def test_threads_share_a_recording(monkeypatch):
     measured, algorithm = scan(), SART(niter=20)
-    alone = algorithm.run(measured).volume
+    alone = run_algorithm(measured, algorithm).volume
     monkeypatch.setattr(sart_update, '_REPLAY', Replay(sart_update._replayed))
     with ThreadPoolExecutor(4) as pool:
-        for found in pool.map(algorithm.run, [measured] * 8):
+        for found in pool.map(lambda s: run_algorithm(s, algorithm), [measured] * 8):
             np.testing.assert_array_equal(found.volume, alone)

@@ -16,9 +16,10 @@ import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.geometry.base import PosedGeometry
+from lingo_mi.geometry import Grid, PosedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.reconstruction import OSSART, SART, SIRT
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.slab_sweeps import _digest, discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
@@ -52,7 +53,7 @@ def difference(found, whole):
 def test_slabs_are_the_whole_volume(scan, tmp_path, algorithm, thickness):
     steps = []
     slabs = algorithm.slabs(scan, thickness, tmp_path / 'work', progress=lambda *step: steps.append(step))
-    assert difference(slabs, algorithm.run(scan).volume) < 1e-5
+    assert difference(slabs, run_algorithm(scan, algorithm).volume) < 1e-5
     count = algorithm.slab_steps(scan, thickness)
     assert [step[:2] for step in steps] == [(i + 1, count) for i in range(count)]
     assert steps[0][2] == 1 and steps[-1][2] < 0.1  # of an empty volume, and of the last
@@ -65,7 +66,9 @@ def test_invalid_pixels(scan, tmp_path):
     valid = np.ones(scan.projections.shape, bool)
     valid[:, 10:20, 20:30] = False
     holed = replace(scan, valid=valid)
-    assert difference(SART(niter=2).slabs(holed, 5, tmp_path / 'work'), SART(niter=2).run(holed).volume) < 1e-5
+    assert (
+        difference(SART(niter=2).slabs(holed, 5, tmp_path / 'work'), run_algorithm(holed, SART(niter=2)).volume) < 1e-5
+    )
 
 
 class Stop(Exception):
@@ -122,9 +125,7 @@ def test_poses_in_the_middle_count(scan, tmp_path):
     digests = []
     for poses in (many, moved):
         g = scan.geometry
-        geometry = PosedGeometry(
-            poses=poses, nDetector=g.nDetector, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin
-        )
+        geometry = PosedGeometry(poses=poses, nDetector=g.nDetector, grid=g.grid)
         digests.append(_digest(lm.Scan(geometry, np.zeros((400, *g.nDetector), np.float32)), [], True, 8))
     assert digests[0] != digests[1]
 
@@ -182,7 +183,7 @@ def test_bad_input(scan, tmp_path, monkeypatch):
     with pytest.raises(InputError, match='need at least .* of memory'):
         next(SART().slabs(scan, 8, tmp_path / 'work'))
     monkeypatch.undo()
-    fine = lm.Scan(scan.geometry.with_volume((96, 80, 64), (1.0, 1.25, 1.5)), scan.projections)
+    fine = lm.Scan(scan.geometry.on(Grid((96, 80, 64), (1.0, 1.25, 1.5), scan.geometry.grid.centre)), scan.projections)
     with pytest.raises(InputError, match='pixels are two or more voxels wide'):
         next(SART().slabs(fine, 8, tmp_path / 'work'))
     with pytest.raises(InputError, match='cannot be written'):

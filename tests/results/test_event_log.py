@@ -67,9 +67,10 @@ def test_without_the_library(data, tmp_path, monkeypatch):
 def test_pictures_have_the_step_of_their_numbers(tmp_path):
     from types import SimpleNamespace
 
-    log = EventLog(tmp_path)
+    log, fit = EventLog(tmp_path), SimpleNamespace(method=lm.R2(), data=None, views=None)
+    fit.volume = lambda: np.ones((4, 4, 4), np.float32)
     for step in 7, 5000:
-        log.look(SimpleNamespace(volume=np.ones((4, 4, 4), np.float32), measured=None, test=None, views=None))
+        log.look(fit)
         log.step(dict(iteration=step, loss=1.0), 5000)
     log.close(True)
     steps = {event.step for event in records(tmp_path) for value in event.summary.value if value.HasField('image')}

@@ -16,6 +16,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.browser import browser, opened, readout
+from lingo_mi.report.data import ReportData
 from lingo_mi.results.live import SHARE, Live
 from lingo_mi.results.watch import Watch, watched
 
@@ -115,7 +116,7 @@ class Failing:
     def step(self, entry, total):
         self._fail('step')
 
-    def look(self, snapshot):
+    def look(self, fit):
         self._fail('look')
 
     def close(self, finished):
@@ -204,15 +205,31 @@ def test_a_lost_viewer_stops_nothing(data, monkeypatch):
     assert len(result) > 0
 
 
-def snapshot(data, shift=0.0, truth=True):
-    """A look at a fit that has no fit."""
-    volume = data.volume + np.float32(shift)
-    views = data.test.projections + np.float32(shift)
-    rng = np.random.default_rng(0)
-    cloud = rng.random((30, 3)), rng.random((30, 3)) + 0.1, rng.normal(0, 1, (30, 4)), rng.random(30)
-    measured = (volume, data.volume) if truth else None
-    model = SimpleNamespace(settings=SimpleNamespace(cloud=True))
-    return SimpleNamespace(model=model, test=data.test, views=views, measured=measured, volume=volume, gaussians=cloud)
+class Drawn:
+    """A fit as a watcher sees it, without steps."""
+
+    def __init__(self, data, shift=0.0):
+        self.data, self.shift = data, np.float32(shift)
+
+    def report(self, title, numbers):
+        rng, grid, test = np.random.default_rng(0), self.data.train.geometry, self.data.test
+        return ReportData(
+            title=title,
+            metrics=numbers,
+            volume=self.data.volume + self.shift,
+            truth=self.data.volume,
+            shape=grid.grid.shape,
+            spacing=grid.grid.spacing,
+            centre=grid.grid.centre,
+            pixel=grid.dDetector,
+            views=test.projections + self.shift,
+            views_truth=test.projections,
+            views_angles=np.degrees(test.geometry.angles),
+            cloud_centres=rng.random((30, 3)),
+            cloud_scales=rng.random((30, 3)) + 0.1,
+            cloud_quaternions=rng.normal(0, 1, (30, 4)),
+            cloud_density=rng.random(30),
+        )
 
 
 def entry(iteration, **more):
@@ -230,7 +247,7 @@ def test_a_page_is_told_what_it_does_not_know(live, data):
     """New entries of the history; of the arrays those that have changed, so the truth once."""
     asked(live)
     live.step(entry(1), 100)
-    live.look(snapshot(data))
+    live.look(Drawn(data))
     live.step(entry(2, psnr_2d=float('nan'), psnr_3d=None), 100)
     first = asked(live)
     assert [e['iteration'] for e in first['history']['entries']] == [1, 2] and first['history']['whole']
@@ -241,11 +258,11 @@ def test_a_page_is_told_what_it_does_not_know(live, data):
     again = asked(live, 1, place)
     assert again['history']['entries'] == [] and 'texts' not in again and 'known' not in again
     live.step(entry(3), 100)
-    live._show(snapshot(data, -0.001 * data.volume.max()))
+    live._show(Drawn(data, -0.001 * data.volume.max()))
     news = asked(live, 1, place)
     assert [e['iteration'] for e in news['history']['entries']] == [3] and not news['history']['whole']
     # The first state's range has no room for values below 0, so that all volumes are packed anew; from then on it has.
-    live._show(snapshot(data, -0.0005 * data.volume.max()))
+    live._show(Drawn(data, -0.0005 * data.volume.max()))
     news = asked(live, 2, news['history']['place'])
     assert set(news['texts']) == {'volume0', 'views0'} and set(news['known']['arrays']) == names
     assert set(asked(live, 1)['texts']) == {'volume0', 'volume1', 'views0', 'views1'}
@@ -273,14 +290,14 @@ def test_looking_takes_its_share_and_no_more(live, data, monkeypatch):
     monkeypatch.setattr('lingo_mi.results.live.time.process_time', lambda: clock.now)
     contents = live._contents
     monkeypatch.setattr(live, '_contents', lambda seen: (setattr(clock, 'now', clock.now + 3.0), contents(seen))[1])
-    live.look(snapshot(data))
+    live.look(Drawn(data))
     assert live._number == 0
     asked(live)
     live.step(entry(1), 10_000)  # not a new look: the one before, for the page that has come since
     assert live._number == 1
     for _ in range(1000):
         clock.now += 1.0
-        live.look(snapshot(data))
+        live.look(Drawn(data))
     assert 3.0 * live._number <= SHARE * (clock.now - live._began) < 3.0 * (live._number + 2)
 
 
@@ -301,7 +318,7 @@ def test_a_part_that_fails_is_said_once_and_the_page_goes_on(chromium, live, dat
     with opened(chromium, live.address, offline=False, first='IntersectionObserver = undefined') as page:
         for i in (1, 2, 3):
             live.step(entry(i), 3)
-            live._show(snapshot(data, i * 0.001))
+            live._show(Drawn(data, i * 0.001))
             page.locator('#live').filter(has_text=f'Step {i} of 3').wait_for()
             while not any(f'seen={i}&' in url for url in page.asked):  # the next question
                 page.wait_for_timeout(100)

@@ -11,7 +11,6 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import read_ply
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.results.stored import read_stored
 from lingo_mi.storage.file_access import beside, read_object, reading, replacing, require_writable, write_text
 from lingo_mi.storage.output_folder import manifest_of
 
@@ -112,7 +111,7 @@ def test_the_probe_makes_nothing(tmp_path):
         require_writable(tmp_path / 'file' / 'b', tmp_path)
 
 
-@pytest.mark.parametrize('call', [lambda f: read_object(f / 'metrics.json'), manifest_of, read_stored])
+@pytest.mark.parametrize('call', [lambda f: read_object(f / 'metrics.json'), manifest_of])
 def test_json_that_is_nested_too_deeply(tmp_path, call):
     for name in ('.lingo_mi.json', 'metrics.json'):
         (tmp_path / name).write_text('[' * 200_000)

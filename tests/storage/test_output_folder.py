@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from lingo_mi.common.errors import InputError
@@ -14,11 +13,10 @@ from lingo_mi.storage.output_folder import (
     SCENE,
     begin,
     clear_leftovers,
-    complete,
+    complete_result,
     manifest_of,
     occupants,
     remove_others,
-    require_ours,
     require_together,
 )
 
@@ -27,7 +25,7 @@ def make(folder, text='old'):
     """A whole result of two files."""
     begin(folder, [SCENE, METRICS])
     (folder / SCENE).write_text(text)
-    return complete(folder, [SCENE], dict(psnr=1))
+    return complete_result(folder, [SCENE], dict(psnr=1))
 
 
 def test_a_whole_result(tmp_path):
@@ -85,19 +83,6 @@ def test_others_are_removed_only_if_ours(tmp_path):
     assert sorted(p.name for p in (tmp_path / 'views').iterdir()) == ['0000.exr', '0002.exr', 'mine.exr']
 
 
-def test_results_of_earlier_versions_are_ours(tmp_path):
-    (tmp_path / SCENE).touch()
-    with pytest.raises(InputError, match='was not written'):
-        require_ours(tmp_path, [SCENE])
-    (tmp_path / METRICS).write_text(json.dumps(dict(versions=dict(lingo_mi='0.1'))))
-    require_ours(tmp_path, [SCENE, METRICS])
-    (tmp_path / METRICS).write_text('{"accuracy": 1}')
-    np.savez(tmp_path / CHECKPOINT, **{'extra': 1, 'seen': 1, 'array.initial': 1})
-    require_ours(tmp_path, [SCENE, CHECKPOINT])
-    with pytest.raises(InputError, match=f'{METRICS}: was not written'):
-        require_ours(tmp_path, [METRICS])
-
-
 @pytest.mark.parametrize('text', ['', '[]', '{"files": 3, "writing": true}', '{"files": [], "writing": 1}', '\xff{'])
 def test_a_manifest_that_is_none(tmp_path, text):
     (tmp_path / MANIFEST).write_text(text, encoding='latin1')
@@ -122,8 +107,8 @@ def test_leftovers(tmp_path):
     """Temporaries of ours do not fill a folder, and go; what merely looks like one stays."""
     ours = [f'.lingo_mi-{16 * "a"}-{name}' for name in (METRICS, CHECKPOINT, MANIFEST)]
     other = [f'.lingo_mi-{16 * "a"}-notes.txt', '.writable', 'metrics.json.partial', '.lingo_mi-1-metrics.json']
-    for name in (*ours, *other, LOCK, CHECKPOINT + '.partial'):
+    for name in (*ours, *other, LOCK):
         (tmp_path / name).touch()
     assert occupants(tmp_path) == sorted(other)
     clear_leftovers(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*other, LOCK, CHECKPOINT + '.partial'])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*other, LOCK])

@@ -11,7 +11,7 @@ import pytest
 
 from helpers.same import assert_same
 from helpers.script import run
-from lingo_mi.geometry.base import CircularGeometry
+from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.cutoff import PRESETS
 from lingo_mi.studies import alternatives, oracle
 from lingo_mi.studies.accuracy import Sizes, measure, measure_presets
@@ -79,11 +79,10 @@ def test_closed_form_is_the_oracle(mode):
         DSD=7.5,
         nDetector=(20, 27),
         dDetector=(0.15, 0.16),
-        nVoxel=8,
-        dVoxel=0.25,
         angles=[0.4],
         offDetector=(0.1, -0.2),
         mode=mode,
+        grid=Grid(8, 0.25),
     )
     cloud, weights = random_cloud(rng, 4, size=0.06), rng.normal(size=(20, 27))
     columns = cloud.centre, cloud.scale, cloud.rotation, cloud.density

@@ -4,7 +4,6 @@ import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, run
-from lingo_mi.fitting.fitted import Fitted
 from lingo_mi.studies.benchmarks.step import described, measured
 
 
@@ -12,13 +11,13 @@ def checkpoint(folder, method, **settings):
     """Of a short fit of three views."""
     scan = dict(DSO=100, DSD=150, nDetector=24, dDetector=3, nVoxel=16, dVoxel=2, angles=lm.circular(3))
     data = lm.simulate(lm.phantom('foot', size=16).data, lm.Geometry.cone(**scan), progress=False)
-    lm.fit(data, method, progress=False, checkpoint=folder / 'checkpoint.npz', **settings)
-    return folder / 'checkpoint.npz'
+    lm.fit(data, method, progress=False, folder=folder / 'fit', **settings)
+    return folder / 'fit' / 'checkpoint.npz'
 
 
 def test_parts_of_a_step(tmp_path):
     """The parts make a whole, and each that computes takes time."""
-    found = measured(Fitted.from_checkpoint(checkpoint(tmp_path, 'fast', n_points=200, iterations=20)), 3)
+    found = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=20)), 3)
     whole, densification = found.pop('a step'), found.pop('densification')
     assert abs(sum(found.values()) - whole) < 1e-9 and densification >= 0
     assert min(found['integrator, forward'], found['Adam'], whole) > 0
@@ -30,7 +29,7 @@ def test_parts_of_a_step(tmp_path):
 def test_a_loss_of_one_part(tmp_path):
     """It cannot be left out: a step would compare nothing."""
     alone = dict(lambda_l1=0, lambda_ssim=0, lambda_gradient=1, lambda_tv=0)
-    found = measured(Fitted.from_checkpoint(checkpoint(tmp_path, 'fast', n_points=200, iterations=4, **alone)), 1)
+    found = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=4, **alone)), 1)
     assert set(found) == {'integrator, forward', 'integrator, backward', 'Adam', 'the rest', 'a step', 'densification'}
 
 

@@ -20,7 +20,7 @@ def test_rays_through_one_voxel():
     np.testing.assert_allclose(found[u < 0.43], 1, atol=1e-5)
     np.testing.assert_allclose(found[u > 0.57], 0, atol=1e-5)
     assert data.train.projections[0, 0][u > 0.57].max() > 0.3  # the trilinear interpolant reaches into the neighbours
-    assert with_boxes(data, 8).train.geometry.nVoxel == (5, 5, 5)
+    assert with_boxes(data, 8).train.geometry.grid.shape == (5, 5, 5)
 
 
 def test_no_volume():

@@ -6,7 +6,7 @@ from importlib import resources
 
 import pytest
 
-from helpers.fits import SHORT, geometry, some_points, tiny_scan
+from helpers.fits import SHORT, geometry, tiny_scan
 from helpers.script import FIT, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.gpu import GPU
@@ -132,7 +132,7 @@ def test_times_of_a_kernel():
 
 def test_times_of_a_fit():
     scan = tiny_scan(geometry())
-    found = measure.measured(run_fit(scan, SHORT, some_points(scan.geometry)), repeats=2)
+    found = measure.measured(run_fit(scan, SHORT), repeats=2)
     for work in found.values():
         assert work['launches'] > 10 and 0 < work['short'] <= work['launches'] and 0 < work['of_short'] <= work['all']
     assert found['a step']['seconds'] > 0

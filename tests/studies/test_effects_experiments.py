@@ -8,7 +8,7 @@ import pytest
 from helpers.script import FIT, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.scene.shipped import scenes
-from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, SETTINGS, measure, quality
+from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, METHOD, measure, quality
 from lingo_mi.studies.effects.report import write
 
 TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12')
@@ -29,7 +29,7 @@ def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
 
 def test_an_experiment(tmp_path, monkeypatch):
     """Of the blur: three fits that differ, and the table and picture of them, by the function and by the command."""
-    result = measure('psf', TINY, SETTINGS.changed(iterations=12))
+    result = measure('psf', TINY, METHOD.changed(iterations=12))
     volumes = [result[kind]['volume'] for kind in FITS]
     assert all(v.shape == (16, 16, 16) and np.isfinite(v).all() for v in volumes)
     assert not np.allclose(volumes[0], volumes[1]) and not np.allclose(volumes[1], volumes[2])

@@ -20,7 +20,7 @@ def fan(views=60):
     x, y = np.meshgrid(*2 * [np.arange(48) - 23.5], indexing='ij')
     discs = sum((np.hypot(x - a, y - b) < r) * 0.02 for a, b, r in ((0, 0, 15), (6, 3, 4), (-5, -6, 3)))
     true = Drift.of(geometry, dict(u=1.0, u1=2.0)).panel(geometry).moved(geometry)
-    scan = lm.Scan(geometry, grid.project(discs[:, :, None].astype(np.float32), true))
+    scan = lm.Scan(geometry, grid.project_volume(discs[:, :, None].astype(np.float32), true))
     return lm.Dataset(scan.subset(slice(0, None, 2)), scan.subset(slice(1, None, 2)))
 
 

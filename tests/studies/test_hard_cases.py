@@ -15,12 +15,12 @@ from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.loss_scale import loss_scale, otsu
 from lingo_mi.fitting.losses import combined
-from lingo_mi.fitting.recipes import R2
+from lingo_mi.fitting.methods.r2 import R2
 from lingo_mi.fitting.state import activate, start
-from lingo_mi.geometry.base import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry, Grid
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.lingo.loss_scale import loss_scale, otsu_on_device
 from lingo_mi.lingo.masks import Masks, masks
 from lingo_mi.lingo.otsu import otsu as otsu_of_paper
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid
@@ -28,7 +28,7 @@ from lingo_mi.metrics.quality import ssim_map
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
-from lingo_mi.projectors.voxelize import Grid, voxelize
+from lingo_mi.projectors.voxelize import Lattice, voxelize
 from lingo_mi.studies import oracle
 from lingo_mi.studies.hard_cases import measuring
 from lingo_mi.studies.hard_cases.cases import all_cases
@@ -182,7 +182,7 @@ def test_a_gaussian_that_is_no_number_is_never_skipped(mode, name, value):
     cloud = cloud.changed(**{name: values})
     image, _ = image_and_gradients(cloud, frames, shape, weights_of(shape))
     assert not np.isfinite(image).any()
-    grid = Grid(vector64([-1, -1, -1]), vector64([0.2] * 3), (10, 10, 10))
+    grid = Lattice(vector64([-1, -1, -1]), vector64([0.2] * 3), (10, 10, 10))
     assert not np.isfinite(voxelize(*on_device(cloud), grid, 3.0).numpy()).any()
 
 
@@ -212,7 +212,7 @@ def test_a_pile_of_gaussians_is_summed_as_accurately_as_one(side, sigma):
 
 
 def test_a_pile_of_gaussians_in_voxels():
-    count, grid = 20_000, Grid(vector64([-1, -1, -1]), vector64([0.1] * 3), (20, 20, 20))
+    count, grid = 20_000, Lattice(vector64([-1, -1, -1]), vector64([0.1] * 3), (20, 20, 20))
     one = Cloud([[0.03, 0.02, -0.01]], [[0.03, 0.05, 0.04]], [[0.1, 0.2, 0.3, 0.9]], [0.7])
     found, expected = (voxelize(*on_device(one[np.zeros(n, int)]), grid, 4.0, deep=True).numpy() for n in (count, 1))
     assert relative(found, count * expected.astype(float)) < 3e-6
@@ -313,28 +313,28 @@ def test_a_long_fit_of_bad_data_ends_finite():
     fit_to(adversarial(), 10_000)
 
 
-SETTINGS = R2.changed(densify_threshold=1e-3, split_size=0.15)
+CONTROL, FORWARD = R2().changed(densify_threshold=1e-3, split_size=0.15).densify, R2().forward
 
 
 def coincident(n=8):
-    state = start(np.zeros((n, 3)), np.where(np.arange(n) % 2, 0.1, 0.3), np.full(n, 0.5), SETTINGS)
+    state = start(np.zeros((n, 3)), np.where(np.arange(n) % 2, 0.1, 0.3), np.full(n, 0.5), FORWARD)
     state.gradient[:], state.visits[:] = 1, 1
     return state
 
 
 def mass(state):
-    _, scale, _, density = activate(state, SETTINGS)
+    _, scale, _, density = activate(state, FORWARD)
     return (density * scale.prod(1)).sum()
 
 
 def test_coincident_gaussians_densify():
     state = coincident()
-    after = densify(state, SETTINGS, np.ones(3), np.random.default_rng(0))
+    after = densify(state, CONTROL, FORWARD, np.ones(3), np.random.default_rng(0))
     assert len(after) == 16 and all(np.isfinite(v).all() for v in after.values.values())
     everyone = np.ones(8, bool)
-    assert abs(mass(clone(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
-    assert abs(mass(halve(state, everyone, SETTINGS)) / mass(state) - 1) < 1e-5
-    halves = split(state, everyone, SETTINGS, np.random.default_rng(0))
+    assert abs(mass(clone(state, everyone, FORWARD)) / mass(state) - 1) < 1e-5
+    assert abs(mass(halve(state, everyone, FORWARD)) / mass(state) - 1) < 1e-5
+    halves = split(state, everyone, FORWARD, np.random.default_rng(0))
     assert len(np.unique(halves.values['centre'], axis=0)) == 16  # drawn from their parents, so no longer at one place
 
 
@@ -344,7 +344,7 @@ def test_dynamic_scale_at_its_corner(value):
     image, truth = mi.Float([value, value * 0.5, value, value * 0.5]), mi.Float([0.1, 0.2, 0.3, 0.4])
     dr.enable_grad(image)
     factor = loss_scale(image)
-    threshold = max(0.01, otsu(image)[0])
+    threshold = max(0.01, otsu_on_device(image)[0])
     assert abs(factor[0] - (threshold + 0.25 / threshold)) < 1e-5 * factor[0] and not dr.grad_enabled(factor)
     assert factor[0] <= 25.01 * (1 + 1e-6)
     dr.backward(dr.sum(dr.abs(image - truth)) * factor)
@@ -366,7 +366,7 @@ def test_ssim_of_constant_images(a, b):
 
 
 def raw_state(scale=0.0, density=0.0, rotation=(0, 0, 0, 1)):
-    state = start(np.zeros((2, 3)), np.full(2, 0.1), np.ones(2), SETTINGS)
+    state = start(np.zeros((2, 3)), np.full(2, 0.1), np.ones(2), FORWARD)
     state.values['scale'][:], state.values['density'][:], state.values['rotation'][:] = scale, density, rotation
     return state
 
@@ -376,13 +376,12 @@ def test_activations_at_both_ends(raw):
     """Finite values within their bounds and finite derivatives, the same on the host and on the device."""
     state = raw_state(scale=raw, density=raw)
     with np.errstate(over='ignore'):
-        _, scale, _, density = activate(state, SETTINGS)
+        _, scale, _, density = activate(state, FORWARD)
     device = DeviceState(state)
     dr.enable_grad(list(device.values.values()))
-    _, scale_there, _, density_there = device.gaussians(SETTINGS)
+    _, scale_there, _, density_there = FORWARD.gaussians(device.values)
     assert (
-        np.all((scale >= SETTINGS.bounds.scale_min) & (scale <= SETTINGS.bounds.scale_max))
-        and np.isfinite(density).all()
+        np.all((scale >= FORWARD.bounds.scale_min) & (scale <= FORWARD.bounds.scale_max)) and np.isfinite(density).all()
     )
     np.testing.assert_allclose(np.array(scale_there).T, scale, rtol=2e-6)
     np.testing.assert_allclose(density_there.numpy(), density, rtol=2e-6, atol=1e-7)
@@ -394,7 +393,7 @@ def test_activations_at_both_ends(raw):
 def test_inverses_at_both_ends():
     y = np.array([0, 1e-300, 1e-30, 1e-7, 1, 700, 1e8])
     np.testing.assert_allclose(softplus(inverse_softplus(y)), np.maximum(y, 1e-30), rtol=1e-12)
-    low, high = SETTINGS.bounds.scale_min, SETTINGS.bounds.scale_max
+    low, high = FORWARD.bounds.scale_min, FORWARD.bounds.scale_max
     inner = np.array([low * (1 + 1e-6), low * 1.5, 0.5, high * (1 - 1e-6)])
     raw = inverse_scale(inner, low, high)
     np.testing.assert_allclose(low + (high - low) / (1 + np.exp(-raw)), inner, rtol=1e-9)
@@ -418,7 +417,7 @@ def test_length_of_a_quaternion_does_not_matter(length):
 @pytest.mark.parametrize('value', [-1.0, 0.0, 1e-30, 0.3, 1e30])
 def test_otsu_of_flat_images(value):
     image = np.full((6, 7), value, np.float32)
-    assert otsu_of_paper(image) == image[0, 0] == otsu(mi.Float(image.ravel()))[0]
+    assert otsu_of_paper(image) == image[0, 0] == otsu_on_device(mi.Float(image.ravel()))[0]
     if value >= 0:
         found = masks(image[None])
         assert not found.high.any()
@@ -427,16 +426,16 @@ def test_otsu_of_flat_images(value):
 @pytest.mark.parametrize('full, expected', [(False, 0.0), (True, 1.0)])
 def test_voxel_scaling_at_the_ends_of_occupancy(full, expected):
     geometry = CircularGeometry(
-        DSO=5.0, DSD=7.0, nDetector=(40, 40), dDetector=0.2, nVoxel=32, dVoxel=0.0625, angles=circular(4)
+        DSO=5.0, DSD=7.0, nDetector=(40, 40), dDetector=0.2, angles=circular(4), grid=Grid(32, 0.0625)
     )
     everywhere = np.full((4, 40, 40), full)
     P = occupancy(
         geometry.normalised_rays(),
         Masks(everywhere, everywhere, np.zeros(4), np.zeros(4)),
-        geometry.half,
-        geometry.nVoxel,
+        geometry.grid.half,
+        geometry.grid.shape,
     )
     assert P == expected
     S = scale_factor(P)
     assert S == (20 if full else 1)
-    assert scaled_grid(geometry.nVoxel, S) == ((8, 8, 8) if full else (32, 32, 32))
+    assert scaled_grid(geometry.grid.shape, S) == ((8, 8, 8) if full else (32, 32, 32))

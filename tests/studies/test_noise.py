@@ -28,7 +28,7 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     cells = {setting: study.get(case, setting) for setting in SETTINGS}
     assert cells['equal']['steps'] == [50, 100] and cells['equal']['search'] is None
     stopped = cells['stopped']
-    assert stopped['steps'][-1] == stopped['search']['kept']
+    assert stopped['steps'][-1] == stopped['search']['best']
     assert stopped['psnr_3d'][-1] == pytest.approx(cells['equal']['psnr_3d'][stopped['steps'][-1] // 50 - 1], abs=1e-3)
     row = (tmp_path / 'noise.md').read_text().splitlines()[-1]
     assert row.startswith('| foot | x1 | 500 |') and row in text and '–' not in row

@@ -13,7 +13,7 @@ from helpers.script import FIT
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
@@ -31,7 +31,7 @@ def scan(tmp_path):
     volume[4:12, 5:10, 3:12] = 0.03
     volume = gaussian_filter(volume, 1.5)
     geometry = Geometry.cone(nDetector=24, nVoxel=16, dVoxel=2.4, angles=circular(12), **SIZES)
-    views = grid.project(volume, geometry)[:, :, ::-1]
+    views = grid.project_volume(volume, geometry)[:, :, ::-1]
     path = tmp_path / 'scan.npz'
     np.savez(path, projections=views, angles=np.degrees(geometry.angles) - 90, air=0.0, **SIZES)
     return path
@@ -64,8 +64,8 @@ def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
     cell = json.loads((folder / '6_views' / 'asd-pocs.json').read_text())
     found = read_volume(folder / '6_views' / 'asd-pocs.nii.gz').data
     reference = read_volume(folder / 'reference.nii.gz').data
-    geometry = train.geometry.with_volume((16,) * 3, (2.4,) * 3)
-    wrong = grid.project(found, geometry.subset(slice(1, None, 2))) - train.projections[1::2]
+    geometry = train.geometry.on(Grid((16,) * 3, (2.4,) * 3, train.geometry.grid.centre))
+    wrong = grid.project_volume(found, geometry.subset(slice(1, None, 2))) - train.projections[1::2]
     assert cell['held_out_rms'] == pytest.approx(np.sqrt(np.mean(wrong.astype(float) ** 2)), rel=1e-5)
     assert cell['psnr_3d'] == pytest.approx(psnr_3d(found, reference), abs=1e-4)
     assert (folder / 'slices.png').stat().st_size > 1000
@@ -86,9 +86,11 @@ def test_a_setting_is_chosen_by_views_that_are_held_out():
         return truth * weight
 
     method = Method('scaled', volume, 'weight', (0.5, 1.0, np.nan, 2.0))
-    found, settings = method.run(Scan(geometry, grid.project(truth, geometry)))
+    found, settings = method.run(Scan(geometry, grid.project_volume(truth, geometry)))
     assert settings == {'weight': 1.0} and np.array_equal(found, truth) and views == [8, 8, 8, 8, 10]
-    assert replace(method, values=(2.0,)).run(Scan(geometry, grid.project(truth, geometry)))[1] == {'weight': 2.0}
+    assert replace(method, values=(2.0,)).run(Scan(geometry, grid.project_volume(truth, geometry)))[1] == {
+        'weight': 2.0
+    }
     assert views[5:] == [10]
 
 
@@ -136,7 +138,7 @@ def test_pixels_that_are_not_valid(tmp_path):
     volume = np.zeros((16, 16, 16), np.float32)
     volume[4:12, 5:10, 3:12] = 0.03
     geometry = Geometry.cone(nDetector=24, nVoxel=16, dVoxel=2.4, angles=circular(12), **SIZES)
-    p = grid.project(volume, geometry)
+    p = grid.project_volume(volume, geometry)
     valid = np.random.default_rng(0).random(p.shape) > 0.05
     masked = Scan(geometry, p, valid)
     with pytest.raises(InputError, match='needs every pixel'):

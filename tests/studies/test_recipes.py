@@ -66,7 +66,9 @@ def test_a_fit_of_other_settings_is_another(recipes, fits, tmp_path):
     assert asked('--methods', 'r2', 'fast') == [['iterations=5000'], []]
     assert asked('--methods', 'r2', 'fast') == []
     assert asked('--methods', 'r2', '--iterations', '7') == [['iterations=7']]
-    assert asked('--methods', 'r2:iterations=9,V_S=1', '-D', 'pixels=8') == [['pixels=8', 'iterations=9', 'V_S=1']]
+    assert asked('--methods', 'r2:iterations=9,lambda_tv=0', '-D', 'pixels=8') == [
+        ['pixels=8', 'iterations=9', 'lambda_tv=0']
+    ]
     assert asked('--methods', 'r2', '-D', 'iterations=9') == [['iterations=9']]
     assert asked('--methods', 'r2', '--views', '3') == [['iterations=5000']]
     assert (tmp_path / 'recipes.png').exists()
@@ -82,10 +84,10 @@ def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypat
     (folder / 'checkpoint.npz').touch()
     code, _, err = recipes('--methods', 'fast')
     assert code == 2 and '--resume' in commands[0]
-    assert err.splitlines()[-1] == 'error: a.xml: lingo-mi fit --recipe fast failed with exit code 3'
+    assert err.splitlines()[-1] == 'error: a.xml: lingo-mi fit --method fast failed with exit code 3'
 
 
-@pytest.mark.parametrize('method', ['nerf', 'r2:V=1', 'r2:V_S'])
+@pytest.mark.parametrize('method', ['nerf', 'r2:V=1', 'r2:lambda_tv'])
 def test_bad_methods(recipes, fits, method):
     code, _, err = recipes('--methods', 'r2', method)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not fits
@@ -129,15 +131,3 @@ def test_damaged_results(tmp_path, name):
     (tmp_path / name if name == 'scenes.json' else folder / name).write_text('[1]')
     with pytest.raises(InputError, match=f'{name}: is damaged'):
         comparison.result(scene, 'r2')
-
-
-def test_results_stored_with_earlier_names_of_the_measures(tmp_path):
-    r2 = dict(ssim_2d=0.9, psnr_3d=25.0, ssim_3d=0.8)
-    old = {name: value for name, value in METRICS.items() if not name.endswith('d_r2') or name == 'psnr_2d_r2'} | r2
-    comparison = study.Comparison(tmp_path)
-    folder, _ = comparison.plan('a.xml', 'r2')
-    folder.mkdir()
-    (folder / 'metrics.json').write_text(
-        json.dumps(old | dict(history=[dict(seconds=1.0, psnr_2d=20.0, psnr_3d=15.0)]))
-    )
-    assert comparison.result('a.xml', 'r2') == METRICS

@@ -56,8 +56,8 @@ def test_the_measured_walnut(data, tmp_path):
     """On the voxels asked for, which are as large as all together need; its truth is the FDK of all views."""
     found = Study(tmp_path, 8).dataset(Case('walnut', views=30))
     geometry = found.train.geometry
-    assert tuple(geometry.nVoxel) == (8, 8, 8) and len(found.train) == 30
-    np.testing.assert_allclose(8 * np.array(geometry.dVoxel), 128 * 0.305)
+    assert tuple(geometry.grid.shape) == (8, 8, 8) and len(found.train) == 30
+    np.testing.assert_allclose(8 * np.array(geometry.grid.spacing), 128 * 0.305)
     assert found.volume.shape == (8, 8, 8) and found.volume.max() > 0.01
 
 

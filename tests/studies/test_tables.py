@@ -16,15 +16,19 @@ from helpers.same import fits_alike
 from helpers.script import FIT, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import write_volume
-from lingo_mi.fitting.recipes import METHODS
+from lingo_mi.fitting.methods.cloud_method import CloudMethod
+from lingo_mi.fitting.methods.fast import Fast
+from lingo_mi.geometry import Grid
 from lingo_mi.phantoms import make
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.studies.tables import cells as tables
-from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, recipe
+from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, method_for
 from lingo_mi.studies.tables.objects import available, load_object
 from lingo_mi.studies.tables.report import ABLATION, groups, markdown, plan, results
 
 TABLES = FIT.with_name('tables.py')
 TINY = Scale(16, 24, 200, (20,), ('foot',))
+FAST = 'fast:iterations=15'
 SHORT = 'r2:densify_from=5,densify_until=100,densify_every=6,densify_threshold=1e-6'
 
 
@@ -33,7 +37,6 @@ def tiny(monkeypatch):
     monkeypatch.setitem(SCALES, 'small', TINY)
     monkeypatch.setattr(tables, 'SCANNED', 25)
     monkeypatch.setattr(tables, 'COMPLETED', 30)
-    monkeypatch.setitem(METHODS, 'fast', METHODS['fast'].changed(iterations=15))
     monkeypatch.setitem(tables.ALGORITHMS, 'sart', tables.SART(niter=2))
     monkeypatch.setitem(tables.ALGORITHMS, 'asd-pocs', tables.ASDPOCS(niter=1, tviter=2))
 
@@ -49,13 +52,13 @@ def script(table, out, *args):
 
 
 def test_new_views(out):
-    code, text, err = script('views', out, '--views', '4', '--iterations', '10', '20', '--methods', 'r2', 'fast')
+    code, text, err = script('views', out, '--views', '4', '--iterations', '10', '20', '--methods', 'r2', FAST)
     assert code == 0, err
     rows = json.loads((out / 'views.json').read_text())
     assert [(r['views'], r['second'], r['object']) for r in rows] == [
         (4, n, name) for n in (10, 20) for name in ('foot', 'mean of 1')
     ]
-    assert rows[0]['columns']['fast'] == rows[2]['columns']['fast'] != rows[0]['columns']['r2']
+    assert rows[0]['columns'][FAST] == rows[2]['columns'][FAST] != rows[0]['columns']['r2']
     assert rows[0]['columns']['r2'] == rows[1]['columns']['r2'] != rows[2]['columns']['r2']
     assert '3 of 3 cells' in text and (out / 'views.md').read_text() in text
     assert 'views' in json.loads((out / 'views.provenance.json').read_text())['command']
@@ -70,18 +73,6 @@ def test_a_cell_that_exists_is_not_computed_again(out):
     with mock.patch.object(Cells, 'compute', side_effect=AssertionError):
         code, text, _ = script(*arguments)
     assert code == 0 and '1 of 1 cells' in text
-
-
-def test_a_cell_stored_with_earlier_names_of_the_measures_is_read(tmp_path):
-    cells, fit = Cells(tmp_path, TINY), Fit('foot', 3, 'r2', 5)
-    old = dict(
-        psnr_2d_r2=30.0, ssim_2d=0.9, ipsd=None, psnr_3d=25.0, ssim_3d=0.8, psnr_3d_absolute=24.0, seconds_init=1
-    )
-    for cell in fit, Volume(fit, 'fdk'):
-        cells.path(cell).parent.mkdir(parents=True, exist_ok=True)
-        cells.path(cell).write_text(json.dumps(old))
-        found = cells.get(cell)
-        assert (found['psnr_3d_r2'], found['psnr_3d'], found['ssim_2d_r2']) == (25.0, 24.0, 0.9)
 
 
 @pytest.mark.parametrize('content', [b'', b'{}', b'[]', b'{"psnr_2d_r2": 3', b'\xff'])
@@ -112,13 +103,13 @@ def test_two_stages(out):
     assert len(whole) == 30
     train = cells.dataset('foot').train
     np.testing.assert_array_equal(whole.projections[:4], train.projections[[0, 6, 12, 18]])
-    volume = tables.FDK().run(whole).volume
+    volume = run_algorithm(whole, tables.FDK()).volume
     truth = make('foot', 16).data
     assert rows['fdk']['r2']['psnr_3d_r2'] == pytest.approx(
         tables.metrics.psnr_3d_r2(volume, truth), rel=fits_alike(1e-5)
     )
     measured = train.subset([0, 6, 12, 18])
-    refined = tables.Refined().run(measured, completed=whole, sample=cells._cloud(fit).volume)
+    refined = run_algorithm(measured, tables.Refined(), completed=whole, sample=cells._cloud(fit).volume)
     found = refined.volume
     assert rows['refined']['r2']['psnr_3d_r2'] == pytest.approx(
         tables.metrics.psnr_3d_r2(found, truth), rel=fits_alike(1e-5)
@@ -130,16 +121,17 @@ def test_two_stages(out):
 
 
 def test_the_parts_of_lingo():
-    """Each row has its parts and nothing else; the first and the last are the recipes of the other tables."""
+    """Each row has its parts and nothing else; the first and the last are the methods of the other tables."""
     found = groups('ablation', [25], [20], [])
     cells = {group.second: [column.cell('foot') for column in group.columns] for group in found}
     assert list(cells) == list(ABLATION) and all(volume == Volume(fit, 'asd-pocs') for fit, volume in cells.values())
     assert cells['- - -'][0] == Fit('foot', 25, 'r2', 20) and cells['+ + +'][0] == Fit('foot', 25, 'lingo', 20)
-    base = recipe(cells['+ + +'][0], TINY)
+    base = method_for(cells['+ + +'][0], TINY)
     for parts, (fit, _) in cells.items():
         scale, start, voxels = (part == '+' for part in parts.split())
-        changes = dict(loss_scale='dynamic' if scale else 'none', init='lingo' if start else 'r2')
-        assert recipe(fit, TINY) == base.changed(**changes, V_S=20.0 if voxels or not start else 1.0)
+        of_start = dict(start='masks', V_S=20.0 if voxels else 1.0) if start else dict(start='fdk')
+        changes = dict(loss_scale='dynamic' if scale else 'none', **of_start)
+        assert method_for(fit, TINY).flat() == base.changed(**changes).flat()
 
 
 def test_opacities_have_no_row_of_means(tmp_path):
@@ -197,7 +189,7 @@ def test_an_interrupted_fit_goes_on(tmp_path):
     with mock.patch.object(tables.Progress, 'update', side_effect=_stop_at(13)), pytest.raises(KeyboardInterrupt):
         broken.compute(fit, 'fit')
     assert broken.get(fit) is None and broken.path(fit).with_name('checkpoint.npz').exists()
-    with mock.patch.object(tables, 'initial_cloud', side_effect=AssertionError):
+    with mock.patch.object(CloudMethod, 'starting_cloud', side_effect=AssertionError):
         resumed = broken.compute(fit, 'fit')
     assert numbers(resumed) == pytest.approx(numbers(whole.compute(fit, 'fit')))
 
@@ -233,7 +225,7 @@ def test_a_longer_fit_goes_on_from_a_shorter_one(tmp_path, sums_in_order):
     short, fit = Fit('foot', 4, SHORT, 10), Fit('foot', 4, SHORT, 20)
     steps, whole = Cells(tmp_path / 'a', TINY), Cells(tmp_path / 'b', TINY)
     before = steps.compute(short, 'fit')
-    with mock.patch.object(tables, 'initial_cloud', side_effect=AssertionError):
+    with mock.patch.object(CloudMethod, 'starting_cloud', side_effect=AssertionError):
         after = steps.compute(fit, 'fit')
     assert (
         numbers(after) == pytest.approx(numbers(whole.compute(fit, 'fit'))) and after['gaussians'] > before['gaussians']
@@ -282,7 +274,7 @@ def test_killed(tmp_path):
 def test_volumes_are_averaged_down(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     data = rng.uniform(0, 1, (40, 30, 20)).astype(np.float32)
-    write_volume(tmp_path / 'engine.nii.gz', data, (1.0, 2.0, 3.0))
+    write_volume(tmp_path / 'engine.nii.gz', data, Grid(data.shape, (1.0, 2.0, 3.0)))
     monkeypatch.setenv('LINGO_MI_DATA', str(tmp_path))
     lines = []
     assert available(['foot', 'engine', 'tooth'], lines.append) == ['foot', 'engine'] and 'tooth' in lines[0]
@@ -299,8 +291,8 @@ def test_objects_finer_than_the_voxels(tmp_path):
     found, usual, scanned = fine.dataset('foot'), coarse.dataset('foot'), make('foot', 32)
     geometry = found.train.geometry
     assert (
-        (geometry.nVoxel, geometry.dVoxel)
-        == (usual.train.geometry.nVoxel, usual.train.geometry.dVoxel)
+        (geometry.grid.shape, geometry.grid.spacing)
+        == (usual.train.geometry.grid.shape, usual.train.geometry.grid.spacing)
         == ((16,) * 3, (16.0,) * 3)
     )
     np.testing.assert_allclose(found.volume, scanned.data.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5)), atol=1e-5)
@@ -355,18 +347,18 @@ def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ['views.md'] and (tmp_path / 'views.md').read_text() == 'kept'
 
 
-def test_recipes():
-    assert recipe(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
-    assert recipe(Fit('foot', 5, 'fast'), TINY).iterations == METHODS['fast'].iterations
-    found = recipe(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
+def test_methods():
+    assert method_for(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
+    assert method_for(Fit('foot', 5, 'fast'), TINY).iterations == Fast.iterations
+    found = method_for(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
     assert (
         found.start.V_S,
         found.start.n_points,
         found.loss.loss_scale,
-        recipe(Fit('foot', 5, 'r2'), TINY).start.n_points,
+        method_for(Fit('foot', 5, 'r2'), TINY).start.n_points,
     ) == (1, 70, 'dynamic', 200)
-    with pytest.raises(InputError, match='no such recipe'):
-        recipe(Fit('foot', 5, '3d'), TINY)
+    with pytest.raises(InputError, match='there is no method'):
+        method_for(Fit('foot', 5, '3d'), TINY)
 
 
 @pytest.mark.parametrize(
@@ -378,7 +370,7 @@ def test_recipes():
         (['ct', '--iterations', '0'], 'at least 1'),
         (['views', '--seed', '-1'], 'seed must be a whole number from 0 on'),
         (['figures'], 'invalid choice'),
-        (['views', '--methods', 'nerf'], 'no such recipe'),
+        (['views', '--methods', 'nerf'], 'there is no method'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
         (['ct', '--finer', '0'], 'at least 1'),
         (['ct', '--photons', '-1'], 'photons'),

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.calibration.response.part import Part
+from lingo_mi.calibration.response.part import ResponsePart
 
 
 @dataclass
-class Air(Part):
+class Air(ResponsePart):
     """The air level a."""
 
     name = 'air'
@@ -39,7 +39,7 @@ class Air(Part):
 
 
 @dataclass
-class Gain(Part):
+class Gain(ResponsePart):
     """The gain g."""
 
     name = 'gain'

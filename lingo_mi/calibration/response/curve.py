@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.calibration.response.part import Part
+from lingo_mi.calibration.response.part import ResponsePart
 
 LEAST_SLOPE = 0.2
 NEWTON = 8  # steps of the inverse
 
 
 @dataclass
-class Curve(Part):
+class Curve(ResponsePart):
     """The polynomial of `count` coefficients, from the square on, up to the line integral `highest`."""
 
     name = 'curve'

@@ -22,7 +22,7 @@ class Place:
 
 
 @dataclass
-class Part(ABC):
+class ResponsePart(ABC):
     """A model that takes a view's line integrals p to what is measured, with K numbers c that may change from view to view.
 
     varies   'view': numbers of every view for itself; 'smooth': polynomials in time; 'one': the same in all views

@@ -11,8 +11,8 @@ from numpy.polynomial import legendre
 from lingo_mi.calibration.drift import times
 from lingo_mi.calibration.response.air import Air, Gain
 from lingo_mi.calibration.response.curve import Curve
-from lingo_mi.calibration.response.part import SMOOTH, Part, Place
-from lingo_mi.calibration.response.scatter import Scatter
+from lingo_mi.calibration.response.part import SMOOTH, Place, ResponsePart
+from lingo_mi.calibration.response.scatter import ScatterImage
 from lingo_mi.geometry.base import Geometry
 
 STEPS = 4  # of Gauss and Newton
@@ -33,7 +33,7 @@ class Response:
     """
 
     geometry: Geometry
-    parts: list[Part]
+    parts: list[ResponsePart]
 
     @classmethod
     def of(
@@ -53,10 +53,10 @@ class Response:
         scatter     'off', or 'one' for the same image in all views
         highest     the highest line integral, for the curve
         """
-        parts: list[Part] = [
+        parts: list[ResponsePart] = [
             *([Gain(gain)] if gain != 'off' else []),
             *([Curve('one', curve, highest)] if curve else []),
-            *([Scatter(scatter)] if scatter != 'off' else []),
+            *([ScatterImage(scatter)] if scatter != 'off' else []),
             *([Air(air)] if air != 'off' else []),
         ]
         rows = dict(one=1, smooth=min(SMOOTH, len(geometry) - 1) + 1, view=len(geometry))

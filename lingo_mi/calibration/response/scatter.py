@@ -3,7 +3,7 @@
     m = -ln(exp(-p) + S),    S = sum over i + j <= 2 of s_ij P_i(y) P_j(x)
 
 with Legendre's polynomials P over the panel. S is relative to the open beam. It is told by the object's most absorbing parts.
-Where it would be negative it is not light, and a calibration does not take it (`Scatter.doubt`).
+Where it would be negative it is not light, and a calibration does not take it (`ScatterImage.doubt`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lingo_mi.calibration.response.part import SURE, Part, Place
+from lingo_mi.calibration.response.part import SURE, Place, ResponsePart
 
 DEGREE = 2
 ORDERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
@@ -21,7 +21,7 @@ EVERYWHERE = Place(*np.meshgrid(*2 * [np.linspace(-1, 1, 41)], indexing='ij'))
 
 
 @dataclass
-class Scatter(Part):
+class ScatterImage(ResponsePart):
     """The polynomial of second degree: 6 numbers."""
 
     name = 'scatter'

@@ -8,6 +8,7 @@ from lingo_mi.projectors import grid
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.rectify import can_rectify
+from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
 SHARE, ROOM = 0.9999, 1.5  # of the voxels of an FDK volume that are less dense; the bound, over the next
@@ -23,10 +24,10 @@ def largest_density(scan: Scan) -> float:
     the volume's longest side. Raises InputError for an empty scan.
     """
     require_signal(scan, 'fit')
-    rough = float(scan.projections.max()) * scan.geometry.scale / THINNEST
+    rough = float(scan.projections.max()) * scan.geometry.grid.scale / THINNEST
     if not can_rectify(scan):
         return rough
-    found = ROOM * float(np.quantile(FDK().run(scan).volume, SHARE))
+    found = ROOM * float(np.quantile(run_algorithm(scan, FDK()).volume, SHARE))
     # Three digits, so that a fit that goes on has the same unit, whatever the rounding of a reconstruction made anew.
     return float(f'{found:.3g}') if found > 0 else rough
 
@@ -38,6 +39,6 @@ def mean_density(scan: Scan) -> float:
     meets the volume.
     """
     few = scan.subset(np.arange(min(len(scan), VIEWS)) * len(scan) // min(len(scan), VIEWS))
-    ways = grid.project(np.ones(few.geometry.nVoxel, np.float32), few.geometry).astype(float)
+    ways = grid.project_volume(np.ones(few.geometry.grid.shape, np.float32), few.geometry).astype(float)
     inside = ways > 0 if few.valid is None else (ways > 0) & few.valid
     return float(few.projections[inside].sum(dtype=float) / ways[inside].sum()) if inside.any() else 0.0

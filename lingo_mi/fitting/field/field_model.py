@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -11,39 +10,31 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.calibration.response.response import Response
-from lingo_mi.effects.forward import Effects
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.network import Network
+from lingo_mi.fitting.field.options import Field
 from lingo_mi.fitting.field.rays import Cube, integrals, pixels_of
-from lingo_mi.fitting.settings import Settings
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.fitting.models.model import Model
+from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.grid import view_table
 from lingo_mi.projectors.upload import uploaded
 
 POINTS = 2**18  # of the field that are evaluated at once
 
 
-class FieldModel:
-    """Renders and samples the states of a fit, as `CloudModel` does for Gaussians.
+class FieldModel(Model):
+    """Renders and samples a neural field. No density exceeds `unit` (see `densities.largest_density`).
 
-    settings   of the fit
-    geometry   of its scan, as given; defines the cube of the field and the default grid of `volume`
-    unit       the fit's unit of density, 1/mm, which no density of the field exceeds (see `densities.largest_density`)
-    effects    none: the field fits line integrals
-    response   none, for the same reason
+    options   of the field
     """
 
-    effects: Effects | None = None
-    response: Response | None = None
-
-    def __init__(self, settings: Settings, geometry: Geometry, unit: float):
-        self.settings, self.geometry, self.unit = settings, geometry, unit
-        self.cube = Cube(geometry, settings.neural.field_cube)
+    def __init__(self, options: Field, geometry: Geometry, unit: float):
+        super().__init__(geometry, unit)
+        self.options, self.cube = options, Cube(geometry, options.field_cube)
 
     @cached_property
     def network(self) -> Network:
-        return Network(self.settings.neural)
+        return Network(self.options)
 
     def integrals(self, values: dict, row: Any, x: Any, y: Any, within: Any) -> Any:
         """Line integrals along rays of a view, as `rays.integrals` gives them, in the fit's unit times normalised length."""
@@ -53,10 +44,10 @@ class FieldModel:
             row,
             x,
             y,
-            self.settings.neural.field_samples,
+            self.options.field_samples,
             within,
         )
-        return found * dr.opaque(mi.Float, self.geometry.scale)
+        return found * dr.opaque(mi.Float, self.geometry.grid.scale)
 
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
@@ -66,8 +57,8 @@ class FieldModel:
         progress   called as progress(views done, all views)
         """
         g, (height, width) = self.geometry, geometry.nDetector
-        every = replace(geometry, nVoxel=g.nVoxel, dVoxel=g.dVoxel, offOrigin=g.offOrigin)
-        at_once = max(POINTS // self.settings.neural.field_samples, 1)
+        every = geometry.on(g.grid)
+        at_once = max(POINTS // self.options.field_samples, 1)
         out = np.empty((len(geometry), height * width), np.float32)
         for i, row in enumerate(view_table(every)):
             on_device = uploaded(row)
@@ -77,36 +68,27 @@ class FieldModel:
                 out[i, pixels] = self.integrals(state.values, on_device, x, y, 0.5).numpy()
             if progress:
                 progress(i + 1, len(geometry))
-        out *= np.float32(self.unit / g.scale)
+        out *= np.float32(self.unit / g.grid.scale)
         return out.reshape(len(geometry), height, width)
 
-    def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
-        """What the scan's detector is expected to measure in the views of a geometry: `render`."""
-        return self.render(state, geometry)
-
-    def volume(self, state: DeviceState, geometry: Geometry | None = None) -> np.ndarray:
-        """The field at the voxel centres of a geometry's grid, 1/mm, float32 [x, y, z] (default: of the scan's).
+    def volume(self, state: DeviceState, grid: Grid | None = None) -> np.ndarray:
+        """The field at the voxel centres of a grid (default: the scan's), 1/mm, float32 [x, y, z].
 
         It is 0 outside the scan's volume, where no ray has sampled it.
         """
-        own, grid = self.geometry, geometry or self.geometry
-        shift = np.array(grid.offOrigin) - np.array(own.offOrigin)
+        own = self.geometry.grid
+        grid = grid or own
+        shift = np.array(grid.centre) - np.array(own.centre)
         axes = [
             ((np.arange(n) + 0.5 - n / 2) * d + s) / own_d + (own_n - 1) / 2
-            for n, d, s, own_n, own_d in zip(grid.nVoxel, grid.dVoxel, shift, own.nVoxel, own.dVoxel)
+            for n, d, s, own_n, own_d in zip(grid.shape, grid.spacing, shift, own.shape, own.spacing)
         ]
-        inside = [(a > -0.5 - 1e-6) & (a < n - 0.5 + 1e-6) for a, n in zip(axes, own.nVoxel)]
-        out = np.zeros(int(np.prod(grid.nVoxel)), np.float32)
+        inside = [(a > -0.5 - 1e-6) & (a < n - 0.5 + 1e-6) for a, n in zip(axes, own.shape)]
+        out = np.zeros(int(np.prod(grid.shape)), np.float32)
         chosen = np.flatnonzero(inside[0][:, None, None] & inside[1][:, None] & inside[2])
         for first in range(0, len(chosen), POINTS):
             part = chosen[first : first + POINTS]
-            where = np.unravel_index(part, grid.nVoxel)
+            where = np.unravel_index(part, grid.shape)
             points = self.cube.of_grid([uploaded(a[i]) for a, i in zip(axes, where)])
             out[part] = self.network.density(state.values, [dr.clip(p, 0, 1) for p in points]).numpy()
-        return out.reshape(grid.nVoxel) * np.float32(self.unit)
-
-    def cloud(self, state: DeviceState) -> None:
-        """None: a field has no Gaussians."""
-
-    def shares(self, state: DeviceState) -> None:
-        """None: a field is of one material."""
+        return out.reshape(grid.shape) * np.float32(self.unit)

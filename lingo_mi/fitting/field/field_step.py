@@ -14,11 +14,10 @@ from lingo_mi.fitting.adam import adam_step
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.densities import largest_density, mean_density
 from lingo_mi.fitting.field.field_model import FieldModel
+from lingo_mi.fitting.field.options import Field
 from lingo_mi.fitting.field.rays import pixels_of
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.method import Method, Stepper
 from lingo_mi.fitting.state import State
-from lingo_mi.geometry.base import Geometry
-from lingo_mi.lingo.initialise import InitialCloud
 from lingo_mi.projectors.grid import view_table
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.scan import Scan
@@ -26,44 +25,33 @@ from lingo_mi.scan import Scan
 MOST_COPIES = 2**30  # bytes of the copies of the gradient, one for each thread
 
 
-class FieldStepper:
-    """The optimisation of a field on one scan, step by step, as `step.Stepper` for Gaussians.
+class FieldStepper(Stepper):
+    """The optimisation of a field on one scan, step by step."""
 
-    model   the fit's `FieldModel`
-    poses   None: they are not fitted
-    """
+    model: FieldModel
 
-    poses = None
-
-    @property
-    def geometry(self) -> Geometry:
-        """Of the scan."""
-        return self.scan.geometry
-
-    def __init__(self, scan: Scan, settings: Settings):
-        """Raises InputError for an empty scan."""
-        self.settings, self.scan = settings, scan
-        unit = largest_density(scan) if settings.model.normalise else 1.0
-        self.model = FieldModel(settings, scan.geometry, unit)
+    def __init__(self, method: Method, options: Field, normalise: bool, scan: Scan):
+        """options: of the field; normalise: as of `NAF`. Raises InputError for an empty scan."""
+        self.method, self.options, self.scan, self.geometry = method, options, scan, scan.geometry
+        self.model = FieldModel(options, scan.geometry, largest_density(scan) if normalise else 1.0)
         self.rows = view_table(scan.geometry)
 
-    def start(self, initial: InitialCloud, rng: np.random.Generator) -> State:
-        """The state at the start of a fit: random parameters, no Gaussians."""
-        mean = mean_density(self.scan) / self.model.unit if self.settings.neural.field_start == 'mean' else None
+    def begin(self, seed: int) -> tuple[State, np.ndarray, dict]:
+        """Random parameters, and no points."""
+        rng = np.random.default_rng(seed).spawn(1)[0]  # takes nothing from the steps
+        mean = mean_density(self.scan) / self.model.unit if self.options.field_start == 'mean' else None
         values = self.model.network.initial(rng, mean)
         first, second = ({k: np.zeros_like(v) for k, v in values.items()} for _ in range(2))
         none = np.zeros(0, np.float32)
-        return State(values, first, second, none, none.copy(), np.zeros(0, bool))
-
-    def renewed(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> None:
-        """None: nothing is added to a field or removed from it."""
+        state = State(values, first, second, none, none.copy(), np.zeros(0, bool))
+        return state, np.zeros((0, 3), np.float32), {}
 
     def step(self, state: DeviceState, views: Sequence[int], iteration: int, rng: np.random.Generator) -> Any:
         """Advance the state by one Adam step on random rays of the given views. Returns the loss, Float [1].
 
         `iteration` counts from 0. `rng` chooses the rays, and the samples on them.
         """
-        s = self.settings.neural
+        s = self.options
         for value in state.values.values():
             dr.enable_grad(value)
         total = mi.Float(0)
@@ -74,7 +62,7 @@ class FieldStepper:
                     continue
                 x, y = map(uploaded, pixels_of(pixels, self.scan.geometry.nDetector[1]))
                 within = uploaded(rng.random(s.field_samples * len(pixels), np.float32))
-                scale = np.float32(self.scan.geometry.scale / self.model.unit)
+                scale = np.float32(self.scan.geometry.grid.scale / self.model.unit)
                 measured = uploaded(self.scan.projections[view].ravel()[pixels] * scale)
                 found = self.model.integrals(state.values, uploaded(self.rows[view]), x, y, within)
                 loss = dr.mean(dr.square(found - measured)) / len(views)
@@ -82,15 +70,8 @@ class FieldStepper:
                 total += dr.detach(loss)
                 dr.eval(total, *(dr.grad(v) for v in state.values.values()))
         gradients = {name: dr.grad(value) for name, value in state.values.items()}
-        adam_step(state, gradients, self.settings, iteration)
+        adam_step(state, gradients, self.method, iteration)
         return total
-
-    def arrays(self) -> dict:
-        """Nothing: a step keeps no more than the state."""
-        return {}
-
-    def restore(self, arrays: dict) -> None:
-        """Nothing to restore."""
 
     def _pixels(self, view: int, rng: np.random.Generator) -> np.ndarray:
         """Flat indices of `field_rays` valid pixels of a view behind the object, whose line integral is above 0 (NAF).
@@ -103,7 +84,7 @@ class FieldStepper:
         behind = np.flatnonzero(valid & (pixels > 0))
         if not len(behind):
             behind = np.flatnonzero(valid)
-        n = self.settings.neural.field_rays if len(behind) else 0
+        n = self.options.field_rays if len(behind) else 0
         return rng.choice(behind, n, replace=len(behind) < n, shuffle=False)
 
 

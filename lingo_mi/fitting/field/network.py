@@ -15,7 +15,7 @@ import numpy as np
 from drjit import nn
 
 from lingo_mi.fitting.activations import inverse_sigmoid
-from lingo_mi.fitting.field.settings import FieldSettings
+from lingo_mi.fitting.field.options import Field
 
 SLOPE = 0.01  # of the leaky ReLU below 0 (PyTorch's default)
 MEANS = 1e-4, 0.5  # densities that a field starts from: it hardly leaves lower ones
@@ -32,8 +32,8 @@ class Network:
     one kernel, but their derivatives by the matrices take four times as long on the CPU.
     """
 
-    def __init__(self, settings: FieldSettings):
-        s = settings
+    def __init__(self, options: Field):
+        s = options
         self.encoding: Any = nn.HashGridEncoding(
             mi.Float,
             3,

@@ -27,10 +27,10 @@ class Cube:
 
     def of_grid(self, position: Any) -> list:
         """Coordinates in the cube, in [0, 1], of a position in the scan's grid, where voxel centres are at whole numbers."""
-        g, side = self.geometry, self.side * max(self.geometry.sVoxel)
+        g, side = self.geometry, self.side * max(self.geometry.grid.size)
         return [
             dr.fma(position[i] + (0.5 - n / 2), dr.opaque(mi.Float, d / side), 0.5)
-            for i, (n, d) in enumerate(zip(g.nVoxel, g.dVoxel))
+            for i, (n, d) in enumerate(zip(g.grid.shape, g.grid.spacing))
         ]
 
 

@@ -6,15 +6,15 @@ It has no densities and no volume. The grey images are the projections divided b
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.fitting.activations import inverse_sigmoid, sigmoid
-from lingo_mi.fitting.models.base import SHAPE, ForwardModel
-from lingo_mi.fitting.settings import Settings
+from lingo_mi.fitting.models.forward import SHAPE, ForwardModel
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.alpha import Discs, composite, flatten
 from lingo_mi.projectors.backprop import Cuts
@@ -24,19 +24,24 @@ from lingo_mi.projectors.view import View
 OPACITY = 0.1  # of all Gaussians at the start of a fit (3DGS)
 
 
+@dataclass(frozen=True)
 class AlphaCompositing(ForwardModel):
     """Opacities by a sigmoid (3DGS), radiances as in `projectors.radiance`. Clones and halves keep both.
 
     Raw parameters besides the shape: 'opacity', 'radiance' and 'harmonics', the coefficients of the radiance's spherical
     harmonics from degree 1 on, degree by degree.
+
+    sh_degree, sh_every   as of `GaussianSplatting`
     """
 
-    replayable = False
+    sh_degree: int
+    sh_every: int
+
+    replayable: ClassVar = False
 
     @property
     def parameters(self) -> dict[str, int]:
-        degree = self.settings.model.sh_degree
-        harmonics = {'harmonics': (degree + 1) ** 2 - 1} if degree else {}
+        harmonics = {'harmonics': (self.sh_degree + 1) ** 2 - 1} if self.sh_degree else {}
         return SHAPE | {'opacity': 1, 'radiance': 1} | harmonics
 
     def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -55,15 +60,6 @@ class AlphaCompositing(ForwardModel):
         """Gaussians that are not too large, inside the volume or not (3DGS)."""
         return scale.max(1) <= largest
 
-    def with_lengths(self, geometry: Geometry) -> Settings:
-        """Converts `rate_centre`, `split_size` and `prune_size` from units of the scene's radius."""
-        radius, s = scene_radius(geometry), self.settings
-        return s.changed(
-            rate_centre=tuple(radius * r for r in s.adam.rate_centre),
-            split_size=radius * s.densification.split_size,
-            prune_size=radius * s.densification.prune_size,
-        )
-
     def gaussians(self, values: dict) -> tuple:
         """As in `ForwardModel`; the further arguments are those of `projectors.radiance.radiance_towards`."""
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
@@ -81,9 +77,8 @@ class AlphaCompositing(ForwardModel):
         """Harmonics of degrees that have not started stay zero (3DGS)."""
         if 'harmonics' not in gradients:
             return
-        model = self.settings.model
-        degrees = range(1, model.sh_degree + 1)
-        joined = [dr.opaque(mi.Float, float((iteration + 1) // model.sh_every >= k)) for k in degrees]
+        degrees = range(1, self.sh_degree + 1)
+        joined = [dr.opaque(mi.Float, float((iteration + 1) // self.sh_every >= k)) for k in degrees]
         for i in range(len(gradients['harmonics'])):
             gradients['harmonics'][i] *= joined[math.isqrt(i + 1) - 1]
 

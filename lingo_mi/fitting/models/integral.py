@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
 from lingo_mi.fitting.activations import inverse_softplus, softplus
-from lingo_mi.fitting.models.base import SHAPE, ForwardModel
+from lingo_mi.fitting.models.forward import SHAPE, ForwardModel
 from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.footprint import Footprints, project
 from lingo_mi.projectors.splat import splat
@@ -18,10 +18,13 @@ from lingo_mi.projectors.view import View
 PARAMETERS = SHAPE | {'density': 1}
 
 
+@dataclass(frozen=True)
 class LineIntegrals(ForwardModel):
     """Densities by softplus (R2-Gaussian, section 4.1). Pixels are line integrals, exact up to the cut-off `extent`."""
 
-    replayable = True
+    extent: float
+
+    replayable: ClassVar = True
 
     @property
     def parameters(self) -> dict[str, int]:
@@ -47,14 +50,13 @@ class LineIntegrals(ForwardModel):
         return *self._shape(values), _softplus(values['density'])
 
     def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Footprints:
-        return project(gaussians, rays, self.settings.model.extent, cut=cut)
+        return project(gaussians, rays, self.extent, cut=cut)
 
     def integrals(self, footprints: Footprints, rays: View, share: Any = None) -> list:
         amplitude, *others = footprints.values
         parts = [amplitude] if share is None else [amplitude * (1 - share), amplitude * share]
-        extent = self.settings.model.extent
         return [
-            splat(replace(footprints, values=(part, *others)), rays.height, rays.width, extent) * rays.lengths()
+            splat(replace(footprints, values=(part, *others)), rays.height, rays.width, self.extent) * rays.lengths()
             for part in parts
         ]
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.fields import SMALL, random_state
 from helpers.fits import geometry
 from lingo_mi.fitting.device_state import DeviceState
-from lingo_mi.fitting.field.field_model import FieldModel
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors import grid
 from lingo_mi.studies.benchmarks.field import NumpyField
@@ -22,8 +22,8 @@ def views(**changes):
     return geometry(2, **{**dict(nDetector=(12, 14), dDetector=(25.0, 24.0)), **changes})
 
 
-def rendered(settings, g, state=None, unit=1.0):
-    return FieldModel(settings, g, unit).render(DeviceState(state or random_state(settings, amplitude=3)), g)
+def rendered(method, g, state=None, unit=1.0):
+    return method.model(g, unit).render(DeviceState(state or random_state(method, amplitude=3)), g)
 
 
 @pytest.mark.parametrize('changes', BOXES)
@@ -31,9 +31,9 @@ def test_integrals_are_those_of_the_sampled_field(changes):
     """The exact projector of the field on fine voxels; what is left is their error, which the samples do not have."""
     g = views(**changes)
     state = random_state(SMOOTH, amplitude=3)
-    fine = replace(g, nVoxel=tuple(3 * n for n in g.nVoxel), dVoxel=tuple(d / 3 for d in g.dVoxel))
-    volume = FieldModel(SMOOTH, g, 1.0).volume(DeviceState(state), fine)
-    expected, found = grid.project(volume, fine), rendered(SMOOTH, g, state)
+    fine = g.on(g.grid.finer(3))
+    volume = SMOOTH.model(g, 1.0).volume(DeviceState(state), fine.grid)
+    expected, found = grid.project_volume(volume, fine), rendered(SMOOTH, g, state)
     assert volume.std() > 0.01 and (expected > 0).mean() > 0.3
     np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
 
@@ -53,23 +53,22 @@ def test_error_falls_with_the_number_of_samples():
 def test_volume_is_the_field_at_the_voxel_centres():
     g, unit = views(nVoxel=(5, 4, 3), dVoxel=(8.0, 9.0, 10.0), offOrigin=(3.0, -2.0, 1.0)), 0.25
     state = random_state(SMALL)
-    found = FieldModel(SMALL, g, unit).volume(DeviceState(state))
-    side = SMALL.neural.field_cube * 40  # of the cube, mm
-    axes = [(np.arange(n) + 0.5 - n / 2) * d / side + 0.5 for n, d in zip(g.nVoxel, g.dVoxel)]
+    found = SMALL.model(g, unit).volume(DeviceState(state))
+    side = SMALL.field.field_cube * 40  # of the cube, mm
+    axes = [(np.arange(n) + 0.5 - n / 2) * d / side + 0.5 for n, d in zip(g.grid.shape, g.grid.spacing)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), -1).reshape(-1, 3)
-    expected = unit * NumpyField(SMALL.neural, state, np.float64).density(points).reshape(g.nVoxel)
+    expected = unit * NumpyField(SMALL.field, state, np.float64).density(points).reshape(g.grid.shape)
     np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 def test_volume_on_another_grid_is_of_the_same_field_and_empty_outside():
     g, state = views(), DeviceState(random_state(SMALL))
-    model = FieldModel(SMALL, g, 1.0)
+    model = SMALL.model(g, 1.0)
     own = model.volume(state)
-    larger = replace(
-        g, nVoxel=(40, 40, 40), offOrigin=(8.0, 0.0, -8.0)
-    )  # voxels of the same size, shifted by whole ones
+    # Voxels of the same size, shifted by whole ones.
+    larger = replace(g.grid, shape=(40, 40, 40), centre=(8.0, 0.0, -8.0))
     found = model.volume(state, larger)
-    inside = np.zeros(larger.nVoxel, bool)
+    inside = np.zeros(larger.shape, bool)
     inside[3:35, 4:36, 5:37] = True
     np.testing.assert_allclose(found[3:35, 4:36, 5:37], own, rtol=1e-5)
     assert not found[~inside].any()
@@ -77,8 +76,8 @@ def test_volume_on_another_grid_is_of_the_same_field_and_empty_outside():
 
 def test_views_do_not_depend_on_the_voxels_of_their_geometry():
     g, state = views(), DeviceState(random_state(SMALL))
-    other = replace(g, nVoxel=(8, 8, 8), dVoxel=(8.0, 8.0, 8.0), angles=circular(2, 180, start=10))
-    model = FieldModel(SMALL, g, 1.0)
+    other = replace(g, angles=circular(2, 180, start=10), grid=Grid(8, 8.0, g.grid.centre))
+    model = SMALL.model(g, 1.0)
     np.testing.assert_array_equal(model.render(state, other), model.render(state, g))
 
 

@@ -8,13 +8,13 @@ import pytest
 from helpers.fields import SMALL, random_state
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.network import Network
-from lingo_mi.fitting.recipes import NAF
+from lingo_mi.fitting.methods.naf import NAF
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.studies.benchmarks.field import NumpyField
 
 
 @pytest.fixture(params=[{}, dict(field_skip=1, field_layers=3), dict(field_skip=3, field_growth=1.5)])
-def settings(request):
+def method(request):
     return SMALL.changed(**request.param)
 
 
@@ -27,30 +27,30 @@ def on_device(points):
     return [uploaded(p) for p in points.T]
 
 
-def test_density_is_that_of_a_reference_in_float64(settings, points):
-    state = random_state(settings)
-    found = Network(settings.neural).density(DeviceState(state).values, on_device(points)).numpy()
-    expected = NumpyField(settings.neural, state, np.float64).density(points)
+def test_density_is_that_of_a_reference_in_float64(method, points):
+    state = random_state(method)
+    found = Network(method.field).density(DeviceState(state).values, on_device(points)).numpy()
+    expected = NumpyField(method.field, state, np.float64).density(points)
     assert expected.std() > 1e-3  # a field that varies
     np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 def test_published_size():
     """16 levels, of which the three coarsest are stored whole, 2 features, and a network of 4225 numbers."""
-    shapes = Network(NAF.neural).shapes
+    shapes = Network(NAF().field).shapes
     assert shapes == {'features': (2 * (16**3 + 32**3 + 64**3 + 13 * 2**19), 1), 'network': (4225, 1)}
 
 
-def test_derivatives_are_those_of_a_reference_and_of_differences(settings, points):
+def test_derivatives_are_those_of_a_reference_and_of_differences(method, points):
     """The derivative along a random direction, by central differences in float64, and all derivatives one by one."""
-    state, weights = random_state(settings), np.random.default_rng(2).normal(size=len(points)).astype(np.float32)
+    state, weights = random_state(method), np.random.default_rng(2).normal(size=len(points)).astype(np.float32)
     values = DeviceState(state).values
     for value in values.values():
         dr.enable_grad(value)
-    dr.backward(dr.sum(Network(settings.neural).density(values, on_device(points)) * uploaded(weights)))
+    dr.backward(dr.sum(Network(method.field).density(values, on_device(points)) * uploaded(weights)))
     found = {k: dr.grad(v).numpy().astype(float) for k, v in values.items()}
 
-    reference = NumpyField(settings.neural, state, np.float64)
+    reference = NumpyField(method.field, state, np.float64)
     reference.density(points)
     features, *layers = reference.gradients(weights.astype(float))
     expected = dict(features=features.ravel(), network=np.concatenate([x.ravel() for x in layers]))
@@ -60,16 +60,16 @@ def test_derivatives_are_those_of_a_reference_and_of_differences(settings, point
         direction = np.random.default_rng(3).normal(size=gradient.shape)
         sums = []
         for step in (-1e-6, 1e-6):
-            moved = random_state(settings)
+            moved = random_state(method)
             moved.values[name] = (moved.values[name][:, 0].astype(float) + step * direction)[:, None]
-            sums.append(NumpyField(settings.neural, moved, np.float64).density(points) @ weights)
+            sums.append(NumpyField(method.field, moved, np.float64).density(points) @ weights)
         difference = (sums[1] - sums[0]) / 2e-6
         assert found[name] @ direction == pytest.approx(difference, rel=2e-3, abs=1e-3 * np.linalg.norm(gradient))
 
 
 def test_forward_and_backward_derivatives_are_adjoint(points):
     state, rng = random_state(SMALL), np.random.default_rng(4)
-    network, values = Network(SMALL.neural), DeviceState(state).values
+    network, values = Network(SMALL.field), DeviceState(state).values
     directions = {k: rng.normal(size=dr.width(v)).astype(np.float32) for k, v in values.items()}
     weights = rng.normal(size=len(points)).astype(np.float32)
     for k, v in values.items():

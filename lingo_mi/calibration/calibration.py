@@ -1,0 +1,95 @@
+"""A calibration: what was found of a scanner's errors, in sentences, and the scan without them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import overload
+
+import numpy as np
+
+from lingo_mi.calibration.response.response import Response
+from lingo_mi.calibration.search import Found
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.reconstruction.line_integrals import line_integrals
+from lingo_mi.scan import Dataset, Scan
+
+_TERMS = dict(
+    air='air level',
+    gain='gain over 1',
+    curve='curve, coefficients from the square on',
+    scatter='scatter over the open beam',
+)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What `lm.calibrate` has found; `corrected` is the scan with it.
+
+    geometry    of the scan that was given
+    found       numbers, their standard errors, and how well views predict each other before and after
+    """
+
+    geometry: Geometry
+    found: Found
+
+    @property
+    def needed(self) -> bool:
+        """Whether anything was found that is taken."""
+        drift = self.found.drift
+        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._response is not None
+
+    @property
+    def _response(self) -> Response | None:
+        """The response, if any of its numbers was found."""
+        response = self.found.response
+        return response if response is not None and any(part.values.any() for part in response.parts) else None
+
+    @overload
+    def corrected(self, scan: Scan) -> Scan: ...
+
+    @overload
+    def corrected(self, scan: Dataset) -> Dataset: ...
+
+    def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
+        """The same views with the panel where it was found. Views that were held out get what was found for their time, which
+        their angles tell: the scan's views must be in the order in which they were taken.
+
+        Raises InputError for a scan by another scanner.
+        """
+        require_type('scan', scan, (Scan, Dataset))
+        if isinstance(scan, Dataset):
+            test = None if scan.test is None else self._moved(scan.test)
+            return replace(scan, train=self._moved(scan.train), test=test)
+        return self._moved(scan)
+
+    def _moved(self, scan: Scan) -> Scan:
+        if scan.geometry.mode != self.geometry.mode or scan.geometry.nDetector != self.geometry.nDetector:
+            raise InputError('this calibration is that of a scan by another scanner: calibrate this one')
+        if not self.needed:
+            return scan
+        response = self._response
+        if response is not None:
+            scan = line_integrals(scan)  # which the response was fitted to
+            scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
+        return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
+
+    def lines(self) -> list[str]:
+        """What was found, in sentences."""
+        f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
+        lines = []
+        for name, value in f.measured.items():
+            error, why = f.errors[name], f.refused.get(name)
+            if name == 'yaw':
+                text = f'panel turned in its plane by {np.degrees(value):+.3f} degrees +- {np.degrees(error):.3f}'
+            elif name[0] not in 'uv':
+                text = f'{_TERMS[name.rstrip("0123456789_")]} ({name}): {value:+.3g} +- {error:.2g}'
+            else:
+                what = 'shift' if len(name) == 1 else f'drift of order {name[1:]}'
+                pixels = value / pixel[name[0]]
+                text = f'{what} of the panel along {name[0]}: {value:+.4g} mm +- {error:.2g} ({pixels:+.3f} pixels)'
+            lines.append(text + (f', not taken: {why}' if why else ''))
+        lines.append(
+            f'views predict each other to {f.after:.4g} rms instead of {f.before:.4g} (line integrals, smoothed)'
+        )
+        return lines

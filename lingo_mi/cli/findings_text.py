@@ -1,0 +1,157 @@
+"""What `inspect` prints: findings as sentences, and what to correct with which option."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lingo_mi.inspection.measure import Findings
+from lingo_mi.scan import Scan
+
+CALIBRATE = '; lingo-mi calibrate finds an axis off centre all the same'
+OBSTACLES = dict(
+    orbit='the scanner leaves the circle' + CALIBRATE,
+    panel='the panel does not see the plane of the source' + CALIBRATE,
+    gaps='pixels side by side in the plane of the source are not valid' + CALIBRATE,
+    truncation='the object reaches over the edge of the panel' + CALIBRATE,
+    empty='too few of them show anything',
+    aside='too few of them see the object from beside',
+)
+
+
+def facts(scan: Scan, found: Findings) -> list[str]:
+    """Sentences with the numbers that were measured."""
+    geometry = scan.geometry
+    (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
+    lengths = f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else ''
+    lines = [
+        f'{len(scan)} views of {nv} x {nu} pixels of {dv:.4g} x {du:.4g} mm, {geometry.mode} beam{lengths}; '
+        f'{found.invalid:.2%} of the pixels are left out'
+    ]
+    if (border := found.border) is not None:
+        if border.air is None:
+            lines.append('air: none beside the object, which fills the panel')
+        else:
+            lines.append(f'air: {border.air:.4g} beside the object (line integral; 0 without error)')
+        if border.air_spread is not None:
+            lines.append(f'air of the views: differs by {border.air_spread:.2g} rms')
+        for name, views in _cut(found):
+            lines.append(f'truncation: the object reaches over the {name} edge of the panel in {views} views')
+    if found.photons is None:
+        lines.append('noise: none that could be measured')
+    else:
+        lines.append(
+            f'noise: {found.photons**-0.5:.2g} rms in air from column to column, as from {found.photons:.2g} photons a pixel'
+        )
+    if found.clipped is not None:
+        lines.append(
+            f'saturation: {found.clipped:.2%} of the pixels have exactly the highest value, {found.highest:.3g}'
+        )
+    if found.mass_spread is not None:
+        lines.append(f'mass: equal in all views to {found.mass_spread:.2%} rms')
+    jitter = [f'{x:.2g} pixels along {name}' for x, name in zip(found.jitter, ('rows', 'columns')) if np.isfinite(x)]
+    if jitter:
+        lines.append('jitter of the outline: ' + ', '.join(jitter))
+    return lines + _orbit(scan, found)
+
+
+def _orbit(scan, found):
+    orbit, lines = found.orbit, []
+    if orbit.turn and len(scan) >= 4:
+        lines.append(f'angles: {np.degrees(orbit.turn):.4g} degrees in all')
+    if orbit.obstacle is not None:
+        lines.append(f'consistency of the views: not measured, as {OBSTACLES[orbit.obstacle]}')
+    if orbit.disagreement is None:
+        return lines
+    what = 'of the half-width of the panel' if scan.geometry.mode == 'parallel' else 'of their mass'
+    lines.append(f'consistency of the views: they disagree by {orbit.disagreement:.2%} rms {what}')
+    if orbit.off_axis:
+        pixels = orbit.shift / scan.geometry.dDetector[1]
+        lines.append(
+            f'axis: {orbit.shift:+.3g} mm on the panel ({pixels:+.2g} pixels) lets them agree to {orbit.shifted:.2%}'
+        )
+    elif orbit.short and orbit.reversed is None and orbit.swapped is None:
+        lines.append('axis: not measured, as the views span less than half a turn')
+    return lines
+
+
+def advice(scan: Scan, found: Findings) -> list[str]:
+    """Sentences that say what to correct, and how; none for a sound scan."""
+    border, lines = found.border, []
+    if found.negative:
+        lines.append(
+            'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
+            'views (import with --exposure, or --air)'
+        )
+    if border is not None:
+        if found.air_is_off:
+            lines.append(
+                f'air is {border.air:.3g} instead of 0: import again with --air, or subtract it from the projections'
+            )
+        if found.air_differs:
+            lines.append(
+                f'the air level of the views differs by {border.air_spread:.2g} rms: import again with --air, which scales every '
+                'view by its own air, or fit with -D fit_air=view'
+            )
+        for name, _ in _cut(found):
+            lines.append(f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object')
+    if found.clipped is not None:
+        lines.append('pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)')
+    if found.black:
+        lines.append(f'{_named(found.black)} black or empty: drop with --views of import, or lm.Scan.subset')
+    if found.doubled:
+        lines.append(
+            f'{_named(found.doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
+        )
+    if found.mass_differs:
+        lines.append(
+            f'the mass of the views differs by {found.mass_spread:.1%} rms: the beam or the exposure drifts; import again with '
+            '--air, which scales every view by its own air'
+        )
+    if found.unsteady:
+        lines.append(
+            'the object or the panel moves from view to view: fit with -D rate_pose=2e-3,2e-4, and keep it if the held-out views '
+            'get better; lingo-mi calibrate --drift 3 measures a slow drift'
+        )
+    return lines + _placement(scan, found)
+
+
+def _placement(scan, found):
+    """What to correct in the geometry."""
+    orbit, lines = found.orbit, []
+    if found.wide:
+        lines.append(
+            f'the panel of {max(scan.geometry.sDetector):.4g} mm is {found.wide:.2g} times as wide as its distance from the '
+            'source: give DSO, DSD and the size of the pixels in mm'
+        )
+    if orbit.turn == 0:
+        lines.append('all views have the same angle: give the angle of each')
+    elif orbit.unit == 'radians':
+        lines.append(
+            f'the angles span {np.degrees(orbit.turn):.3g} degrees: they look like radians; a .yml takes degrees'
+        )
+    elif orbit.unit == 'degrees':
+        lines.append(f'the angles span {orbit.turn:.4g} radians: they look like degrees; give numpy.radians(angles)')
+    elif orbit.reversed is not None:
+        lines.append(
+            f'with reversed angles the views disagree by {orbit.reversed:.2%} instead of {orbit.shifted:.2%}: change the sign of '
+            'the angles, or mirror the columns'
+        )
+    elif orbit.swapped is not None:
+        first, second = orbit.swapped
+        lines.append(f"views {first} and {second} fit better in each other's place: check the order of the frames")
+    elif orbit.off_axis:
+        lines.append(
+            f'the axis is off: add {orbit.shift:+.3g} mm to the second number of offDetector, or run lingo-mi calibrate'
+        )
+    return lines
+
+
+def _cut(found):
+    """The edges that the object reaches over, and in how many views."""
+    sides = ('left or right', found.border.cut_sides), ('upper or lower', found.border.cut_ends)
+    return [(name, views) for name, views in sides if views]
+
+
+def _named(views):
+    text = ', '.join(map(str, views[:6])) + (', ...' if len(views) > 6 else '')
+    return f'view {text} is' if len(views) == 1 else f'views {text} are'

@@ -1,0 +1,1 @@
+"""What is fitted besides the cloud: kinds of `correction.Correction`, a file each."""

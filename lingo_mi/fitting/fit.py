@@ -1,0 +1,301 @@
+"""A fit, running or finished: measured, saved, shown, and loaded again."""
+
+from __future__ import annotations
+
+import base64
+import html
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lingo_mi.common import notebook
+from lingo_mi.common.errors import InputError, require_type
+from lingo_mi.common.parsing import whole_number
+from lingo_mi.common.runtime import ensure_variant
+from lingo_mi.effects.forward import Effects, find_effects
+from lingo_mi.files.slabs import THICKNESS, write_slabs
+from lingo_mi.fitting import average
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.fitted_model import FittedModel
+from lingo_mi.fitting.measure import comparable, measure
+from lingo_mi.fitting.save import description, result_names, write_fit
+from lingo_mi.geometry.grid import Grid
+from lingo_mi.report.data import ReportData
+from lingo_mi.report.figures import overview
+from lingo_mi.report.numbers import headline
+from lingo_mi.report.page import report_page
+from lingo_mi.report.view import Page
+from lingo_mi.scan import Dataset
+from lingo_mi.scene.load import load_scene
+from lingo_mi.storage.file_access import as_path, new_file, writing
+from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.output_folder import (
+    CHECKPOINT,
+    CLOUD,
+    SCENE,
+    clear_leftovers,
+    occupants,
+    require_ours,
+    require_together,
+)
+
+
+class Fit(FittedModel):
+    """The result of `lm.fit` or `lm.load_fit`. In a notebook it shows slices, views, curves and numbers.
+
+    Examples
+    --------
+    ::
+
+        fit = lm.fit(data, lm.LINGO())
+        fit.volume()                     # float32 [x, y, z], density per mm
+        fit.render(data.test.geometry)   # float32 [view, v, u], line integrals
+        fit.metrics()['psnr_3d']
+        fit.save('out/foot')
+    """
+
+    @classmethod
+    def load(cls, path: str | PathLike) -> Fit:
+        """The fit in a folder that `lm.fit` or `save` wrote, by the folder or its result.xml; or of a checkpoint (.npz) alone.
+
+        Raises
+        ------
+        InputError
+            If there is no result, if it is damaged, or if files do not belong together.
+
+        Examples
+        --------
+        `fit = lm.load_fit('out/foot')`
+        """
+        ensure_variant()
+        path = as_path('path', path)
+        folder = path if path.is_dir() else path.parent if path.name == SCENE else None
+        file = path if folder is None else folder / CHECKPOINT
+        if not file.exists():
+            raise InputError(
+                f'{path}: there is no fit here; give a folder that lm.fit or Fit.save wrote, or its {CHECKPOINT}'
+            )
+        if folder is not None:
+            require_together(folder, [SCENE, CLOUD, CHECKPOINT])
+        stored = Checkpoint.load(file)
+        if stored.searching:
+            raise InputError(
+                f'{file}: the fit still searches for the step to stop at, and has no result: let it go on, with resume=True'
+            )
+        effects = None
+        if stored.effects:
+            effects = _effects_of(folder, file)
+        stored.state.values |= average.values_of(stored.arrays)
+        model = stored.method.model(stored.geometry, stored.unit, effects)
+        if model.response is not None:
+            model.response.restore(stored.arrays)
+        fit = cls(stored, model, folder=folder)
+        fit._stored  # noqa: B018 - damaged numbers are an error here, not later
+        return fit
+
+    # ---- numbers ----
+
+    @cached_property
+    def numbers(self) -> dict:
+        """All numbers, with the history. What a loaded fit has no truth for is as it was saved."""
+        numbers = measure(self)
+        if self.data is None and self._stored:
+            missing = {k: self._stored.get(k) for k, value in numbers.items() if value is None}
+            numbers |= _scalars(missing)
+        return numbers
+
+    @property
+    def record(self) -> dict:
+        """What metrics.json says of a loaded fit, or would say: `numbers`, method and settings, scan, software."""
+        return self._stored if self.data is None and self._stored else self.numbers | description(self)
+
+    def metrics(self, data: Dataset | None = None) -> dict[str, float | None]:
+        """PSNR and SSIM of held-out views and volume, IPSD, times; None without a truth to compare with.
+
+        The full scale of `psnr_2d`, `ssim_2d`, `psnr_3d` and `ssim_3d` is the largest true value. Those that end in `_r2` are
+        R2-Gaussian's, as published tables have them: views divided by their own maxima, and 1 for densities.
+
+        Parameters
+        ----------
+        data : Dataset, optional
+            What to compare with (default: what `lm.fit` received; of a loaded fit, the numbers as saved).
+        """
+        if data is not None:
+            require_type('data', data, Dataset, 'write lm.Dataset(scan, test, volume)')
+            return _scalars(measure(Fit(self.checkpoint, self.model, data)))
+        if self.data is None and self._stored is not None:
+            return _scalars(self._stored)
+        return _scalars(self.numbers)
+
+    # ---- files and pages ----
+
+    def save_volume(
+        self, path: str | PathLike, grid: Grid | None = None, *, slab: int = THICKNESS, force: bool = False
+    ) -> Path:
+        """Write `volume` slab by slab, so that it need not fit into memory.
+
+        Parameters
+        ----------
+        path : path
+            .nii, .nii.gz, or a new .ome.zarr; its folder is made.
+        grid : Grid, optional
+            Of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
+        slab : int
+            Slices that are in memory at once.
+        force : bool
+            Replace an earlier file.
+
+        Returns
+        -------
+        Path
+            Of the file.
+
+        Raises
+        ------
+        InputError
+            As `volume`, and if the file exists already or cannot be written.
+
+        Examples
+        --------
+        `fit.save_volume('foot.ome.zarr', lm.Grid(2048, 0.125))`
+        """
+        path, slab = as_path('path', path), whole_number('slab', slab, 1)
+        voxels = self._grid(grid)
+        with writing(path):
+            new_file(path, force)
+        write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
+        return path
+
+    def save(self, folder: str | PathLike, *, title: str = '', force: bool = False, record: dict | None = None) -> Path:
+        """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz.
+
+        Parameters
+        ----------
+        folder : path
+            Is made if it is missing.
+        title : str
+            Of the report (default: the folder's name).
+        force : bool
+            Replace an earlier result; other files in the folder are left alone.
+        record : dict, optional
+            Further entries of metrics.json, such as the `command` that makes the result again.
+
+        Returns
+        -------
+        Path
+            Of the folder.
+
+        Raises
+        ------
+        InputError
+            If the folder holds files already, cannot be written, or another process writes to it.
+        """
+        folder = as_path('folder', folder)
+        with writing(folder):
+            if folder.is_dir() and occupants(folder) and not force:
+                raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
+        self.numbers  # noqa: B018 - takes a while, and may fail: before anything is touched
+        with locked(folder), writing(folder):
+            clear_leftovers(folder)
+            require_ours(folder, result_names(self.method, len(self.view_angles)) | {CHECKPOINT})
+            self.checkpoint.save(folder / CHECKPOINT)
+            self.write(folder, title or folder.name, record)
+        return folder
+
+    def write(self, folder: Path, title: str, record: dict | None = None) -> None:
+        """`save` without the checkpoint, into an existing folder that this process has locked."""
+        write_fit(folder, self, self.numbers | (record or {}), lambda numbers: self.report(title, numbers))
+
+    def report(self, title: str = '', numbers: dict | None = None) -> ReportData:
+        """The contents of the report. numbers: to show in the place of `numbers`."""
+        test = None if self.data is None else self.data.test
+        angles = np.array(self.view_angles)
+        more: dict[str, Any] = {}
+        if self.views is not None:
+            truth = None if test is None else test.projections
+            views = self.views if test is None else comparable(self.views, test)
+            more = dict(views=views, views_truth=truth, views_angles=angles)
+        if self.method.makes_gaussians:
+            means, scales, quaternions, density = self.gaussians
+            more |= dict(cloud_centres=means, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions)
+        numbers, grid = self.numbers if numbers is None else numbers, self.nominal_geometry
+        has_volume = self.method.makes_volume
+        return ReportData(
+            title=title or self.method.name,
+            metrics=numbers if self.method.makes_gaussians else _without_gaussians(numbers),
+            volume=self.volume() if has_volume else None,
+            truth=self.data.volume if has_volume and self.data is not None else None,
+            shape=grid.grid.shape,
+            spacing=grid.grid.spacing,
+            centre=grid.grid.centre,
+            pixel=grid.dDetector,
+            scanner=self.geometry,
+            cloud_unit='density at the centre [1/mm]' if has_volume else 'opacity',
+            command=numbers.get('command', ''),
+            **more,
+        )
+
+    def view(self, *, title: str = '') -> Page:
+        """The interactive page of the fit: linked slices, held-out views, curves, the cloud in 3D, all numbers.
+
+        As the last line of a notebook's cell the `Page` shows itself there; elsewhere `page.open()` opens it in the browser, and
+        `page.save('foot.html')` writes it. It is the report.html of `save`, 1 to 30 MB.
+
+        Parameters
+        ----------
+        title : str
+            Of the page (default: the method's name).
+        """
+        return Page(report_page(self.report(title)))
+
+    def __repr__(self) -> str:
+        size = sum(v.size for v in self.state.values.values())
+        what = f'{len(self):,} Gaussians' if self.method.makes_gaussians else f'a field of {size:,} parameters'
+        return f'Fit({self.method.name}: {what} after {self.steps} iterations, {self.seconds:.0f} s)'
+
+    def _repr_html_(self) -> str:
+        geometry, parts = self.nominal_geometry, []
+        if self.method.makes_volume:
+            parts += [notebook.slices(self.volume(), geometry.grid.spacing, geometry.grid.centre), '<br>']
+        test = None if self.data is None else self.data.test
+        if self.views is not None and test is not None:
+            labels = [f'held-out view {i}, at {a:.1f}°' for i, a in enumerate(self.view_angles)]
+            for title, images in (('Rendered', self.views), ('Measured', test.projections)):
+                parts.append(notebook.frames(images, labels, title))
+        picture = overview(self.report(), headline(self.metrics()))
+        embedded = base64.b64encode(picture).decode('ascii')
+        parts.append(
+            f'<br><img alt="{html.escape(repr(self))}" style="max-width: 100%" src="data:image/png;base64,{embedded}">'
+        )
+        return notebook.box(f'{self!r}:  {headline(self.metrics())}', *parts)
+
+
+def load_fit(path: str | PathLike) -> Fit:
+    """A fit from the folder that `Fit.save` or the command line wrote, or from a checkpoint alone; see `Fit.load`."""
+    return Fit.load(path)
+
+
+def _effects_of(folder: Path | None, checkpoint: Path) -> Effects | None:
+    """The effects that a fit has modelled, which stand in the scene of its folder."""
+    scene = None if folder is None else folder / SCENE
+    if scene is None or not scene.exists():
+        raise InputError(
+            f'{checkpoint}: the fit has modelled effects of its scan, which a checkpoint does not hold: load the folder of its '
+            f'result, whose {SCENE} has them'
+        )
+    loaded = load_scene(scene)
+    return find_effects(loaded.scene, loaded.scanner)
+
+
+def _scalars(numbers: dict) -> dict[str, float | None]:
+    return {name: value for name, value in numbers.items() if value is None or isinstance(value, int | float)}
+
+
+def _without_gaussians(numbers: dict) -> dict:
+    """Numbers of a neural field without those that only a cloud has, as a report shows them."""
+    of_clouds = {'ipsd', 'ipsd_targets', 'ipsd_reverse', 'gaussians'}
+    history = [{k: v for k, v in entry.items() if k not in of_clouds} for entry in numbers['history']]
+    return {k: v for k, v in numbers.items() if k not in of_clouds} | dict(history=history)

@@ -1,0 +1,56 @@
+"""This package's own recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from lingo_mi.fitting.methods.densities import DensityMethod
+from lingo_mi.fitting.options.densification import Densify, Halve
+from lingo_mi.fitting.options.loss import Loss
+from lingo_mi.fitting.options.rates import DensityRates
+from lingo_mi.fitting.options.stopping import Stopping
+from lingo_mi.fitting.start.edges import EdgeStart
+from lingo_mi.fitting.start.start import Start
+
+
+@dataclass(frozen=True)
+class Fast(DensityMethod):
+    """600 steps in the place of 30,000, tuned on the foot and chest phantoms and the engine.
+
+    What differs from R2-Gaussian: a start on the edges of a quick reconstruction; no factor on the loss, and the gradient of the
+    difference beside L1, which restores fine detail sooner; rates 3 to 40 times higher that fall over the run; views in a row
+    that lie well apart; Nesterov's momentum, a shorter memory of the second moment, and a mean of the last steps; more weight on
+    SSIM; total variation of eight times the volume (with a short memory, each Gaussian must be smoothed more often than once in
+    64 steps), less for more views; early densification, limited by the scan's size; an early stop if the noise is known.
+
+    The options are those of `DensityMethod`.
+
+    Examples
+    --------
+    >>> Fast(iterations=300).densify.name
+    'halve'
+    """
+
+    name: ClassVar = 'fast'
+
+    iterations: int = 600
+    view_order: str = 'golden'
+    stopping: Stopping = Stopping(stop='auto')
+    rates: DensityRates = DensityRates(
+        decay_steps=0,
+        beta1=0.96,
+        beta2=0.97,
+        nesterov=True,
+        average=0.97,
+        rate_centre=(2e-3, 7e-5),
+        rate_density=(2e-1, 6e-3),
+        rate_scale=(2e-1, 5e-3),
+        rate_rotation=(2e-2, 1e-3),
+    )
+    start: Start = EdgeStart()
+    loss: Loss = Loss(lambda_ssim=1.0, lambda_gradient=3.0, lambda_tv=0.4, tv_stride=2, tv_views=25)
+    densify: Densify = Halve(
+        densify_from=50, densify_until=300, densify_every=25, densify_threshold=1e-4, values_per_gaussian=14.0
+    )
+    normalise: bool = True

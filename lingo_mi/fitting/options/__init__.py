@@ -1,0 +1,1 @@
+"""The parts of a method: frozen dataclasses of options, each with its sources."""

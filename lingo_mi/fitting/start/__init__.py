@@ -1,0 +1,1 @@
+"""Where the Gaussians of a fit start: kinds of `start.Start`, a file each."""

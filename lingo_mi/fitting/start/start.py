@@ -1,0 +1,99 @@
+"""The interface of all starts, and the cloud that one makes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from lingo_mi.fitting.options.part import Part
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.scan import Scan
+
+# render(points, density, spacing, views): projections, normalised, [len(views), v, u] of isotropic Gaussians in these views.
+Render = Callable[[np.ndarray, np.ndarray, np.ndarray, Any], np.ndarray]
+
+
+@dataclass(frozen=True)
+class StartingCloud:
+    """The Gaussians that a fit starts from, in the normalised frame.
+
+    Parameters
+    ----------
+    points : ndarray
+        Centres, float64 [N, 3].
+    density : ndarray or None
+        Values at the centres, 1/mm, float64 [N]; None for Gaussians with opacities.
+    spacing : ndarray
+        Standard deviations, float64 [N].
+    info : dict
+        What the start has measured: numbers and texts.
+    """
+
+    points: np.ndarray
+    density: np.ndarray | None
+    spacing: np.ndarray
+    info: dict = field(default_factory=dict, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Start(Part, ABC):
+    """Where the Gaussians of a fit start.
+
+    Attributes
+    ----------
+    densities : bool
+        Whether the cloud has densities; without, only methods with opacities can start from it.
+    """
+
+    densities: ClassVar[bool] = True
+
+    @abstractmethod
+    def cloud(self, scan: Scan, rng: np.random.Generator, render: Render, unit: float) -> StartingCloud:
+        """The cloud for a scan.
+
+        Parameters
+        ----------
+        scan : Scan
+            Line integrals.
+        rng : Generator
+            Of all random choices.
+        render : callable
+            Renders a cloud of isotropic Gaussians; see `Render`.
+        unit : float
+            The density that the fit counts as 1, in 1/mm.
+
+        Raises
+        ------
+        InputError
+            If the scan gives no cloud.
+        """
+
+    def count(self, geometry: Geometry) -> int:
+        """The largest number of Gaussians, to ask for memory before the work; 0 if the start asks by itself."""
+        return 0
+
+    def limited(self, most: int) -> Start:
+        """The same with at most so many Gaussians, if their number is an option."""
+        return self
+
+
+def neighbour_distance(points: ArrayLike, fallback: float) -> np.ndarray:
+    """Root mean square distance to the three nearest neighbours, [N] (R2-Gaussian's starting scale).
+
+    With fewer than four points, all others are neighbours. A single point gets `fallback`.
+    """
+    points = np.asarray(points, float)
+    k = min(4, len(points))
+    if k < 2:
+        return np.full(len(points), float(fallback))
+    distance = KDTree(points).query(points, k, workers=-1)[0][:, 1:]
+    return np.sqrt(np.mean(distance**2, 1))

@@ -1,0 +1,83 @@
+"""What the constructors of `Geometry` do: they choose the kind of scan that the numbers make."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lingo_mi.common.errors import InputError, shown
+from lingo_mi.geometry import limits
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.circle import CircularGeometry, circle_of, require_mode
+from lingo_mi.geometry.grid import Grid, Voxels, grid_of
+from lingo_mi.geometry.posed import PosedGeometry
+from lingo_mi.geometry.rays import Rays
+from lingo_mi.geometry.trajectories import helix, scanner_rays
+
+
+def placed(mode: str, scan: dict[str, Any], pitch: float = 0.0) -> Geometry:
+    """The circle of the numbers `scan`, or what its motion makes of it if any of that is not zero."""
+    motion = _taken(scan, ('rotDetector', 'COR', 'height', 'tilt'))
+    circle = CircularGeometry(mode=mode, grid=grid_of(_taken(scan, Voxels.__annotations__)), **scan)
+    _warn_of_degrees(circle.angles)
+    if pitch:
+        climb, height = helix(circle.angles, pitch), limits.lengths('height', motion.get('height', 0.0))
+        if height.shape not in ((), climb.shape):
+            raise InputError(f'height must be one number, or one for each of {len(climb)} views, not {shown(height)}')
+        motion['height'] = climb + height
+    if not any(np.any(limits.numbers(name, value)) for name, value in motion.items()):
+        return circle
+    if 'rotDetector' in motion:
+        motion['rotDetector'] = limits.vector('rotDetector', motion['rotDetector'], 3)
+    return Geometry.per_view(**circle.numbers(), **motion)
+
+
+def per_view(
+    mode: str, DSO: ArrayLike, DSD: ArrayLike, nDetector: ArrayLike, dDetector: ArrayLike, views: dict[str, Any]
+) -> Geometry:
+    """The scan of `Geometry.per_view`."""
+    require_mode(mode)
+    voxels = _taken(views, Voxels.__annotations__)
+    nDetector, dDetector = limits.counts('nDetector', nDetector, 2), limits.sizes('dDetector', dDetector, 2)
+    DSO, DSD = limits.lengths('DSO', DSO), limits.lengths('DSD', DSD)
+    origin = limits.lengths('offOrigin', voxels.get('offOrigin', 0.0))
+    rays = scanner_rays(
+        DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, parallel=mode == 'parallel', **views
+    )
+    if mode == 'cone' and not (np.all(DSO > 0) and np.all(DSD >= DSO)):
+        raise InputError('a cone beam needs DSD >= DSO > 0 in every view (both are distances from the source, in mm)')
+    if origin.ndim == 2:
+        if origin.shape != (len(rays), 3):
+            raise InputError(
+                f'offOrigin must be 3 numbers, or that for each of {len(rays)} views, not an array of shape {origin.shape}'
+            )
+        voxels['offOrigin'] = origin.mean(0)
+        rays = rays.moved(shift=voxels['offOrigin'] - origin)
+    return from_poses(rays, nDetector, grid_of(voxels))
+
+
+def from_poses(rays: Rays, nDetector: Any, grid: Grid) -> Geometry:
+    """The scan of `Geometry.from_poses`."""
+    posed = PosedGeometry(poses=rays, nDetector=nDetector, grid=grid)
+    circle = circle_of(posed.poses, posed.nDetector)
+    if circle is None:
+        return posed
+    return CircularGeometry(mode=posed.mode, nDetector=posed.nDetector, grid=grid, **circle)
+
+
+def _taken(numbers: dict[str, Any], names) -> dict[str, Any]:
+    """The numbers of these names, which are removed from `numbers`."""
+    return {name: numbers.pop(name) for name in names if name in numbers}
+
+
+def _warn_of_degrees(angles: np.ndarray) -> None:
+    """Warn, in the name of the caller's caller's caller, if angles in radians look like degrees."""
+    if np.ptp(angles) > 8 * np.pi and not np.any(angles % 1):
+        warnings.warn(
+            f'angles are radians, but these are whole numbers from {angles.min():g} to {angles.max():g}: '
+            'if they are degrees, give numpy.radians(angles)',
+            stacklevel=4,
+        )

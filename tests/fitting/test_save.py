@@ -1,0 +1,70 @@
+"""What a fit writes when nothing is known but its checkpoint."""
+
+import json
+from dataclasses import replace
+
+import nibabel
+import numpy as np
+import pytest
+
+from helpers.fits import SHORT, geometry, tiny_scan
+from lingo_mi.common.errors import InputError
+from lingo_mi.fitting.checkpoint import Checkpoint
+from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.loop import run
+from lingo_mi.fitting.measure import summary
+from lingo_mi.scan import Dataset
+
+
+@pytest.fixture(scope='module')
+def checkpoint(tmp_path_factory):
+    scan, path = tiny_scan(geometry()), tmp_path_factory.mktemp('fit') / 'checkpoint.npz'
+    run(scan, SHORT.changed(iterations=3), seed=3, path=path)
+    return path
+
+
+def test_a_result_without_a_scan(checkpoint, tmp_path):
+    fit = Fit.load(checkpoint)
+    found = json.loads((fit.save(tmp_path / 'out') / 'metrics.json').read_text())
+    assert Fit.load(tmp_path / 'out').record == found
+    assert found['psnr_2d'] is None and found['psnr_3d'] is None and found['test_angles'] == []
+    assert (found['seed'], found['views'], found['settings']['lambda_tv']) == (3, 3, SHORT.loss.lambda_tv)
+    np.testing.assert_allclose(nibabel.load(tmp_path / 'out' / 'volume.nii.gz').get_fdata(), fit.volume(), rtol=1e-6)
+    assert (tmp_path / 'out' / 'result.xml').exists() and not (tmp_path / 'out' / 'views').exists()
+    assert 'n/a' in summary(found)
+
+
+@pytest.mark.parametrize(
+    'effects, arrays, message',
+    [
+        (True, {}, 'has modelled effects of its scan, which a checkpoint does not hold'),
+        (False, dict(share=np.zeros(60, np.float32)), 'array.share.*does not belong there'),
+        (False, dict(scattered=np.zeros((2, 3, 4, 4))), 'array.scattered.*does not belong there'),
+    ],
+)
+def test_effects_that_a_checkpoint_does_not_hold(checkpoint, tmp_path, effects, arrays, message):
+    stored = Checkpoint.load(checkpoint)
+    replace(stored, effects=effects, arrays=stored.arrays | arrays).save(tmp_path / 'fit.npz')
+    with pytest.raises(InputError, match=message):
+        Fit.load(tmp_path / 'fit.npz')
+
+
+def compared(checkpoint):
+    """The fit, to be compared with two views and its volume."""
+    fit = Fit.load(checkpoint)
+    fit.data = Dataset(tiny_scan(geometry()), tiny_scan(geometry(2)), fit.volume())
+    return fit
+
+
+def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
+    numbers = compared(checkpoint).numbers
+    assert f'PSNR {numbers["psnr_2d"]:.2f} dB, SSIM {numbers["ssim_2d"]:.4f}' in summary(numbers)
+    assert numbers['ssim_2d'] != numbers['ssim_2d_r2']
+
+
+def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path):
+    folder = compared(checkpoint).save(tmp_path / 'out', title='itself', record=dict(command='fit'))
+    found = json.loads((folder / 'metrics.json').read_text())
+    assert found['ssim_3d'] == pytest.approx(1) and found['psnr_2d'] > 0 and len(found['test_angles']) == 2
+    assert (found['method'], found['command']) == ('r2', 'fit')
+    assert sorted(p.name for p in (folder / 'views').iterdir()) == ['0000.exr', '0001.exr']
