@@ -39,7 +39,7 @@ def fit(
     progress: bool | Callable[..., None] = True,
     live: bool = False,
     log_dir: str | PathLike | None = None,
-    record: dict | None = None,
+    note: dict | None = None,
     **options: Any,
 ) -> Fit:
     """Fit a cloud of 3D Gaussians, or a neural field, to a scan.
@@ -69,7 +69,7 @@ def fit(
         Serve a page that grows while the fit runs, to this machine alone. Its address is printed; a notebook shows the page.
     log_dir : path, optional
         A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
-    record : dict, optional
+    note : dict, optional
         Further entries of metrics.json in the folder.
     options
         Any option of the method by its flat name, such as iterations=800, n_points=20_000 or lambda_tv=0.1.
@@ -120,16 +120,15 @@ def fit(
                 check()
 
             def measure(fit: Fit) -> dict:
-                fit.data = few
+                fit = fit.with_data(few)
                 numbers = quick_measure(fit)
                 watch.look(fit, numbers)
                 return numbers
 
             result = run(dataset.train, chosen, seed, measure=measure, progress=between, path=checkpoint, resume=resume)
-        result.data = dataset
+        result = result.with_data(dataset)
         if path is not None:
-            result.write(path, label, record)
-            result.folder = path
+            result.write(path, label, note)
     return result
 
 

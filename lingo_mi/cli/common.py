@@ -166,7 +166,7 @@ def check_input(args: argparse.Namespace) -> None:
     if scene.suffix.lower() != '.xml' and args.scene not in scenes() and scene.exists():
         if args.projections or args.volume:
             raise InputError(
-                f'{args.scene}: is no scene, which --projections and --volume go with; leave one of them out'
+                f'{args.scene}: is not a scene, which --projections and --volume go with; leave one of them out'
             )
         args.projections, args.scene = args.scene, SCANNER
     for name in ('projections', 'volume', 'complete', 'start'):
@@ -327,24 +327,6 @@ def definitions(pairs: Iterable[str]) -> dict[str, str]:
             raise InputError(f'-D {pair}: write it as name=value')
         out[name] = value
     return out
-
-
-def writable_file(path: Path, force: bool) -> Path:
-    """The output file, whose folder can be made and written to, or an error that refuses to spoil one.
-
-    Leaves nothing behind.
-
-    force   whether an earlier file may be replaced
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f'{path}: is a folder; choose another --out')
-    if path.is_symlink():
-        raise InputError(f'{path}: is a link, which is not written to; choose another --out')
-    if path.exists() and not force:
-        raise InputError(f'{path}: exists already; add --force to replace it, or choose another --out')
-    require_writable(path.parent, path, 'choose another --out')
-    return path
 
 
 @contextmanager

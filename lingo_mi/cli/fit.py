@@ -30,7 +30,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import nearest
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.fitting.method import Method
-from lingo_mi.fitting.methods.by_name import method_of
+from lingo_mi.fitting.methods.by_name import known_options, method_of
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.folder_lock import locked
 from lingo_mi.storage.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, result_folder
@@ -99,18 +99,15 @@ def method_of_arguments(args: argparse.Namespace, given: dict[str, str], of_scen
     options = {k: v for k, v in (('iterations', args.iterations), ('start', args.start)) if v is not None}
     if twice := given.keys() & options.keys():
         raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
-    known = method_of(args.method).flat()
-    if unknown := [k for k in given if k not in known]:
-        try:
-            return method_of(args.method, **options, **given)  # a kind of start may know it
-        except InputError:
-            names = ', '.join(sorted(of_scene)) or 'it has none'
-            near = nearest(unknown[0], [*of_scene, *known])
-            raise InputError(
-                f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor an option of {args.method}'
-                + (near or '; the documentation of the methods lists those')
-            ) from None
-    return method_of(args.method, **options, **given)
+    options |= given
+    known = known_options(args.method, options)
+    if unknown := [name for name in given if name not in known]:
+        names = ', '.join(sorted(of_scene)) or 'it has none'
+        raise InputError(
+            f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor an option of {args.method}'
+            + (nearest(unknown[0], [*of_scene, *known]) or '; the documentation of the methods lists those')
+        )
+    return method_of(args.method, **options)
 
 
 def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters: dict[str, str]) -> None:
@@ -136,7 +133,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
             title=Path(args.volume or args.projections or scene.name).name,
             live=args.live,
             log_dir=args.log_dir,
-            record=dict(command=command_line(without=('--resume', '--force'))),
+            note=dict(command=command_line(without=('--resume', '--force'))),
         )
     except KeyboardInterrupt:
         begun = (folder / CHECKPOINT).exists()

@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lingo_mi.cli.common import Parser, writable_file
+from lingo_mi.cli.common import Parser
 from lingo_mi.common.errors import InputError
+from lingo_mi.storage.file_access import check_new_file
 
 if TYPE_CHECKING:
     from lingo_mi.scan import Scan
@@ -28,7 +29,7 @@ def main() -> None:
     out = args.out or Path(Path(args.scan).stem + '.png')
     if out.suffix.lower() != '.png':
         raise InputError(f'{out}: the picture is a PNG; give an --out that ends in .png')
-    writable_file(out, args.force)
+    check_new_file(out, args.force)
     from lingo_mi.cli.findings_text import advice, facts
     from lingo_mi.files.scans import read_scan
     from lingo_mi.inspection.measure import measure

@@ -43,7 +43,6 @@ from lingo_mi.cli.common import (
     input_arguments,
     input_name,
     read_input,
-    writable_file,
 )
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import parse
@@ -62,7 +61,7 @@ from lingo_mi.report.page import report_page
 from lingo_mi.report.view import Page
 from lingo_mi.scene.load import defaults, load_scene
 from lingo_mi.scene.shipped import scene_path
-from lingo_mi.storage.file_access import require_writable
+from lingo_mi.storage.file_access import check_new_file, require_writable
 from lingo_mi.storage.folder_lock import writing_file
 
 IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'voxelize'  # those that need not hold the whole volume
@@ -156,7 +155,7 @@ def check_output(out: Path, args: argparse.Namespace) -> None:
     """Raises InputError if a file cannot be written, or would spoil one."""
     check_volume_name(out)
     for path in (out, *(plan_and_error_map(out) if args.algorithm == 'best' else ())):
-        writable_file(path, args.force)
+        check_new_file(path, args.force)
     if (page := args.report) is None:
         return
     if page.suffix.lower() not in ('.html', '.htm'):

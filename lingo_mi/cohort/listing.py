@@ -15,7 +15,7 @@ from lingo_mi.cohort.row import COLUMNS, Row, scene_of
 from lingo_mi.common.errors import InputError, printable, shown
 from lingo_mi.common.parsing import MOST_SEED, nearest
 from lingo_mi.files.scans import load_yaml, reader_of
-from lingo_mi.fitting.methods.by_name import method_of
+from lingo_mi.fitting.methods.by_name import known_options
 from lingo_mi.scene.load import defaults
 from lingo_mi.storage.file_access import reading
 
@@ -52,7 +52,7 @@ def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
     header, records = _records(path)
     rows, bad, names = [], [], {}
     for line, cells in records:
-        where = f'{path}, line {line}'
+        where = f'{path.name}, line {line}'  # the path stands once, in the last line
         try:
             if len(cells) != len(header):
                 raise InputError(f'has {len(cells)} cells, but the header has {len(header)}')
@@ -122,8 +122,7 @@ def _row(cells: dict[str, str], line: int, folder: Path, method: str) -> Row:
     of_scene = _parameters(scene) if scene else frozenset()
     method = own.get('method', method)
     settings = {name: text for name, text in given.items() if name not in of_scene}
-    known = method_of(method).flat()
-    known |= method_of(method, **{k: v for k, v in settings.items() if k in known}).flat()  # start=masks has its own
+    known = known_options(method, settings)
     for name in settings:
         if name not in known:
             raise InputError(
@@ -151,7 +150,7 @@ def _check(row: Row) -> None:
     name = row.name
     if not _NAME.fullmatch(name) or _DEVICES.fullmatch(name) or len(name.encode()) > MOST_NAME:
         raise InputError(
-            f'{shown(name)} is no name of a folder: use letters, digits, spaces and _.+,=@()-, at most {MOST_NAME} bytes, '
+            f'{shown(name)} is not a name of a folder: use letters, digits, spaces and _.+,=@()-, at most {MOST_NAME} bytes, '
             'in a column name'
         )
     if name.casefold() in RESERVED:

@@ -29,7 +29,7 @@ class Table:
         if path.is_symlink() or path.exists():
             with reading(path), open(path, encoding='utf-8', errors='replace') as file:
                 if path.is_symlink() or not file.readline().startswith(','.join(FIRST)):
-                    raise InputError(f'{path}: is no table of a batch; move it away, or choose another folder')
+                    raise InputError(f'{path}: is not a table of a batch; move it away, or choose another folder')
         for other in (out / PARQUET, out / LOG):
             if other.is_symlink() or other.exists() and not (path.exists() and other.is_file()):
                 raise InputError(f'{other}: is not that of a batch; move it away, or choose another folder')

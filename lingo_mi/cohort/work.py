@@ -41,7 +41,7 @@ def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
         force=True,
         title=row.name,
         progress=report,
-        record=dict(request=row.request()),
+        note=dict(request=row.request()),
     ).record
 
 

@@ -37,7 +37,7 @@ def prepare_completed(scan: Scan, fit: Fit, views: int, algorithm: Algorithm) ->
     scan   holds the views that the fit has seen
 
     `Refined` gets the measured views and, in addition, the completed ones and the fit's densities. Any other algorithm gets
-    the completed views. Raises InputError as `fitted_views`, `require_rays` and `complete` do, and for FDK if the fit has
+    the completed views. Raises InputError as `fitted_views`, `require_rays` and `complete_views` do, and for FDK if the fit has
     corrected the poses. Whether there is memory for the algorithm is not checked.
     """
     if isinstance(algorithm, Refined):

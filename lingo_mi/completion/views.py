@@ -9,6 +9,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.methods.cloud_method import CloudMethod
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.reconstruction.arcs import gaps
@@ -84,9 +85,9 @@ def without_effects(scan: Scan, fit: Fit) -> Scan:
     response, effects, cloud = fit.model.response, fit.model.effects, fit.cloud()
     if response is not None:
         scan = replace(scan, projections=response.undone(scan.projections, fit.nominal_geometry))
-    if effects is None or cloud is None:
+    if effects is None or cloud is None or not isinstance(fit.method, CloudMethod):
         return scan if scan.effects is None else replace(scan, effects=None)
-    return corrected(scan, effects.of_cloud(), [cloud], fit.method.flat()['extent'])
+    return corrected(scan, effects.of_cloud(), [cloud], fit.method.extent)
 
 
 def complete_views(scan: Scan, fit: Fit, views: int) -> Scan:

@@ -46,7 +46,7 @@ def read_poses(
         values = _table(path)
     else:
         raise InputError(
-            f"{path}: is no known file of poses; give RTK's .xml, or a .npy, .txt or .csv of 12 numbers a view"
+            f"{path}: is not a known file of poses; give RTK's .xml, or a .npy, .txt or .csv of 12 numbers a view"
         )
     try:
         if values.ndim == 3 and values.shape[1:] == (3, 4):
@@ -71,4 +71,4 @@ def _table(path):
     except InputError:
         raise
     except (ValueError, MemoryError) as error:  # also for rows of different lengths, and for bytes that are not text
-        raise InputError(f'{path}: is no table of 12 numbers a view ({one_line(error)})') from None
+        raise InputError(f'{path}: is not a table of 12 numbers a view ({one_line(error)})') from None

@@ -35,7 +35,7 @@ def read_public_scan(path: PathLike | str, name: str = 'ta') -> Dataset:
     if data.keys() >= _WALNUT:
         return _walnut(path, data)
     raise InputError(
-        f'{path}: is no scan of the Helsinki Tomography Challenge (sinogram_<name>, {", ".join(sorted(_HTC))}), nor the '
+        f'{path}: is not a scan of the Helsinki Tomography Challenge (sinogram_<name>, {", ".join(sorted(_HTC))}), nor the '
         f'walnut ({", ".join(sorted(_WALNUT))}), the only .npz scans that can be read; give .npy with a .yml beside it'
     )
 

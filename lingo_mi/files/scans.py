@@ -398,7 +398,7 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
         return partial(_read_npy, path, geometry_file_of(path, geometry))
     if suffix == '.npz':
         return partial(public_scans.read_public_scan, path, name)
-    raise InputError(f'{path}: is no known scan format; give .pickle, .npy, .npz, or a folder of a scan')
+    raise InputError(f'{path}: is not a known scan format; give .pickle, .npy, .npz, or a folder of a scan')
 
 
 _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy}
@@ -421,7 +421,7 @@ def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history
     format cannot hold the data.
     """
     if kind not in _WRITERS:
-        raise InputError(f'{kind!r} is no kind of scan file; choose one of {", ".join(_WRITERS)}')
+        raise InputError(f'{kind!r} is not a kind of scan file; choose one of {", ".join(_WRITERS)}')
     dataset = Dataset(dataset) if isinstance(dataset, Scan) else dataset
     masked = any(scan is not None and scan.valid is not None for scan in (dataset.train, dataset.test))
     if masked and kind != 'npy':

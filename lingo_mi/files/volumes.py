@@ -216,7 +216,7 @@ def read_volume(
         with reading(path):
             open(path, 'rb').close()
         raise InputError(
-            f'{path}: is no known volume format; give .nii.gz, .nrrd, .mhd, .npy, .tif, a '
+            f'{path}: is not a known volume format; give .nii.gz, .nrrd, .mhd, .npy, .tif, a '
             'folder of slices, or shape and dtype of raw bytes'
         )
     data = numeric(data, path, 3)

@@ -66,7 +66,7 @@ def read_voxels(
     start     bytes before it; -1: it is the file's end
     packing   None, 'deflate' (zlib's or gzip's) or 'bzip2'
 
-    Raises InputError where the file cannot hold what is asked for, is damaged or is no regular file.
+    Raises InputError where the file cannot hold what is asked for, is damaged or is not a regular file.
     """
     dtype = np.dtype(dtype)
     with reading(path):

@@ -163,7 +163,7 @@ def _read(path: PathLike | str) -> dict[str, np.ndarray]:
     taken."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
-        raise InputError('it is no regular file')
+        raise InputError('it is not a regular file')
     with open(path, 'rb') as file, zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
         if any(e.compress_type for e in entries) or sum(e.file_size for e in entries) > status.st_size:
@@ -201,7 +201,7 @@ def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
     try:
         shape, columns_first, kind = read[np.lib.format.read_magic(header)](header)
     except (KeyError, MemoryError, SyntaxError, TypeError, ValueError, tokenize.TokenError):  # an expression
-        raise InputError('an entry is no array') from None
+        raise InputError('an entry is not an array') from None
     count, begin = math.prod(shape), header.tell()
     if kind.hasobject or any(n < 0 for n in shape) or count * kind.itemsize != len(content) - begin:
         raise InputError('an entry claims another size than it has')

@@ -96,6 +96,10 @@ class Fit(FittedModel):
         fit._stored  # noqa: B018 - damaged numbers are an error here, not later
         return fit
 
+    def with_data(self, data: Dataset | None) -> Fit:
+        """The same fit beside other held-out views, or another true volume."""
+        return Fit(self.checkpoint, self.model, data)
+
     # ---- numbers ----
 
     @cached_property
@@ -125,7 +129,7 @@ class Fit(FittedModel):
         """
         if data is not None:
             require_type('data', data, Dataset, 'write lm.Dataset(scan, test, volume)')
-            return _scalars(measure(Fit(self.checkpoint, self.model, data)))
+            return _scalars(measure(self.with_data(data)))
         if self.data is None and self._stored is not None:
             return _scalars(self._stored)
         return _scalars(self.numbers)
@@ -169,7 +173,7 @@ class Fit(FittedModel):
         write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
         return path
 
-    def save(self, folder: str | PathLike, *, title: str = '', force: bool = False, record: dict | None = None) -> Path:
+    def save(self, folder: str | PathLike, *, title: str = '', force: bool = False, note: dict | None = None) -> Path:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz.
 
         Parameters
@@ -180,7 +184,7 @@ class Fit(FittedModel):
             Of the report (default: the folder's name).
         force : bool
             Replace an earlier result; other files in the folder are left alone.
-        record : dict, optional
+        note : dict, optional
             Further entries of metrics.json, such as the `command` that makes the result again.
 
         Returns
@@ -202,12 +206,12 @@ class Fit(FittedModel):
             clear_leftovers(folder)
             require_ours(folder, result_names(self.method, len(self.view_angles)) | {CHECKPOINT})
             self.checkpoint.save(folder / CHECKPOINT)
-            self.write(folder, title or folder.name, record)
+            self.write(folder, title or folder.name, note)
         return folder
 
-    def write(self, folder: Path, title: str, record: dict | None = None) -> None:
+    def write(self, folder: Path, title: str, note: dict | None = None) -> None:
         """`save` without the checkpoint, into an existing folder that this process has locked."""
-        write_fit(folder, self, self.numbers | (record or {}), lambda numbers: self.report(title, numbers))
+        write_fit(folder, self, self.numbers | (note or {}), lambda numbers: self.report(title, numbers))
 
     def report(self, title: str = '', numbers: dict | None = None) -> ReportData:
         """The contents of the report. numbers: to show in the place of `numbers`."""
@@ -221,17 +225,17 @@ class Fit(FittedModel):
         if self.method.makes_gaussians:
             means, scales, quaternions, density = self.gaussians
             more |= dict(cloud_centres=means, cloud_density=density, cloud_scales=scales, cloud_quaternions=quaternions)
-        numbers, grid = self.numbers if numbers is None else numbers, self.nominal_geometry
-        has_volume = self.method.makes_volume
+        numbers = self.numbers if numbers is None else numbers
+        scanner, has_volume = self.nominal_geometry, self.method.makes_volume
         return ReportData(
             title=title or self.method.name,
             metrics=numbers if self.method.makes_gaussians else _without_gaussians(numbers),
-            volume=self.volume() if has_volume else None,
+            volume=self.own_volume if has_volume else None,
             truth=self.data.volume if has_volume and self.data is not None else None,
-            shape=grid.grid.shape,
-            spacing=grid.grid.spacing,
-            centre=grid.grid.centre,
-            pixel=grid.dDetector,
+            shape=scanner.grid.shape,
+            spacing=scanner.grid.spacing,
+            centre=scanner.grid.centre,
+            pixel=scanner.dDetector,
             scanner=self.geometry,
             cloud_unit='density at the centre [1/mm]' if has_volume else 'opacity',
             command=numbers.get('command', ''),
@@ -259,7 +263,7 @@ class Fit(FittedModel):
     def _repr_html_(self) -> str:
         geometry, parts = self.nominal_geometry, []
         if self.method.makes_volume:
-            parts += [notebook.slices(self.volume(), geometry.grid.spacing, geometry.grid.centre), '<br>']
+            parts += [notebook.slices(self.own_volume, geometry.grid.spacing, geometry.grid.centre), '<br>']
         test = None if self.data is None else self.data.test
         if self.views is not None and test is not None:
             labels = [f'held-out view {i}, at {a:.1f}°' for i, a in enumerate(self.view_angles)]

@@ -153,11 +153,12 @@ class FittedModel:
         InputError
             For `GaussianSplatting` and `XGaussian`, whose opacities are not densities.
         """
-        return self._volume if grid is None else self.model.volume(self._device, self._grid(grid))
+        return self.model.volume(self._device, None if grid is None else self._grid(grid))
 
     @cached_property
-    def _volume(self) -> np.ndarray:
-        return self.model.volume(self._device)
+    def own_volume(self) -> np.ndarray:
+        """`volume` on the scan's grid, computed once, for all that measures, shows and saves it: not to be written to."""
+        return self.volume()
 
     @one_at_a_time()
     def cloud(self) -> Ellipsoids | None:

@@ -17,7 +17,7 @@ def measure(fit: FittedModel) -> dict:
     """All numbers of a fit: quality of the held-out views and of the volume, None without a truth; IPSD; times; the history."""
     data, views = fit.data, fit.views
     test = None if data is None else data.test
-    volume = fit.volume() if fit.method.makes_volume else None
+    volume = fit.own_volume if fit.method.makes_volume else None
     truth = None if data is None else data.volume
     expected = rendered = None
     if test is not None and views is not None:
@@ -53,8 +53,8 @@ def quick_measure(fit: FittedModel) -> dict:
     if data is not None and data.test is not None and fit.views is not None:
         numbers['psnr_2d'] = _number(metrics.psnr_2d(comparable(fit.views, data.test), data.test.projections))
     if data is not None and data.volume is not None and fit.method.makes_volume:
-        numbers['psnr_3d'] = _number(metrics.psnr_3d(fit.volume(), data.volume))
-        numbers['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(fit.volume(), data.volume))
+        numbers['psnr_3d'] = _number(metrics.psnr_3d(fit.own_volume, data.volume))
+        numbers['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(fit.own_volume, data.volume))
     return numbers
 
 

@@ -18,6 +18,7 @@ from lingo_mi.files.ply import write_ply, write_radiance_ply
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.fitting.method import Method
+from lingo_mi.fitting.methods.cloud_method import CloudMethod
 from lingo_mi.fitting.models.alpha import harmonics
 from lingo_mi.fitting.scene_file import write_scene
 from lingo_mi.report.data import ReportData
@@ -69,10 +70,11 @@ def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[d
     names |= {CHECKPOINT}
     remove_others(folder, names)
     if method.makes_volume:
-        write_volume(folder / VOLUME, fit.volume(), geometry.grid, 'density per mm')
+        write_volume(folder / VOLUME, fit.own_volume, geometry.grid, 'density per mm')
         if method.makes_gaussians:
             write_ply(folder / CLOUD, *fit.gaussians, fit.shares())
-        write_scene(folder / SCENE, fit.geometry, getattr(method, 'extent', None), fit.model.effects)
+        extent = method.extent if isinstance(method, CloudMethod) else None
+        write_scene(folder / SCENE, fit.geometry, extent, fit.model.effects)
     else:
         write_radiance_ply(folder / CLOUD, *fit.gaussians, *harmonics(fit.state.values))
     if fit.views is not None:

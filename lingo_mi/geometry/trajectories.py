@@ -108,7 +108,7 @@ def scanner_rays(
     """
     moves: dict[str, Any] = dict(offDetector=(0, 0), rotDetector=(0, 0, 0), COR=0, height=0, tilt=0)
     for name in motion.keys() - moves.keys():
-        raise TypeError(f'{name!r} is no number of a scanner; what moves one is {", ".join(moves)}')
+        raise TypeError(f'{name!r} is not a number of a scanner; what moves one is {", ".join(moves)}')
     moves |= motion
     angles = np.atleast_1d(limits.angles('angles', angles))
     n = len(angles)

@@ -156,7 +156,7 @@ def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """
     name = shape.id()
     if not shape.is_mesh():
-        raise InputError(f'the shape {name!r} is no triangle mesh: use a ply, obj or cube shape, for example')
+        raise InputError(f'the shape {name!r} is not a triangle mesh: use a ply, obj or cube shape, for example')
     parameters = mi.traverse(shape)
     vertices, faces = (np.array(parameters[key]).reshape(-1, 3) for key in ('vertex_positions', 'faces'))
     return MeshPaths(vertices, faces, name)

@@ -181,7 +181,9 @@ class HomogeneousMesh:
 
         self.name = shape.id()
         if not shape.is_mesh():
-            raise InputError(f'the shape {shape.id()!r} has a homogeneous medium, but is no mesh: use ply, obj or cube')
+            raise InputError(
+                f'the shape {shape.id()!r} has a homogeneous medium, but is not a mesh: use ply, obj or cube'
+            )
         params: Any = mi.traverse(medium)
         self.sigma = next(
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')

@@ -56,7 +56,7 @@ def geometry_of(
             raise InputError('angles must be a list of numbers, in degrees, or the name of a file of them') from None
     if angles is not None and not np.isfinite(angles).all():
         raise InputError(
-            f'{frames.where}: angle {int(np.argmin(np.isfinite(angles)))} is no finite number; give angles=FILE'
+            f'{frames.where}: angle {int(np.argmin(np.isfinite(angles)))} is not a finite number; give angles=FILE'
         )
     if angles is not None and len(angles) != n:
         raise InputError(f'{frames.where}: there are {len(angles)} angles for {n} views; these must agree')
@@ -88,7 +88,7 @@ def geometry_of(
                     'or air=(v0, v1, u0, u1)'
                 )
     else:
-        raise InputError(f'{path}: is no geometry file; give .yml, .xtekct or .xml (RTK)')
+        raise InputError(f'{path}: is not a geometry file; give .yml, .xtekct or .xml (RTK)')
     values.setdefault('nDetector', list(shape))
     if not _same(values['nDetector'], shape):
         raise InputError(f'{path}: nDetector is {values["nDetector"]}, but the frames have {list(shape)} pixels (v, u)')

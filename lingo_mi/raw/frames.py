@@ -98,7 +98,7 @@ def open_recording(path: PathLike | str) -> Recording:
     if suffix in IMAGES:
         return Recording(_image_stack(path))
     raise InputError(
-        f'{path}: is no known file of frames; give a folder of TIFF or EDF, .tif, .edf, .npy or HDF5 (.h5, .nxs)'
+        f'{path}: is not a known file of frames; give a folder of TIFF or EDF, .tif, .edf, .npy or HDF5 (.h5, .nxs)'
     )
 
 
@@ -172,7 +172,7 @@ def _array(path):
     except (ValueError, EOFError) as error:
         raise InputError(f'{path}: is damaged or not a NumPy file ({one_line(error)[:120]}); write it again') from None
     if not isinstance(stack, np.ndarray) or stack.ndim != 3:
-        raise InputError(f'{path}: is no array [n, v, u]; write the frames with numpy.save')
+        raise InputError(f'{path}: is not an array [n, v, u]; write the frames with numpy.save')
     arrays.numeric(stack[:1], path, 3, finite=False)
     return Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i])
 

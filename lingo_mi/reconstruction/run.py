@@ -35,7 +35,7 @@ def run_algorithm(
     Parameters
     ----------
     scan : Scan
-        Whose projections are line integrals: take a detector's effects out before (`line_integrals.counts_to_line_integrals`).
+        Whose projections are line integrals: take a detector's effects out before (`line_integrals.line_integrals`).
     algorithm : Algorithm
         With its options.
     start : array, optional

@@ -227,7 +227,7 @@ class _Volume:
             try:
                 found, done = known['of'], int(known['updates'])
             except (KeyError, TypeError, ValueError):
-                raise InputError(f'{state}: is no state of ours; move its folder away') from None
+                raise InputError(f'{state}: is not a state of ours; move its folder away') from None
             if found != digest:
                 raise InputError(
                     f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '

@@ -49,7 +49,7 @@ class EventLog:
         data = fit.data
         if fit.method.makes_volume:
             truth = None if data is None else data.volume
-            shown = [fit.volume()] if truth is None else [fit.volume(), truth]
+            shown = [fit.own_volume] if truth is None else [fit.own_volume, truth]
             window = grey_range(shown[-1])
             for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
                 index = richest(shown[-1], axis)

@@ -30,5 +30,5 @@ def data_file(name: str, parameter: str) -> str:
             f'that holds it, or name your file: {parameter}=FILE'
         )
     if not found.is_file() and not found.is_dir():
-        raise InputError(f'{name}: is no regular file, but a device or a pipe; name another: {parameter}=FILE')
+        raise InputError(f'{name}: is not a regular file, but a device or a pipe; name another: {parameter}=FILE')
     return str(found)

@@ -190,7 +190,7 @@ def _read_poses(props, shared):
         poses = props['poses']
         numbers, wrong = _split_numbers(poses)
         if wrong and len(numbers) > len(wrong):
-            raise InputError(f'poses must be 12 numbers for every view, or a file; {shown(wrong[0])} is no number')
+            raise InputError(f'poses must be 12 numbers for every view, or a file; {shown(wrong[0])} is not a number')
         if wrong:
             return read_poses(data_file(poses, 'poses'), n_detector, step, parallel, origin)
         if len(numbers) % 12:

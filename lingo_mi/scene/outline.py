@@ -132,7 +132,7 @@ class _Look:
     def require_readable(self, scene: Path, name: str):
         for path in self.places(name):
             if path.exists() and not path.is_file():
-                raise InputError(f'{scene}: {name} is no regular file, but a device or a pipe; name another')
+                raise InputError(f'{scene}: {name} is not a regular file, but a device or a pipe; name another')
             if path.suffix.lower() == '.ply' and path.exists():
                 require_elements(path)
 

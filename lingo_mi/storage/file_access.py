@@ -36,7 +36,7 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
         try:
             kind = os.stat(path).st_mode
         except ValueError:  # a zero byte, or text that is no file name
-            raise InputError(f'{path}: is no name of a file; correct it') from None
+            raise InputError(f'{path}: is not a name of a file; correct it') from None
         if folder != stat.S_ISDIR(kind):
             what = 'a file, not a folder' if folder else 'a folder, not a file'
             raise InputError(f'{path}: cannot be read (it is {what}); check the path')

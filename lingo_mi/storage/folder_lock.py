@@ -99,7 +99,7 @@ def _open(path: Path) -> tuple[int, bool]:
         return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o644), True
     except FileExistsError:
         if path.is_symlink() or not path.is_file():
-            raise InputError(f'{path}: is no lock of lingo_mi; move it away, or choose another place') from None
+            raise InputError(f'{path}: is not a lock of lingo_mi; move it away, or choose another place') from None
         return os.open(path, flags | os.O_CREAT, 0o644), False
 
 
@@ -128,7 +128,7 @@ def _owner(file: int) -> dict:
         return dict(pid=int(found['pid']), host=str(found['host']))
     except (KeyError, TypeError, ValueError):
         raise InputError(
-            f'a file {LOCK} holds {shown(content[:20])}, so it is no lock of lingo_mi; move it away'
+            f'a file {LOCK} holds {shown(content[:20])}, so it is not a lock of lingo_mi; move it away'
         ) from None
 
 

@@ -47,7 +47,7 @@ def view_name(index: int) -> str:
 
 
 def manifest_of(folder: Path) -> Manifest:
-    """The manifest of a folder. Raises InputError where it is no manifest."""
+    """The manifest of a folder. Raises InputError where it is not a manifest."""
     path = folder / MANIFEST
     if not os.path.lexists(path):
         return Manifest()
@@ -55,7 +55,7 @@ def manifest_of(folder: Path) -> Manifest:
     found = read_json(path)
     names, begun = (found.get('files'), found.get('writing')) if isinstance(found, dict) else (None, None)
     if not (isinstance(names, list) and isinstance(begun, bool) and all(isinstance(n, str) for n in names)):
-        raise InputError(f'{path}: is no manifest of lingo_mi; move it away, or choose another folder')
+        raise InputError(f'{path}: is not a manifest of lingo_mi; move it away, or choose another folder')
     return Manifest(frozenset(n for n in names if _is_name(n)), begun)
 
 

@@ -70,12 +70,7 @@ def initialisations(sizes: Sizes) -> list[dict]:
 
 def _quality(data: Dataset) -> Callable[[Fit], dict]:
     """Measures a fit by all held-out views and the true volume."""
-
-    def measured(fit):
-        fit.data = data
-        return quick_measure(fit)
-
-    return measured
+    return lambda fit: quick_measure(fit.with_data(data))
 
 
 def curves(sizes: Sizes) -> list[dict]:

@@ -64,7 +64,7 @@ def stored(path: Path) -> Stored:
         notes = {case['name']: case.pop('note') for case in cases}
         results = {case.pop('name'): Result(**case) for case in cases}
     except (ValueError, TypeError, KeyError, AttributeError):
-        raise InputError(f'{path}: is no file of hard cases; write one with lingo-mi hard-cases --json') from None
+        raise InputError(f'{path}: is not a file of hard cases; write one with lingo-mi hard-cases --json') from None
     return Stored(variant, results, notes)
 
 

@@ -252,8 +252,9 @@ class Cells:
                     report(iteration)
 
             fitted = run(dataset.train, method, self.seed, progress=progress, path=saved, resume=resume)
-        fitted.data = dataset
-        return measure(fitted) | dict(method=cell.method, settings=method.flat(), initial=fitted.info)
+        return measure(fitted.with_data(dataset)) | dict(
+            method=cell.method, settings=method.flat(), initial=fitted.info
+        )
 
     def _begin(self, method: Method, saved: Path):
         """Without a whole checkpoint, copy that of the longest shorter fit of the same method, if its steps are ours."""

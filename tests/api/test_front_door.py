@@ -297,7 +297,7 @@ def test_a_folder_and_resume(data, tmp_path, sums_in_order):
     np.testing.assert_array_equal(loaded.volume(), longer.volume())
     with pytest.raises(lm.InputError, match='other values of seed'):
         lm.fit(data, 'r2', seed=1, folder=folder, resume=True, progress=False, **TINY)
-    again = lm.fit(data, 'r2', seed=1, folder=folder, force=True, progress=False, record=dict(command='x'), **short)
+    again = lm.fit(data, 'r2', seed=1, folder=folder, force=True, progress=False, note=dict(command='x'), **short)
     assert lm.load_fit(folder).record['command'] == 'x' and lm.load_fit(folder).steps == again.steps == 6
 
 

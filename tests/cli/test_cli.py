@@ -359,6 +359,6 @@ def test_a_scan_in_the_place_of_a_scene(tmp_path, monkeypatch):
     code, text, err = run(FIT.with_name('reconstruct.py'), 'hand.npy', '--algorithm', 'fdk')
     assert code == 0 and 'out/hand-fdk.nii.gz' in text, err
     code, _, err = fit('hand.npy', '--projections', 'hand.npy')
-    assert code == 2 and 'hand.npy: is no scene, which --projections and --volume go with' in err
+    assert code == 2 and 'hand.npy: is not a scene, which --projections and --volume go with' in err
     code, _, err = fit('foot.npy')
     assert code == 2 and 'foot.npy: there is no such scene' in err

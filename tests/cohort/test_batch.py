@@ -239,9 +239,9 @@ def test_files_that_are_no_list(home, content, message):
 
 
 ROWS = {
-    ',nothing.xml': 'there is no such scene', ',nothing': 'must be a geometry file', 'list.csv,': 'no known scan format',
+    ',nothing.xml': 'there is no such scene', ',nothing': 'must be a geometry file', 'list.csv,': 'not a known scan format',
     'no.pickle,': 'no such file', 'out_of_place,': 'has neither', '/dev/zero,tiny.xml': 'device', ',one.yml': 'has no file',
-    'no\x07.pickle,': 'is no name of a folder', '../../etc/passwd.npy,': 'no such file', ',': '', 'x,y,z': 'has 3 cells',
+    'no\x07.pickle,': 'is not a name of a folder', '../../etc/passwd.npy,': 'no such file', ',': '', 'x,y,z': 'has 3 cells',
     'a': 'has 1 cell',
 }  # fmt: skip
 
@@ -340,7 +340,7 @@ def test_folders_that_are_not_ours(home):
     (out / 'c' / METRICS).unlink()
     (out / 'results.csv').write_text('mine')
     code, _, err = batch(home)
-    assert code == 2 and 'results.csv: is no table of a batch' in err and (out / 'results.csv').read_text() == 'mine'
+    assert code == 2 and 'results.csv: is not a table of a batch' in err and (out / 'results.csv').read_text() == 'mine'
 
 
 def test_a_damaged_result(home):

@@ -113,7 +113,7 @@ def test_wrong_numbers_of_dimensions(tmp_path, n):
         (dict(ElementDataFile='../../v.raw'), 'beside it'),
         (dict(ElementDataFile='below/../../v.raw'), 'beside it'),
         (dict(ElementDataFile=''), 'beside it'),
-        (dict(ElementDataFile='v\0.raw'), 'no name of a file'),
+        (dict(ElementDataFile='v\0.raw'), 'not a name of a file'),
         (dict(ElementDataFile='.'), 'a folder'),
         (dict(DimSize='4 5 7'), 'cannot hold'),
         (dict(DimSize='99999999 99999999 99999999'), 'cannot hold'),

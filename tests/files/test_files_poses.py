@@ -367,9 +367,9 @@ def test_bad_scanners(values, match):
 @pytest.mark.parametrize(
     'name, content, match',
     [
-        ('a.mat', '', 'no known file of poses'),
-        ('a.txt', '1 2 x', 'no table'),
-        ('a.txt', '1 2\n3', 'no table'),
+        ('a.mat', '', 'not a known file of poses'),
+        ('a.txt', '1 2 x', 'not a table'),
+        ('a.txt', '1 2\n3', 'not a table'),
         ('a.txt', '1 2 3', '12 numbers for every view'),
         ('a.npy', 'no', 'damaged'),
         ('a.xml', '<a', 'is no XML'),

@@ -84,7 +84,7 @@ def test_an_earlier_scan_stays_whole_where_the_disk_is_full(tmp_path, monkeypatc
 
 
 def test_write_refuses(tmp_path):
-    with pytest.raises(InputError, match='no kind of scan file'):
+    with pytest.raises(InputError, match='not a kind of scan file'):
         write_scan(tmp_path / 'a', small_dataset(), 'tiff')
     with pytest.raises(InputError, match='ends in .npy'):
         write_scan(tmp_path / 'a', Dataset(small_dataset().train), 'npy')
@@ -281,7 +281,7 @@ def test_unknown_paths(tmp_path):
     refused(tmp_path, 'neither meta_data.json')
     refused(tmp_path / 'none', 'no such file')
     (tmp_path / 'a.xyz').touch()
-    refused(tmp_path / 'a.xyz', 'no known scan format')
+    refused(tmp_path / 'a.xyz', 'not a known scan format')
     refused(tmp_path / 'a.xyz', 'carries its own geometry', geometry='g.yml')
 
 
@@ -319,8 +319,8 @@ def test_htc_choice_and_bad_input(tmp_path):
     assert read_scan(path, name='01a').train.projections.max() == 1
     assert '01a, ta' in refused(path, 'no sinogram', name='09b')
     for changes, match in (
-        ({'DSO': ...}, 'no scan of'),
-        ({'sinogram_ta': ...}, 'no scan of'),
+        ({'DSO': ...}, 'not a scan of'),
+        ({'sinogram_ta': ...}, 'not a scan of'),
         ({'angles_deg': np.arange(4.0)}, 'must agree'),
         ({'sinogram_ta': np.ones(6)}, '2 dimensions'),
         ({'sinogram_ta': np.full((5, 6), np.nan)}, 'NaN'),

@@ -569,7 +569,7 @@ def test_folders_and_names_without_a_volume(tmp_path):
     refused(tmp_path / 'a.dcm', 'folder of the series')
     refused(tmp_path / 'a.xyz', 'no such file')
     (tmp_path / 'a.xyz').touch()
-    refused(tmp_path / 'a.xyz', 'no known volume format')
+    refused(tmp_path / 'a.xyz', 'not a known volume format')
 
 
 @pytest.mark.parametrize('module, name', [('tifffile', 'v.tif'), ('pydicom', '')])

@@ -319,7 +319,7 @@ def test_entries_twice(whole, tmp_path):
 def test_files_that_are_no_files(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):
-        assert 'no regular file' in line(path)
+        assert 'not a regular file' in line(path)
 
 
 @pytest.mark.parametrize('version', [None, 1, 3, 2.5, '2', True])

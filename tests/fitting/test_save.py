@@ -52,8 +52,7 @@ def test_effects_that_a_checkpoint_does_not_hold(checkpoint, tmp_path, effects, 
 def compared(checkpoint):
     """The fit, to be compared with two views and its volume."""
     fit = Fit.load(checkpoint)
-    fit.data = Dataset(tiny_scan(geometry()), tiny_scan(geometry(2)), fit.volume())
-    return fit
+    return fit.with_data(Dataset(tiny_scan(geometry()), tiny_scan(geometry(2)), fit.volume()))
 
 
 def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
@@ -63,7 +62,7 @@ def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
 
 
 def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path):
-    folder = compared(checkpoint).save(tmp_path / 'out', title='itself', record=dict(command='fit'))
+    folder = compared(checkpoint).save(tmp_path / 'out', title='itself', note=dict(command='fit'))
     found = json.loads((folder / 'metrics.json').read_text())
     assert found['ssim_3d'] == pytest.approx(1) and found['psnr_2d'] > 0 and len(found['test_angles']) == 2
     assert (found['method'], found['command']) == ('r2', 'fit')

@@ -54,7 +54,7 @@ def test_an_entry_of_a_checkpoint_whose_header_has_no_end(tmp_path):
         members = {name: archive.read(name) for name in archive.namelist()}
     members['born.npy'] = members['born.npy'].replace(b'}', b'(')
     (tmp_path / 'c.npz').write_bytes(corpus.zipped(members))
-    with pytest.raises(InputError, match='no array'):
+    with pytest.raises(InputError, match='not an array'):
         Checkpoint.load(tmp_path / 'c.npz')
 
 

@@ -551,7 +551,7 @@ def test_a_grid_turned_by_less_than_can_be_told(size):
 
 
 def test_homogeneous_sphere():
-    refused("'thing' has a homogeneous medium, but is no mesh", dict(thing=dict(block(), type='sphere')))
+    refused("'thing' has a homogeneous medium, but is not a mesh", dict(thing=dict(block(), type='sphere')))
 
 
 def test_unknown_sensor():

@@ -226,7 +226,7 @@ def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
         (dict(angles=5.0), 'there are 1 angles for 6 views'),
         (dict(binning=41), 'binning 41 is more than the 40 pixels of a view'),
         (dict(angles='commas.txt'), 'commas.txt: its numbers seem to have decimal commas'),
-        (dict(angles=[0.0, 1, np.nan, 3, 4, 5]), 'angle 2 is no finite number'),
+        (dict(angles=[0.0, 1, np.nan, 3, 4, 5]), 'angle 2 is not a finite number'),
         (dict(flats='shut.npy'), 'flat 4 is .* times as bright as the others; take it out'),
         (dict(saturation=500.0), 'nearly all pixels of flat 0 reach the saturation, 500 counts'),
         (dict(bining=2), "no option 'bining', did you mean binning"),

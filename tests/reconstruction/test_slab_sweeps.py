@@ -170,7 +170,7 @@ def test_spoiled_files(scan, tmp_path):
         list(how.slabs(scan, 16, work))
     for text in ('', '{', '[]', '{"of": 1}', 'null', '\xff'):
         (work / 'state.json').write_text(text, encoding='latin-1')
-        with pytest.raises(InputError, match='is no state of ours'):
+        with pytest.raises(InputError, match='is not a state of ours'):
             list(how.slabs(scan, 16, work))
 
 

@@ -20,7 +20,7 @@ def test_poses_with_a_slip_in_them(tmp_path):
         <string name="nDetector" value="4"/><string name="nVoxel" value="4"/><string name="dVoxel" value="1"/>
         <string name="poses" value="{numbers}"/></sensor></scene>"""
     (tmp_path / 'a.xml').write_text(scene)
-    with pytest.raises(InputError, match="poses must be 12 numbers for every view, or a file; '1.o' is no number"):
+    with pytest.raises(InputError, match="poses must be 12 numbers for every view, or a file; '1.o' is not a number"):
         load_scene(tmp_path / 'a.xml')
     (tmp_path / 'a.xml').write_text(scene.replace(numbers, 'x' * 300))
     with pytest.raises(InputError, match='xxx.*name your file: poses=FILE'):

@@ -82,8 +82,8 @@ def test_devices_and_pipes(refused, tmp_path):
         assert 'a device or a pipe' in refused(f'<scene version="3.0.0"><include filename="{name}"/></scene>')
         for tag in ('shape type="ply"', 'shape type="ellipsoids"', 'texture type="bitmap"', 'volume type="gridvolume"'):
             text = f'<{tag}><string name="filename" value="{name}"/></{tag.split()[0]}>'
-            assert 'no regular file' in refused(f'<scene version="3.0.0">{text}</scene>')
-        with pytest.raises(InputError, match='no regular file'):
+            assert 'not a regular file' in refused(f'<scene version="3.0.0">{text}</scene>')
+        with pytest.raises(InputError, match='not a regular file'):
             data_file(str(tmp_path / name), 'volume')
 
 

@@ -79,12 +79,12 @@ def test_without_locks_of_the_system(tmp_path, monkeypatch, system):
 
 def test_what_is_no_lock(tmp_path):
     (tmp_path / LOCK).write_text('my notes')
-    with pytest.raises(InputError, match='no lock'), locked(tmp_path):
+    with pytest.raises(InputError, match='not a lock'), locked(tmp_path):
         pass
     assert (tmp_path / LOCK).read_text() == 'my notes'
     (tmp_path / LOCK).unlink()
     (tmp_path / 'other').write_text('mine')
     (tmp_path / LOCK).symlink_to(tmp_path / 'other')
-    with pytest.raises(InputError, match='no lock'), locked(tmp_path):
+    with pytest.raises(InputError, match='not a lock'), locked(tmp_path):
         pass
     assert (tmp_path / 'other').read_text() == 'mine'

@@ -86,7 +86,7 @@ def test_others_are_removed_only_if_ours(tmp_path):
 @pytest.mark.parametrize('text', ['', '[]', '{"files": 3, "writing": true}', '{"files": [], "writing": 1}', '\xff{'])
 def test_a_manifest_that_is_none(tmp_path, text):
     (tmp_path / MANIFEST).write_text(text, encoding='latin1')
-    with pytest.raises(InputError, match='no manifest'):
+    with pytest.raises(InputError, match='not a manifest'):
         begin(tmp_path, [SCENE])
     assert (tmp_path / MANIFEST).read_text(encoding='latin1') == text
 

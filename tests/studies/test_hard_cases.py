@@ -124,7 +124,7 @@ def test_table_of_two_variants(tmp_path):
 )
 def test_what_is_no_file_of_results(tmp_path, text):
     (tmp_path / 'other.json').write_text(text)
-    with pytest.raises(InputError, match='no file of hard cases'):
+    with pytest.raises(InputError, match='not a file of hard cases'):
         stored(tmp_path / 'other.json')
 
 

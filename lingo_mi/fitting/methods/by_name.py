@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from lingo_mi.common.errors import InputError, shown
@@ -46,6 +47,15 @@ def method_of(text: str, **values: Any) -> Method:
         raise InputError(f'there is no method {shown(name)}{nearest(name, kinds)}; use one of {", ".join(METHODS)}')
     options = {option: value for option, _, value in (change.partition('=') for change in changes_of(changes))}
     return kinds[name]().changed(**values).changed(**options)
+
+
+def known_options(text: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """All options of a method, by its name as `method_of` takes it, with the kinds of parts that `values` choose.
+
+    Values that are not options are passed over: `start=masks` brings options that other starts do not have.
+    """
+    known = method_of(text).flat()
+    return method_of(text, **{name: value for name, value in values.items() if name in known}).flat()
 
 
 def changes_of(text: str) -> list[str]:
