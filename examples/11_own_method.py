@@ -41,7 +41,7 @@ class LatticeStart(lm.Start):
 
 
 @dataclass(frozen=True)
-class SquaredLoss(lm.Loss):
+class RootMeanSquare(lm.Loss):
     def value(self, image, measured, height, width):
         return dr.sqrt(dr.mean(dr.square(image - measured)))
 
@@ -52,7 +52,7 @@ class MyMethod(lm.DensityMethod):
     iterations: int = 300
     rates: lm.DensityRates = lm.Fast.rates
     start: lm.Start = LatticeStart()
-    loss: lm.Loss = SquaredLoss()
+    loss: lm.Loss = RootMeanSquare()
     normalise: bool = True
 
 

@@ -24,9 +24,8 @@ class LINGO(DensityMethod):
 
     Examples
     --------
-    >>> LINGO().changed(V_S=1).start
-    MaskStart(n_points=50000, high_fraction=0.25, low_factor=0.1, occupancy_voxels=16, V_S=1, misses=0, outside='invalid', \
-density='lsq')
+    >>> LINGO().changed(V_S=1).start.V_S
+    1
     """
 
     name: ClassVar = 'lingo'
