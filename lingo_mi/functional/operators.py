@@ -148,7 +148,7 @@ def _indices(views, count: int) -> np.ndarray:
         return np.arange(count)
     try:
         views = list(views)
-        if any(isinstance(i, bool) for i in views):  # a mask is no list of indices
+        if any(isinstance(i, bool) for i in views):  # a mask is not a list of indices
             raise TypeError
         found = [operator.index(i) for i in views]
     except TypeError:

@@ -165,7 +165,7 @@ def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Pr
 
 
 def _end(name: str, future: Any) -> Event:
-    """How a task ended. A worker's death is no error of a job before several have died of it."""
+    """How a task ended. A worker's death is not an error of a job until several have died of it."""
     if future.status == 'finished':
         event = Event(*future.result())
         return event if event.kind != 'stopped' else Event(name, 'failed', 'was cancelled on its worker')

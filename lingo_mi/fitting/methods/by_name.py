@@ -44,7 +44,9 @@ def method_of(text: str, **values: Any) -> Method:
     name, _, changes = text.partition(':')
     kinds = kinds_of(Method)
     if name not in kinds:
-        raise InputError(f'there is no method {shown(name)}{nearest(name, kinds)}; use one of {", ".join(METHODS)}')
+        raise InputError(
+            f'there is no method {shown(name)}{nearest(name, kinds)}; use one of {", ".join(METHODS | kinds)}'
+        )
     options = {option: value for option, _, value in (change.partition('=') for change in changes_of(changes))}
     return kinds[name]().changed(**values).changed(**options)
 

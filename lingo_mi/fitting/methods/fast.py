@@ -22,8 +22,8 @@ class Fast(DensityMethod):
 
     - Gaussians start on the edges of a quick reconstruction.
     - The loss has the gradient of the difference beside L1, which restores fine detail sooner, and more weight on SSIM.
-    - Rates are 3 to 40 times higher and fall over the run. The second moment has a shorter memory, the first one is Nesterov's, and
-      the result is the mean of the last steps.
+    - Rates are 3 to 40 times higher and fall over the run. The second moment has a shorter memory, the first one is Nesterov's,
+      and the result is the mean of the last steps.
     - Views in a row lie well apart.
     - The total variation covers eight times the volume, since with a short memory each Gaussian must be smoothed more often than
       once in 64 steps. More views have less of it.
