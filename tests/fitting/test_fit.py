@@ -27,8 +27,8 @@ def test_a_checkpoint_is_the_fit(scan, tmp_path, changes):
     np.testing.assert_allclose(again.geometry.rays().source, done.geometry.rays().source, atol=1e-9)
     assert (again.geometry is again.nominal_geometry) == ('rate_pose' not in changes)
     np.testing.assert_allclose(again.cloud().density.numpy(), done.cloud().density.numpy(), rtol=1e-6)
-    finer = scan.geometry.on(Grid((16, 16, 16), (16.0, 16.0, 16.0), scan.geometry.grid.centre))
-    assert again.volume(finer).shape == (16, 16, 16)
+    coarser = Grid((16, 16, 16), (16.0, 16.0, 16.0), scan.geometry.grid.centre)
+    assert again.volume(coarser).shape == (16, 16, 16)
 
 
 def test_an_unfinished_fit_is_its_mean_so_far(scan, tmp_path):

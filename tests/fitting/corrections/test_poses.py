@@ -92,7 +92,7 @@ def recovered(views, iterations, points):
 
     before = np.degrees(rms(turn)), rms(shift)
     after = np.degrees(rms(poses.turn - turn)), rms(poses.shift / g.grid.scale - shift)
-    errors = [rms(f.render(f.corrected) - scan.projections) / rms(scan.projections) for f in fits]
+    errors = [rms(f.render(f.geometry) - scan.projections) / rms(scan.projections) for f in fits]
     return before, after, errors, fits
 
 

@@ -308,8 +308,8 @@ def test_parts_of_the_wrong_type(make, message):
 def test_kinds_are_those_with_a_name():
     """Abstract classes, and those that only share what others have, are not among them."""
 
-    def shipped(kind):  # other tests have kinds of their own
-        return {name: k for name, k in kinds_of(kind).items() if k.__module__.startswith('lingo_mi.')}
+    def shipped(kind):  # tests and studies have kinds of their own
+        return {name: k for name, k in kinds_of(kind).items() if k.__module__.startswith('lingo_mi.fitting')}
 
     assert shipped(lm.FDKStart).keys() == {'fdk', 'masks', 'edges', 'random', 'cuboid'}
     assert shipped(lm.Clone).keys() == {'clone', 'halve', 'opacities'}
