@@ -12,7 +12,7 @@ import numpy as np
 from lingo_mi.common.interpolation import trilinear
 from lingo_mi.effects.forward import Effects
 from lingo_mi.effects.hardening import hardened, second_share
-from lingo_mi.fitting.corrections.scattered_light import ScatteredLight
+from lingo_mi.fitting.models.scattered_light import ScatteredLight
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded

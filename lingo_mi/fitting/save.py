@@ -44,8 +44,8 @@ def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[d
     """Write all files of a fit but its checkpoint into `folder`, and return the numbers.
 
     These are `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`, `report.png`, `report.html` and `metrics.json`. Files of
-    an earlier result are replaced or removed, others are left alone. metrics.json goes first and comes last, with a digest of all
-    others and of the checkpoint beside them, so that it marks a whole result (see `output_folder`).
+    an earlier result are replaced or removed, others are left alone. metrics.json is removed first and written last. It has a
+    digest of all others and of the checkpoint beside them, so that it marks a complete result (see `output_folder`).
 
     For alpha compositing there is no volume, and no scene, because no integrator renders it. For a neural field there is no
     cloud: the scene is of its volume, and the field itself is in the checkpoint.

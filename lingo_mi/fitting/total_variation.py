@@ -17,7 +17,7 @@ from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
 
-FAR = 1e6  # in the normalised frame, where a scan's volume has about the size 1
+FAR = 1e6  # in the normalised frame, where the longest side of the volume is 2
 
 
 def random_cube_variation(
@@ -31,7 +31,7 @@ def random_cube_variation(
     loss        its weight of the variation, and the cube's samples
     extent      cut-off in standard deviations
     geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
-    factor      on the loss (`loss_scale`), Float [1], which the gradient has and the value has not; None: 1
+    factor      the loss scale, Float [1]: multiplies the gradient, not the value that is returned; None: 1
     """
     half = geometry.grid.half
     voxel, between = 2 * half / geometry.grid.shape, np.array(geometry.grid.shape) - 1

@@ -90,9 +90,12 @@ def differentiate(
     signal   `ExpectedSignal` of the detector; None: line integrals
     share    of the second of two materials in every Gaussian, Float [N]; None: one material
 
-    Returns the view's part of the loss, Float [1], without the factor; of the densification statistic, Float [N] each: the norm
-    of the gradient by the projected centre, and 1 if the Gaussian is visible; and of the factor on the loss, Float [1], or
-    None where there is none.
+    Returns four values:
+
+    1. the view's part of the loss, Float [1], not multiplied by the loss scale
+    2. the norm of the gradient with respect to each projected centre, Float [N], for densification
+    3. 1 for each Gaussian that is visible, else 0, Float [N], for densification
+    4. the view's part of the loss scale, Float [1]; None without one
     """
     view = target.view
     bundles = []  # of rays: one, or several if the signal is a mean over them

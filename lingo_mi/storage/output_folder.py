@@ -73,7 +73,7 @@ def require_ours(folder: Path, names: Iterable[str]) -> None:
 
 
 def begin(folder: Path, names: Iterable[str]) -> None:
-    """To be called before files of a result are changed: they become ours, and an old result in the folder is whole no longer.
+    """To be called before files of a result are changed: they become ours, and an old result in the folder is marked incomplete.
 
     Raises InputError as `require_ours`, before anything is changed.
     """
@@ -143,7 +143,7 @@ def require_together(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         file = folder / name
         if name in known and file.exists() and digest(file) != known[name]:
-            raise InputError(f'{file}: is not the one that {METRICS} beside it tells of; fit again')
+            raise InputError(f'{file}: does not match {METRICS} beside it; fit again')
 
 
 def occupants(folder: Path) -> list[str]:

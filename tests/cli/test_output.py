@@ -130,8 +130,8 @@ def test_parts_of_two_results_are_refused(scene, result, tmp_path, name, option)
     more = ('--views', 12) if option == '--complete' else ()
     arguments = scene, '--algorithm', 'refined', option, result / 'result.xml', '--out', tmp_path / 'v.nii', *more
     code, _, err = run(script, *arguments)
-    refused(code, err, name, 'metrics.json beside it tells of')
-    with pytest.raises(lm.InputError, match='tells of'):
+    refused(code, err, name, 'does not match metrics.json')
+    with pytest.raises(lm.InputError, match='does not match'):
         lm.load_fit(result)
     (result / 'metrics.json').unlink()  # as where a result was begun over another
     (result / MANIFEST).write_text((result / MANIFEST).read_text().replace('false', 'true'))

@@ -46,7 +46,7 @@ def test_the_mark_goes_first(tmp_path):
 def test_a_changed_part_is_refused(tmp_path):
     make(tmp_path)
     (tmp_path / SCENE).write_text('new')
-    with pytest.raises(InputError, match='tells of'):
+    with pytest.raises(InputError, match='does not match'):
         require_together(tmp_path, [SCENE])
     (tmp_path / METRICS).unlink()  # a user's own doing: no write was under way
     require_together(tmp_path, [SCENE])

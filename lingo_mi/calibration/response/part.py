@@ -37,7 +37,7 @@ class ResponsePart(ABC):
     @property
     @abstractmethod
     def deviations(self) -> np.ndarray:
-        """What the numbers [K] are expected to be in size. It holds those that a scan does not tell."""
+        """The expected size of the numbers [K]. It keeps those small that a scan does not determine."""
 
     @abstractmethod
     def apply(self, p: np.ndarray, c: np.ndarray, place: Place) -> np.ndarray:

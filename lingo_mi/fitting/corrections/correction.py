@@ -23,7 +23,7 @@ class CorrectedFit(Protocol):
 
 
 class Correction:
-    """A correction with its arrays, and the moments at which it acts. Every moment does nothing unless a kind says otherwise.
+    """A correction with its arrays, and the moments at which it acts. Every method does nothing by default.
 
     Attributes
     ----------

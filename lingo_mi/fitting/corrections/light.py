@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lingo_mi.fitting.corrections.correction import CorrectedFit, Correction, due
-from lingo_mi.fitting.corrections.scattered_light import light_at_pixels
 from lingo_mi.fitting.device_state import DeviceState
+from lingo_mi.fitting.models.scattered_light import light_at_pixels
 from lingo_mi.projectors.upload import uploaded
 
 # Shares of the iterations before which the light is estimated again. It depends only on the object's coarse shape, which a fit

@@ -79,8 +79,10 @@ class Poses:
         return Geometry.from_poses(rays, g.nDetector, grid=g.grid)
 
     def between(self, scan: Geometry, geometry: Geometry) -> Geometry:
-        """A geometry with smooth corrections for the time of its views, which were taken among those of the scan; as it is where
-        every view is corrected for itself, which tells nothing of others."""
+        """A geometry with smooth corrections for the time of its views, which were taken among those of the scan.
+
+        It is returned unchanged if each view has its own correction: these say nothing about other views.
+        """
         if self.projection is None:
             return geometry
         t, own = times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))

@@ -13,6 +13,7 @@ from typing_extensions import Self
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.memory import room
 from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.fitting import state as states
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, trusted
 from lingo_mi.fitting.method import Method
@@ -23,13 +24,12 @@ from lingo_mi.fitting.options.loss import ImageLoss
 from lingo_mi.fitting.start.fdk import FDKStart
 from lingo_mi.fitting.start.start import Start, StartingCloud
 from lingo_mi.fitting.state import State
-from lingo_mi.fitting.state import start as starting_state
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import cutoff
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Scan
 
-BYTES = 500  # that a fit needs at least for each Gaussian: 14 parameters, their moments and derivatives, and copies
+BYTES = 500  # least memory of a fit for each Gaussian: 14 parameters, their moments and derivatives, and copies
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class CloudMethod(Method):
 
         def render(points, density, spacing, views):
             forward = method.forward
-            state = DeviceState(starting_state(points, spacing, density / unit, forward))
+            state = DeviceState(states.start(points, spacing, density / unit, forward))
             return method.model(geometry, unit).render(state, geometry.subset(views)) * geometry.grid.scale
 
         cloud = method.start.cloud(scan, np.random.default_rng(seed), render, unit)
@@ -135,4 +135,4 @@ class CloudMethod(Method):
     def starting_state(self, cloud: StartingCloud, unit: float) -> State:
         """The state of isotropic, unrotated Gaussians with zero moments."""
         density = None if cloud.density is None else cloud.density / unit
-        return starting_state(cloud.points.astype(np.float32), cloud.spacing, density, self.forward)
+        return states.start(cloud.points.astype(np.float32), cloud.spacing, density, self.forward)

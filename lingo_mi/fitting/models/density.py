@@ -12,11 +12,11 @@ import numpy as np
 
 from lingo_mi.calibration.response.response import Response
 from lingo_mi.effects.forward import Effects
-from lingo_mi.fitting.corrections.scattered_light import light_at_pixels
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.expected_signal import ExpectedSignal
 from lingo_mi.fitting.models.cloud import CloudModel
 from lingo_mi.fitting.models.forward import ForwardModel
+from lingo_mi.fitting.models.scattered_light import light_at_pixels
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.projectors.upload import uploaded

@@ -16,9 +16,9 @@ from lingo_mi.effects.hardening import Tube, TubeParameters
 from lingo_mi.effects.scatter import Scatter
 from lingo_mi.files.ply import write_ply
 from lingo_mi.fitting.corrections.light import WHEN
-from lingo_mi.fitting.corrections.scattered_light import ScatteredLight, light_at_pixels
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.methods import densities
+from lingo_mi.fitting.models.scattered_light import ScatteredLight, light_at_pixels
 from lingo_mi.fitting.scene_file import write_scene
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.projectors.objects import GridInCube
