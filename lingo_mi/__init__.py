@@ -58,7 +58,7 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.fitting.start.masks import MaskStart
     from lingo_mi.fitting.start.start import Start, StartingCloud
     from lingo_mi.fitting.start.uniform import CuboidStart, RandomStart
-    from lingo_mi.functional import project, voxelize
+    from lingo_mi.functional import Projector, project, voxelize
     from lingo_mi.geometry import Geometry, Grid, circular
     from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
     from lingo_mi.scan import Dataset, Scan
@@ -94,7 +94,7 @@ _MODULES = {
     'fitting.fitted_model': 'Gaussians',
     'api.volumes': 'reconstruct',
     'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS Refined Best',
-    'functional': 'project voxelize',
+    'functional': 'Projector project voxelize',
     'common.runtime': 'use_variant',
     'common.errors': 'InputError',
 }

@@ -1,5 +1,6 @@
-"""Line integrals and voxels of 3D Gaussians as functions of arrays: NumPy, Dr.Jit, PyTorch or JAX, with gradients."""
+"""The operators of clouds and voxels as functions of arrays: NumPy, Dr.Jit, PyTorch or JAX, with gradients."""
 
 from lingo_mi.functional.operators import project, voxelize
+from lingo_mi.functional.projector import Projector
 
-__all__ = ['project', 'voxelize']
+__all__ = ['Projector', 'project', 'voxelize']

@@ -27,10 +27,11 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.sart_update import normalised, updated
-from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, projector_class, scalar
+from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory

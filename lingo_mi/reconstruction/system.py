@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.projectors.grid_pair import GridPair
-from lingo_mi.projectors.joseph import Joseph
-from lingo_mi.projectors.tilted_joseph import TiltedJoseph
 from lingo_mi.reconstruction.parameters import check_bound
 from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.wide_pixels import Between
@@ -105,14 +104,6 @@ class System:
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
         return volume
-
-
-def projector_class(geometry: Geometry) -> type[Joseph | TiltedJoseph | GridPair]:
-    """The fastest projector that serves a scan: see docs/benchmarks/speed.md."""
-    for kind in (Joseph, TiltedJoseph):
-        if kind.serves(geometry):
-            return kind
-    return GridPair
 
 
 def evaluated(x: Any) -> mi.Float:

@@ -26,12 +26,13 @@ from lingo_mi import phantoms
 from lingo_mi.common import runtime
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import blocks, sweep
-from lingo_mi.reconstruction.system import System, projector_class
+from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 from lingo_mi.studies.benchmarks import rtk_bridge
 

@@ -1,0 +1,44 @@
+"""Linear maps of JAX's arrays, by way of the host: a primitive, so that all of JAX's transformations apply."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from lingo_mi.common.errors import InputError
+from lingo_mi.functional.linear_map import LinearMap
+
+
+def apply_jax(linear_map: LinearMap, x: Any) -> Any:
+    """The map of an array [..., *domain_shape] of real numbers, which is computed as float32."""
+    if jnp.iscomplexobj(x):
+        raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
+    return _PRIMITIVE.bind(jnp.asarray(x, jnp.float32), map=linear_map)
+
+
+def _shape(x, linear_map):
+    return *x.shape[: x.ndim - len(linear_map.domain_shape)], *linear_map.range_shape
+
+
+def _values(x, *, map):
+    if not isinstance(x, Tracer):  # errors are ours, not JAX's around them
+        return jnp.asarray(map.on_host(np.asarray(x)))
+    result = jax.ShapeDtypeStruct(_shape(x, map), jnp.float32)
+    return jax.pure_callback(lambda x: map.on_host(np.asarray(x)), result, x)
+
+
+_PRIMITIVE = Primitive('lingo_mi_linear_map')
+_PRIMITIVE.def_impl(_values)
+_PRIMITIVE.def_abstract_eval(lambda x, *, map: ShapedArray(_shape(x, map), x.dtype))
+ad.deflinear2(_PRIMITIVE, lambda cotangent, x, *, map: [_PRIMITIVE.bind(cotangent, map=map.T)])
+batching.primitive_batchers[_PRIMITIVE] = lambda xs, axes, *, map: (
+    _PRIMITIVE.bind(jnp.moveaxis(xs[0], axes[0], 0), map=map),
+    0,
+)
+mlir.register_lowering(_PRIMITIVE, mlir.lower_fun(_values, multiple_results=False))

@@ -1,0 +1,160 @@
+"""Linear maps and their transposes, on arrays of NumPy, Dr.Jit, PyTorch and JAX."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.memory import room
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.functional.frameworks import kind_of
+from lingo_mi.projectors.upload import uploaded
+
+BASIS, TOLERANCE = 12, 1e-4  # of `norm`: vectors of its Krylov space; its own error is about the square of this
+
+
+class LinearMap(ABC):
+    """A linear map between arrays of fixed shapes. Arrays may have further axes in front, over which it maps one by one.
+
+    Attributes
+    ----------
+    domain_shape, range_shape : tuple of int
+        Of what it takes and of what it gives.
+    """
+
+    domain_shape: tuple[int, ...]
+    range_shape: tuple[int, ...]
+
+    @property
+    @abstractmethod
+    def T(self) -> LinearMap:
+        """The transpose, exact to rounding; its own transpose is this map."""
+
+    @abstractmethod
+    def on_device(self, x: Any) -> Any:
+        """The map of one flat, evaluated mi.Float [prod(domain_shape)]: mi.Float [prod(range_shape)]."""
+
+    def __call__(self, x: Any) -> Any:
+        """The map of an array [..., *domain_shape]: float32 [..., *range_shape], of the caller's kind, on its device.
+
+        It is linear, so it may be differentiated any number of times, in reverse and in forward mode (of Dr.Jit's arrays once).
+
+        Raises
+        ------
+        InputError
+            For an array of another shape, or with NaN or infinity, or if the result does not fit into memory.
+        """
+        kind = kind_of(x)
+        if kind == 'NumPy':
+            x = as_numpy(x, f'the argument of {self!r}', np.float32)
+        shape = tuple(x.shape)
+        if kind == 'Dr.Jit' and not dr.is_tensor_v(x):  # a flat array stands for one
+            shape = self.domain_shape if shape == (math.prod(self.domain_shape),) else shape
+        if shape[len(shape) - len(self.domain_shape) :] != self.domain_shape:
+            raise InputError(f'{self!r} takes arrays [..., {_text(self.domain_shape)}], not [{_text(shape)}]')
+        batch = shape[: len(shape) - len(self.domain_shape)]
+        if 4 * math.prod((*batch, *self.range_shape)) > room():
+            shape = _text((*batch, *self.range_shape))
+            raise InputError(f'{self!r}: a result [{shape}] does not fit into memory: take fewer views or voxels')
+        if kind == 'NumPy':
+            return self.on_host(x)
+        if kind == 'Dr.Jit':
+            with one_at_a_time():
+                return self._of_drjit(x, batch)
+        if kind == 'PyTorch':  # imported here, since it is heavy and may be missing
+            from lingo_mi.functional.linear_torch import apply_torch
+
+            return apply_torch(self, x)
+        from lingo_mi.functional.linear_jax import apply_jax
+
+        return apply_jax(self, x)
+
+    def on_host(self, x: np.ndarray, checked: bool = True) -> np.ndarray:
+        """The map of NumPy's array. checked: whether NaN is an error."""
+        if checked and not np.isfinite(x).all():
+            raise InputError(f'{self!r}: the array has NaN or infinity: replace those values first')
+        batch = x.shape[: x.ndim - len(self.domain_shape)]
+        out = np.empty((*batch, *self.range_shape), np.float32)
+        with one_at_a_time():
+            ensure_variant()
+            for i in np.ndindex(batch):
+                out[i] = self.on_device(uploaded(x[i])).numpy().reshape(self.range_shape)
+        return out
+
+    def _of_drjit(self, x: Any, batch: tuple[int, ...]) -> Any:
+        ensure_variant('cuda' if dr.backend_v(x) == dr.JitBackend.CUDA else 'cpu')
+        flat = mi.Float(x.array if dr.is_tensor_v(x) else x)
+        dr.make_opaque(flat)
+        if not dr.all(dr.isfinite(dr.detach(flat)))[0]:
+            raise InputError(f'{self!r}: the array has NaN or infinity: replace those values first')
+        n, parts = math.prod(self.domain_shape), []
+        for i in range(math.prod(batch)):
+            one = (
+                flat if not batch else dr.gather(mi.Float, flat, dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, i * n))
+            )
+            dr.eval(one)
+            parts.append(dr.custom(_Differentiable, self, one))
+        out = parts[0] if len(parts) == 1 else dr.concat(parts)
+        return mi.TensorXf(out, (*batch, *self.range_shape)) if dr.is_tensor_v(x) else out
+
+    def norm(self) -> float:
+        """The largest singular value, to about 1e-6, in some 20 calls of the map and of its transpose (Lanczos, by SciPy)."""
+        flat = self.aslinearoperator()
+        squared = flat.H @ flat
+        n, ones = squared.shape[0], np.ones(squared.shape[0], np.float32)
+        if not (squared @ ones).any():
+            return 0.0
+        if n <= BASIS:
+            return float(np.linalg.norm(squared @ np.eye(n, dtype=np.float32), 2) ** 0.5)
+        largest = eigsh(squared, 1, v0=ones, ncv=BASIS, tol=TOLERANCE, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
+        return float(largest[0] ** 0.5)
+
+    def aslinearoperator(self) -> LinearOperator:
+        """The map for `scipy.sparse.linalg`, between flat vectors, with `.H` and `@`."""
+        return _Flat(self)
+
+
+class _Flat(LinearOperator):
+    def __init__(self, linear_map: LinearMap):
+        super().__init__(np.float32, (math.prod(linear_map.range_shape), math.prod(linear_map.domain_shape)))
+        self.map = linear_map
+
+    def _matvec(self, x):
+        return self.map(x.reshape(self.map.domain_shape)).ravel()
+
+    def _rmatvec(self, x):
+        return self.map.T(x.reshape(self.map.range_shape)).ravel()
+
+
+class _Differentiable(dr.CustomOp):
+    """A map in Dr.Jit's graph, whose derivatives are the map and its transpose."""
+
+    def eval(self, linear_map, x):
+        self.map = linear_map
+        return linear_map.on_device(x)
+
+    def forward(self):
+        self.set_grad_out(self.map.on_device(_evaluated(self.grad_in('x'))))
+
+    def backward(self):
+        self.set_grad_in('x', self.map.T.on_device(_evaluated(self.grad_out())))
+
+    def name(self):
+        return 'linear map'
+
+
+def _evaluated(x):
+    dr.make_opaque(x)
+    return x
+
+
+def _text(shape: tuple[int, ...]) -> str:
+    return ', '.join(map(str, shape))

@@ -1,0 +1,68 @@
+"""Linear maps of PyTorch's tensors: differentiable in both modes, any number of times, and vectorised by `torch.func.vmap`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import torch
+
+from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.functional.linear_map import LinearMap
+
+ALIGNED = 64  # bytes at which Dr.Jit's own arrays begin; the alignment of others is compiled into kernels
+
+
+def apply_torch(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
+    """The map of a tensor [..., *domain_shape] of real numbers, which is computed as float32."""
+    if x.is_complex():
+        raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
+    if x.device.type not in ('cpu', 'cuda'):
+        raise InputError(f'{linear_map!r} takes tensors on the CPU or on a CUDA device, not on {x.device}')
+    return _Apply.apply(x.as_subclass(torch.Tensor).to(torch.float32), linear_map)
+
+
+class _Apply(torch.autograd.Function):
+    @staticmethod
+    def forward(x: torch.Tensor, linear_map: LinearMap) -> torch.Tensor:
+        x = x.detach().contiguous()
+        if not torch.isfinite(x).all():
+            raise InputError(f'{linear_map!r}: the tensor has NaN or infinity: replace those values first')
+        with one_at_a_time():
+            active = ensure_variant(None if x.device.type == 'cpu' else 'cuda')
+            if x.device.type == 'cpu' and active.startswith('cuda'):
+                return torch.from_numpy(linear_map.on_host(x.numpy(), checked=False))
+            batch = x.shape[: x.dim() - len(linear_map.domain_shape)]
+            if x.device.type == 'cuda':
+                torch.cuda.current_stream(x.device).synchronize()  # Dr.Jit has a stream of its own
+            out = [_one(linear_map, part) for part in x.reshape(-1, *linear_map.domain_shape)]
+            found = torch.stack(out).reshape(*batch, *linear_map.range_shape) if batch else out[0]
+        return found
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
+        ctx.map = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
+        return _Apply.apply(upstream, ctx.map.T), None
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: torch.Tensor, _: Any) -> torch.Tensor:
+        return _Apply.apply(tangent, ctx.map)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, x: torch.Tensor, linear_map: LinearMap) -> tuple:
+        return _Apply.apply(x.movedim(in_dims[0], 0), linear_map), 0
+
+
+def _one(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
+    """The map of one contiguous tensor, in whose memory Dr.Jit reads."""
+    x = x.reshape(-1)
+    if x.data_ptr() % ALIGNED:
+        x = x.clone()
+    out = mi.TensorXf(linear_map.on_device(mi.Float(x)), linear_map.range_shape).torch()
+    dr.sync_thread()
+    return out

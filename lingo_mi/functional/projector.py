@@ -1,0 +1,182 @@
+"""The projector of voxels as a linear map, A and its transpose."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lingo_mi.common.arrays import as_numpy
+from lingo_mi.common.errors import InputError, require_type, shown
+from lingo_mi.common.runtime import ensure_variant
+from lingo_mi.functional.linear_map import LinearMap
+from lingo_mi.geometry import Geometry
+from lingo_mi.geometry.rays import Index
+from lingo_mi.projectors.fastest import projector_class
+from lingo_mi.projectors.grid_pair import GridPair
+from lingo_mi.projectors.stack import Block
+
+MODELS = 'joseph', 'exact'
+
+
+class Projector(LinearMap):
+    """Line integrals of a voxel volume in the views of a scan, A, and backprojection, its transpose A.T.
+
+    `A(volume)` takes densities [x, y, z], per mm, and gives line integrals [view, v, u] without a unit. `A.T(projections)` gives
+    the sum over all pixels of their value times the length, in mm, that each voxel has in their rays. A.T is the transpose of A
+    to rounding. Both take and give arrays of NumPy, Dr.Jit, PyTorch or JAX, with further axes in front, and are differentiable
+    in them. All is computed in float32.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The scanner and the grid of the volume.
+    model : {'joseph', 'exact'}
+        'joseph' interpolates in the slices of voxel centres (error about 0.5 % of the line integrals); 'exact' integrates the
+        trilinear interpolant exactly, and takes three to four times as long. A source beside or inside the volume has the exact
+        one in either case.
+    views : slice or sequence of int, optional
+        Of the geometry (default: all).
+    valid : array of bool, optional
+        Pixels that count, [view, v, u] or [v, u]. Others have zeros in the projections and add nothing to the transpose.
+
+    Attributes
+    ----------
+    geometry : Geometry
+        Of the views that were chosen.
+    model : str
+        The one that is used.
+    domain_shape, range_shape : tuple of int
+        (x, y, z) and (view, v, u).
+
+    Raises
+    ------
+    InputError
+        For another type, an unknown model, views that the geometry does not have, and a mask of another shape.
+
+    References
+    ----------
+    Joseph, "An improved algorithm for reprojecting rays through pixel images", IEEE TMI 1 (1982). The transpose is matched: a
+    voxel gathers from the pixels whose rays meet it, with the same weights.
+
+    Examples
+    --------
+    SIRT in eight lines:
+
+    >>> import numpy as np, lingo_mi as lm
+    >>> panel, voxels = dict(nDetector=(8, 24), dDetector=1), dict(nVoxel=(16, 16, 8), dVoxel=1)
+    >>> A = lm.Projector(lm.Geometry.parallel(**panel, **voxels, angles=lm.circular(12)))
+    >>> b = A(np.ones(A.domain_shape))
+    >>> rows, columns = A(np.ones(A.domain_shape)), A.T(np.ones(A.range_shape))
+    >>> x = np.zeros(A.domain_shape, np.float32)
+    >>> for _ in range(20):
+    ...     x += A.T((b - A(x)) / np.maximum(rows, 1e-6)) / np.maximum(columns, 1e-6)
+    >>> bool(np.linalg.norm(A(x) - b) < 0.01 * np.linalg.norm(b))
+    True
+    """
+
+    def __init__(
+        self, geometry: Geometry, *, model: str = 'joseph', views: Index | None = None, valid: ArrayLike | None = None
+    ):
+        require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
+        if model not in MODELS:
+            raise InputError(f'model is {" or ".join(map(repr, MODELS))}, not {shown(model)}')
+        mask = None if valid is None else _mask(valid, (len(geometry), *geometry.nDetector))
+        if views is not None:
+            geometry, mask = geometry.subset(views), None if mask is None else mask[views]
+        if len(geometry) == 0:
+            raise InputError('the projector has no views: choose at least one')
+        self.geometry, self.valid = geometry, mask
+        self._kind = GridPair if model == 'exact' else projector_class(geometry)
+        self.model = 'exact' if self._kind is GridPair else 'joseph'
+        self.domain_shape, self.range_shape = geometry.grid.shape, (len(geometry), *geometry.nDetector)
+        self._built: dict[str, tuple[Any, Block]] = {}  # by Mitsuba's variant
+
+    @cached_property
+    def T(self) -> Backprojector:
+        """The transpose: projections [..., view, v, u] to a volume [..., x, y, z]."""
+        return Backprojector(self)
+
+    def __getitem__(self, views: int | Index) -> Projector:
+        """The projector of some of the views; one view keeps its axis."""
+        if isinstance(views, int | np.integer):
+            views = [int(views)]
+        return Projector(self.geometry, model=self.model, views=views, valid=self.valid)
+
+    def __len__(self) -> int:
+        return len(self.geometry)
+
+    def __repr__(self) -> str:
+        return f'Projector({self.model}, {_by(self.domain_shape)} voxels to {_by(self.range_shape)} pixels)'
+
+    def on_device(self, x: Any) -> Any:
+        pair, block = self._pair()
+        integrals, _ = pair.forward(x, block)
+        out = dr.empty(mi.Float, math.prod(self.range_shape))
+        dr.scatter(out, integrals, _in_rows(pair, len(self)), mode=dr.ReduceMode.Permute)
+        dr.eval(out)
+        return out
+
+    def backproject(self, y: Any) -> Any:
+        """`A.T.on_device`."""
+        pair, block = self._pair()
+        out = pair.adjoint(dr.gather(mi.Float, y, _in_rows(pair, len(self))), block)
+        dr.eval(out)
+        return out
+
+    def _pair(self) -> tuple[Any, Block]:
+        """The projector of the active variant, and all views."""
+        variant = mi.variant() or ensure_variant()
+        if variant not in self._built:
+            self._built[variant] = self._kind(self.geometry, self.valid), Block.of(range(len(self)))
+        return self._built[variant]
+
+
+class Backprojector(LinearMap):
+    """The transpose of a `Projector`.
+
+    Attributes
+    ----------
+    T : Projector
+        Whose transpose this is.
+    """
+
+    def __init__(self, projector: Projector):
+        self._projector = projector
+        self.domain_shape, self.range_shape = projector.range_shape, projector.domain_shape
+
+    @property
+    def T(self) -> Projector:
+        return self._projector
+
+    def on_device(self, x: Any) -> Any:
+        return self._projector.backproject(x)
+
+    def __repr__(self) -> str:
+        return f'{self._projector!r}.T'
+
+
+def _in_rows(pair: Any, views: int) -> Any:
+    """Where the pixels of device images, [view, u, v], stand in projections, [view, v, u]."""
+    (n_v, n_u), index = pair.panel, dr.arange(mi.UInt, views * pair.pixels)
+    column = index // n_v
+    view = column // n_u
+    return (view * n_v + index - column * n_v) * n_u + column - view * n_u
+
+
+def _mask(valid: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    mask = as_numpy(valid, 'valid')
+    if mask.dtype != bool or mask.shape not in (shape, shape[1:]):
+        raise InputError(
+            f'valid must be true or false for each pixel, {_by(shape)} or {_by(shape[1:])}, not {mask.dtype}, {_by(mask.shape)}'
+        )
+    return np.ascontiguousarray(np.broadcast_to(mask, shape))
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return ' x '.join(map(str, shape))
