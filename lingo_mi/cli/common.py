@@ -189,9 +189,9 @@ def _of_numbers(dtype: str) -> bool:
         return False
 
 
-def check_seed(seed: int) -> None:
+def check_seed(seed: int, flag: str = '--seed') -> None:
     """Raises InputError for a --seed that not every generator of random numbers takes."""
-    parsing.seed(seed, '--seed')
+    parsing.seed(seed, flag)
 
 
 def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0, slab: int = 0) -> Any:

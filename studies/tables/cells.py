@@ -15,7 +15,7 @@ import functools
 import hashlib
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.interrupts import between_steps
 from lingo_mi.common.progress import Progress
 from lingo_mi.completion.views import insert_views
+from lingo_mi.files.scans import read_scan
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fit import Fit as Fitted
 from lingo_mi.fitting.loop import run
@@ -43,7 +44,8 @@ from lingo_mi.storage.file_access import replacing
 from lingo_mi.storage.output_folder import CHECKPOINT
 from lingo_mi.studies.provenance import provenance
 from lingo_mi.studies.simulated import LARGEST, counting, noisy
-from lingo_mi.studies.tables.objects import PHANTOMS, VOLUMES, averaged, load_object
+from lingo_mi.studies.tables.objects import averaged, load_object, scan_digest, scans_in
+from lingo_mi.studies.tables.record import Record
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
 NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d_r2', 'ipsd'), ('psnr_3d_r2', 'ssim_3d_r2')  # of a fit's views; of a volume
@@ -73,6 +75,9 @@ class Scale:
     photons      a pixel in the open beam, by which the views to fit are measured; 0: without noise
     electronic_noise   of the detector, standard deviation in photons
     longest      line integral of a scan, to which its density is scaled when photons are counted
+    first        whether the views to fit are the first ones of the scan, as in the released code of X-Gaussian and SAX-NeRF,
+                 instead of evenly spaced ones
+    data         folder of scans that take the place of the objects, see `objects.scans_in`; '': objects are scanned
     """
 
     size: int
@@ -84,12 +89,27 @@ class Scale:
     photons: float = 0.0
     electronic_noise: float = 0.0
     longest: float = LARGEST
+    first: bool = False
+    data: str = ''
+
+    @property
+    def shrink(self) -> float:
+        """How much smaller than the paper's volumes these are, along a side."""
+        return 1.0 if self.data else self.size / PAPER_SIZE
 
 
-# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians.
+PAPER_SIZE = 256
+# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians. V_S is made smaller, too, so
+# that cells have the paper's size in parts of the object.
 SCALES = {
     'small': Scale(96, 192, 7000, (5000,), ('foot', 'chest', 'engine', 'aneurism')),
-    'paper': Scale(256, 512, 50_000, (5000, 15_000, 30_000), (*PHANTOMS, *VOLUMES)),
+    'paper': Scale(
+        PAPER_SIZE,
+        512,
+        50_000,
+        (5000, 15_000, 30_000),
+        ('foot', 'chest', 'engine', 'aneurism', 'chest_lidc0314', 'head_fsrt'),
+    ),
 }
 
 
@@ -125,19 +145,24 @@ class Volume:
 
 
 def method_for(fit: Fit, scale: Scale) -> Method:
-    """The method of a fit, with the scale's number of Gaussians unless the fit names one, or the start has no such option."""
+    """The method of a fit, with the scale's number of Gaussians and voxel scaling where the fit does not name them."""
     method = method_of(fit.method)
     if 'n_points' in method.flat() and 'n_points=' not in fit.method:
         method = method.changed(n_points=scale.n_points)
+    if 'V_S' in method.flat() and 'V_S=' not in fit.method:
+        method = method.changed(V_S=method.flat()['V_S'] * scale.shrink)
     return method if fit.iterations is None else method.changed(iterations=fit.iterations)
 
 
 class Cells:
     """The cells of one scale and seed below a folder."""
 
-    def __init__(self, folder: Path, scale: Scale, seed: int = 0, command: str | None = None):
-        """command: to be kept with the cells; None: this process's."""
+    def __init__(
+        self, folder: Path, scale: Scale, seed: int = 0, command: str | None = None, record: Record | None = None
+    ):
+        """command: to be kept with the cells, None: this process's; record: has the numbers of cells without their files."""
         self.folder, self.scale, self.seed, self.command = Path(folder), scale, seed, command
+        self.record = record
         self.dataset = functools.lru_cache(1)(self._dataset)
         self._cloud = functools.lru_cache(1)(self._cloud)
         self._completed = functools.lru_cache(1)(self._completed)
@@ -145,9 +170,14 @@ class Cells:
     def path(self, cell: Fit | Volume) -> Path:
         """Where a cell is stored."""
         fit = cell.fit if isinstance(cell, Volume) else cell
-        of_scan = dict(
-            size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed
-        )
+        if self.scale.data:
+            of_scan = dict(scan=scan_digest(scans_in(Path(self.scale.data))[fit.object]), seed=self.seed)
+        else:
+            of_scan = dict(
+                size=self.scale.size, finer=self.scale.finer, pixels=self.scale.pixels, scanned=SCANNED, seed=self.seed
+            )
+        if self.scale.first:
+            of_scan['first'] = True
         if self.scale.photons:
             of_scan |= {name: getattr(self.scale, name) for name in ('photons', 'electronic_noise', 'longest')}
         where = self.folder / fit.object / f'{fit.views}_views'
@@ -168,13 +198,23 @@ class Cells:
         return self.path(fit).parents[1]
 
     def get(self, cell: Fit | Volume) -> dict | None:
-        """The numbers of a cell, or None where it has not been computed, or its file is damaged or lacks a number."""
+        """The numbers of a cell, from its file or the record; None if it is in neither, or damaged."""
+        needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
         try:
             found = json.loads(self.path(cell).read_text(encoding='utf-8'))
         except (OSError, ValueError):
-            return None
-        needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
-        return found if isinstance(found, dict) and found.keys() >= set(needed) else None
+            found = None
+        if not (isinstance(found, dict) and found.keys() >= set(needed)):
+            found = None if self.record is None else self.record.get(self._key(cell))
+        return found if found and found.keys() >= set(needed) else None
+
+    def record_all(self, cells: Iterable[Fit | Volume]) -> None:
+        """Add those of the cells that are stored to the record."""
+        if self.record is not None:
+            self.record.add({self._key(cell): found for cell in cells if (found := self.get(cell)) is not None})
+
+    def _key(self, cell: Fit | Volume) -> str:
+        return self.path(cell).relative_to(self.folder).as_posix()
 
     def compute(self, cell: Fit | Volume, label: str, report: Callable[..., None] | None = None) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
@@ -219,6 +259,8 @@ class Cells:
         return failed
 
     def _dataset(self, name: str) -> Dataset:
+        if self.scale.data:
+            return read_scan(scans_in(Path(self.scale.data))[name])
         scanned = load_object(name, self.scale.size * self.scale.finer)
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
             found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
@@ -235,7 +277,10 @@ class Cells:
         return replace(scan, projections=noisy(scan.projections * unit, detector, self.seed) / unit)
 
     def _measured(self, fit: Fit) -> Dataset:
-        return choose_views(self.dataset(fit.object), fit.views)
+        dataset = self.dataset(fit.object)
+        if self.scale.first:
+            return replace(dataset, train=dataset.train.subset(np.arange(fit.views)))
+        return choose_views(dataset, fit.views)
 
     def _fit(self, cell: Fit, path: Path, label: str, report: Callable[..., None] | None = None) -> dict:
         dataset, method, saved = self._measured(cell), method_for(cell, self.scale), path.with_name(CHECKPOINT)

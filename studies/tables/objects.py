@@ -1,7 +1,8 @@
-"""The objects of the paper's tables: phantoms, and volumes in the folder that LINGO_MI_DATA names."""
+"""The objects of the paper's tables: phantoms, volumes in the folder that LINGO_MI_DATA names, and scans of X3D's kind."""
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -11,7 +12,9 @@ from skimage.transform import resize_local_mean
 
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
+from lingo_mi.files.r2 import META
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.storage.output_folder import digest
 
 PHANTOMS = 'foot', 'chest'
 VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
@@ -40,6 +43,30 @@ def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
             f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}'
         )
     return found
+
+
+def scans_in(folder: Path) -> dict[str, Path]:
+    """The scans of X3D's kind in a folder, by name: pickles NAME_50.pickle of SAX-NeRF and NAF, and folders of R2-Gaussian.
+
+    Raises InputError if there is none.
+    """
+    if not folder.is_dir():
+        raise InputError(f'{folder}: is not a folder; give the folder with the scans')
+    pickles = {path.stem.removesuffix('_50'): path for path in folder.iterdir() if path.suffix in ('.pickle', '.pkl')}
+    folders = {path.name: path for path in folder.iterdir() if (path / META).is_file()}
+    found = dict(sorted((pickles | folders).items()))
+    if not found:
+        raise InputError(f'{folder}: holds neither pickles of SAX-NeRF or NAF nor folders of R2-Gaussian')
+    return found
+
+
+@functools.cache
+def scan_digest(path: Path) -> str:
+    """A digest of a scan's content; of a folder, of its geometry file and of the names and sizes of all others."""
+    if path.is_file():
+        return digest(path)
+    others = [(str(f.relative_to(path)), f.stat().st_size) for f in sorted(path.rglob('*')) if f.is_file()]
+    return f'{digest(path / META)} {others}'
 
 
 def _file(name: str) -> Path | None:

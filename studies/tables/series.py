@@ -12,6 +12,7 @@ from lingo_mi.storage.file_access import leftovers
 from lingo_mi.storage.folder_lock import locked
 from lingo_mi.studies.provenance import command
 from lingo_mi.studies.tables.cells import Cells, Fit, Scale, Volume, method_for
+from lingo_mi.studies.tables.record import Record
 
 
 def compute_missing(
@@ -31,7 +32,7 @@ def compute_missing(
             name,
             sum(map(steps_of(cells.scale), own)),
             compute_series,
-            (cells.folder, cells.scale, cells.seed, command(), own),
+            (cells.folder, cells.scale, cells.seed, command(), cells.record, own),
         )
         for name, own in series.items()
     ]
@@ -53,11 +54,19 @@ def steps_of(scale: Scale) -> Callable[[Fit | Volume], int]:
 
 
 def compute_series(
-    folder: Path, scale: Scale, seed: int, command: str, series: Sequence[Fit | Volume], *, report: Callable[..., None]
+    folder: Path,
+    scale: Scale,
+    seed: int,
+    command: str,
+    record: Record | None,
+    series: Sequence[Fit | Volume],
+    *,
+    report: Callable[..., None],
 ) -> None:
     """Compute those cells of a series that are not stored. Raises InputError where one of them cannot be computed, after the
     others."""
     cells, done, failed = _cells(folder, scale, seed, command), 0, []
+    cells.record = record
     first = series[0].fit if isinstance(series[0], Volume) else series[0]
     home = cells.folder_of(first)
     with locked(home):

@@ -12,19 +12,22 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import lingo_mi as lm
 from helpers.same import fits_alike
 from helpers.script import FIT, run
 from lingo_mi.common.errors import InputError
+from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.fitting.methods.cloud_method import CloudMethod
 from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.geometry import Grid
 from lingo_mi.phantoms import make
 from lingo_mi.reconstruction.run import run_algorithm
+from lingo_mi.scene.simulate import choose_views
 from lingo_mi.studies.tables import cells as tables
 from lingo_mi.studies.tables.cells import SCALES, Cells, Fit, Scale, Volume, method_for
-from lingo_mi.studies.tables.objects import available, load_object
-from lingo_mi.studies.tables.report import ABLATION, groups, markdown, plan, results
+from lingo_mi.studies.tables.objects import available, load_object, scan_digest, scans_in
+from lingo_mi.studies.tables.report import ABLATION, CONTROLS, groups, markdown, plan, results
 
 TABLES = FIT.with_name('tables.py')
 TINY = Scale(16, 24, 200, (20,), ('foot',))
@@ -129,7 +132,7 @@ def test_the_parts_of_lingo():
     base = method_for(cells['+ + +'][0], TINY)
     for parts, (fit, _) in cells.items():
         scale, start, voxels = (part == '+' for part in parts.split())
-        of_start = dict(start='masks', V_S=20.0 if voxels else 1.0) if start else dict(start='fdk')
+        of_start = dict(start='masks', V_S=20.0 * 16 / 256 if voxels else 1.0) if start else dict(start='fdk')
         changes = dict(loss_scale='dynamic' if scale else 'none', **of_start)
         assert method_for(fit, TINY).flat() == base.changed(**changes).flat()
 
@@ -137,7 +140,7 @@ def test_the_parts_of_lingo():
 def test_opacities_have_no_row_of_means(tmp_path):
     found = groups('ct', [4], [20], ['3dgs'])
     cells = mock.Mock(get=lambda cell: dict(psnr_3d_r2=30.0, ssim_3d_r2=0.9))
-    rows = [(row['second'], row['object']) for row in results(found, ['foot'], cells)]
+    rows = [(row['second'], row['object']) for row in results(found, ['foot'], [cells])]
     assert rows == [(a, name) for a in ('fdk', 'sart', 'asd-pocs') for name in ('foot', 'mean of 1')] + [
         ('refined', 'foot'),
         ('finer', 'foot'),
@@ -153,16 +156,16 @@ def test_opacities_have_no_row_of_means(tmp_path):
 def test_paper_beside_ours():
     found = groups('views', [5, 25], [5000, 30_000], ['r2', 'lingo', 'fast'])
     cells = mock.Mock(get=lambda cell: dict(psnr_2d_r2=30.0 + cell.views, ssim_2d_r2=0.9, ipsd=None))
-    text = markdown('views', found, results(found, ['a', 'b'], cells))
+    text = markdown('views', found, results(found, ['a', 'b'], [cells]))
     assert '| 25 | 30000 | paper | 46.09 | 0.9899 | 0.1129 | 47.04 | 0.9911 | 0.0233 | – | – | – |' in text
     assert '| 5 | 5000 | mean of 2 | 35.00 | 0.9000 | – |' in text
     found = groups('ct', [10], [30_000], ['lingo'])
     nothing = mock.Mock(get=lambda cell: None)
-    text = markdown('ct', found, results(found, ['a'], nothing))
+    text = markdown('ct', found, results(found, ['a'], [nothing]))
     assert '| 10 | asd-pocs | paper | 25.64 | 0.7215 | 28.90 | 0.8252 |' in text
     found = groups('ablation', [25], [30_000], [])
     assert '| 25 | + + + | paper | 0.47 | 47.04 | 0.9911 | 0.0289 | 32.91 | 0.8924 |' in markdown(
-        'ablation', found, results(found, ['a'], nothing)
+        'ablation', found, results(found, ['a'], [nothing])
     )
 
 
@@ -268,6 +271,123 @@ def test_killed(tmp_path):
     assert code == 0 and '2 of 2 cells' in text and second.exists() and first.stat().st_mtime_ns == before, err
 
 
+# ---- several seeds, scans of other people ----------------------------------------------------------------------------
+
+
+def test_means_over_seeds_and_objects_with_their_errors():
+    """Gains are differences object by object, so what makes an object easy for every method is no part of their error."""
+    found = groups('views', [5], [20], ['r2', 'lingo'])
+    values = {
+        ('a', 'r2'): (30.0, 32.0),
+        ('a', 'lingo'): (32.0, 34.0),
+        ('b', 'r2'): (40.0, 44.0),
+        ('b', 'lingo'): (44.0, 46.0),
+    }
+
+    def cells(seed):
+        return mock.Mock(
+            get=lambda cell: dict(psnr_2d_r2=values[cell.object, cell.method][seed], ssim_2d_r2=0.9, ipsd=None)
+        )
+
+    rows = {row['object']: row['columns'] for row in results(found, ['a', 'b'], [cells(0), cells(1)])}
+    shown = {name: (c['r2']['psnr_2d_r2'], c['lingo']['psnr_2d_r2']) for name, c in rows.items() if name != 'paper'}
+    assert shown.pop('spread over seeds') == pytest.approx((np.sqrt((2 + 8) / 2), np.sqrt(2)))
+    assert shown == {
+        'a': (31, 33),
+        'b': (42, 45),
+        'mean of 2': (36.5, 39),
+        'standard error': pytest.approx((5.5, 6)),
+        'gain over r2': (0, 2.5),
+        'its standard error': pytest.approx((0, 0.5)),
+    }
+    assert rows['mean of 2']['r2']['ipsd'] is None
+
+
+def test_gains_of_rows_are_over_the_first():
+    found = groups('controls', [25], [20], [])
+    assert [group.second for group in found] == list(CONTROLS)
+    for group in found:
+        method_for(group.columns[0].cell('foot'), TINY)  # has these options
+    quality = {'r2': 30.0, 'lingo': 31.0}
+
+    def get(cell):
+        if cell.method not in quality:
+            return None
+        return dict(
+            psnr_2d_r2=quality[cell.method] + (cell.object == 'b'), ipsd=0.1, gaussians=9, psnr_3d_r2=30, ssim_3d_r2=1
+        )
+
+    rows = results(found, ['a', 'b'], [mock.Mock(get=get)])
+    gains = [(row['second'], row['columns']['fit']['psnr_2d_r2']) for row in rows if row['object'] == 'gain over r2']
+    assert gains == [('lingo', 1.0)]
+
+
+@pytest.fixture(scope='module')
+def theirs(tmp_path_factory):
+    """A folder with a pickle as SAX-NeRF's and a folder as R2-Gaussian's."""
+    folder = tmp_path_factory.mktemp('x3d')
+    with mock.patch.object(tables, 'SCANNED', 6):
+        data = Cells(folder, Scale(16, 24, 200, (20,), ('foot',))).dataset('foot')
+    write_scan(folder / 'foot_50.pickle', data, 'naf')
+    write_scan(folder / 'cone_foot', data, 'r2')
+    (folder / 'notes.txt').write_text('mine')
+    return folder
+
+
+def test_scans_of_a_folder(theirs, tmp_path):
+    """The numbers are those of fits to the files, beside what is published of a scene of that name."""
+    assert list(scans_in(theirs)) == ['cone_foot', 'foot']
+    options = '--views', '4', '--iterations', '20', '--methods', 'r2:n_points=200', 'xgaussian', '--out', tmp_path
+    code, text, err = run(TABLES, 'scenes', '--data', theirs, *options)
+    assert code == 0 and '2 of 2 cells' in text and 'Scans as they are in their files' in text, err
+    rows = {row['object']: row['columns'] for row in json.loads((tmp_path / 'scenes.json').read_text())}
+    assert rows['foot']['R2-Gaussian'] == {'psnr_3d_r2': 32.0} and rows['cone_foot']['SAX-NeRF'] is None
+    data = read_scan(theirs / 'foot_50.pickle')
+    fit = lm.fit(choose_views(data, 4), lm.R2().changed(n_points=200, iterations=20), progress=False)
+    assert rows['foot']['r2:n_points=200']['psnr_3d_r2'] == pytest.approx(
+        fit.metrics()['psnr_3d_r2'], rel=fits_alike(1e-5)
+    )
+    assert rows['cone_foot']['r2:n_points=200']['psnr_3d_r2'] == pytest.approx(fit.metrics()['psnr_3d_r2'], abs=0.1)
+    with mock.patch.object(Cells, 'compute', side_effect=AssertionError):
+        assert run(TABLES, 'scenes', '--data', theirs, *options)[0] == 0
+    code, text, err = run(TABLES, 'ct', '--data', theirs, *options, '--objects', 'foot', '--algorithms', 'fdk')
+    assert code == 0 and '| 4 | fdk | foot |' in text, err
+
+
+def test_another_file_of_the_same_name_is_another_scan(theirs, tmp_path):
+    (tmp_path / 'foot_50.pickle').write_bytes((theirs / 'foot_50.pickle').read_bytes())
+    here, there = (Cells(tmp_path, replace(TINY, data=str(folder))) for folder in (tmp_path, theirs))
+    fit = Fit('foot', 4, 'r2', 20)
+    assert here.path(fit) == there.path(fit) != Cells(tmp_path, TINY).path(fit)
+    (tmp_path / 'foot_50.pickle').write_bytes(b'other')
+    scan_digest.cache_clear()
+    assert here.path(fit) != there.path(fit)
+
+
+def test_a_record_goes_on_without_the_files(tmp_path):
+    record = tmp_path / 'kept' / 'cells.json'
+    options = '--views', '4', '--methods', 'r2', '--iterations', '20', '--record', record
+    assert script('views', tmp_path / 'a', *options, '--seeds', '0', '1')[0] == 0
+    kept = json.loads(record.read_text())
+    assert len(kept) == 2 and len(record.read_text().splitlines()) == 4
+    assert all('history' not in cell and cell['psnr_3d_r2'] > 0 and 'date' in cell for cell in kept.values())
+    with mock.patch.object(Cells, 'compute', side_effect=AssertionError):
+        code, text, err = script('views', tmp_path / 'b', *options, '--seeds', '0', '1')
+    assert code == 0 and '2 of 2 cells' in text and 'seeds 0, 1' in text, err
+    code, text, err = script('ct', tmp_path / 'b', *options, '--algorithms', 'fdk')  # needs the cloud again
+    assert code == 0 and '3 of 3 cells' in text, err
+    record.write_text('[1]')
+    code, _, err = script('views', tmp_path / 'c', *options)
+    assert code == 2 and 'is not a record of cells' in err and err.count('\n') == 1
+
+
+def test_the_first_views(tmp_path):
+    first, even = Cells(tmp_path, replace(TINY, first=True)), Cells(tmp_path, TINY)
+    fit = Fit('foot', 4, 'r2', 20)
+    np.testing.assert_array_equal(first._measured(fit).train.projections, even.dataset('foot').train.projections[:4])
+    assert first.path(fit) != even.path(fit)
+
+
 # ---- objects and bad input -------------------------------------------------------------------------------------------
 
 
@@ -368,7 +488,7 @@ def test_methods():
         (['views', '--views', '26'], '25'),
         (['views', '--views', '0'], '25'),
         (['ct', '--iterations', '0'], 'at least 1'),
-        (['views', '--seed', '-1'], 'seed must be a whole number from 0 on'),
+        (['views', '--seeds', '-1'], '--seeds must be a whole number from 0 on'),
         (['figures'], 'invalid choice'),
         (['views', '--methods', 'nerf'], 'there is no method'),
         (['ct', '--methods', 'r2:V=1'], 'unknown setting'),
@@ -376,6 +496,8 @@ def test_methods():
         (['ct', '--photons', '-1'], 'photons'),
         (['ct', '--electronic-noise', '10'], 'needs photons'),
         (['ct', '--photons', '1000', '--longest', 'nan'], '--longest must be above 0'),
+        (['views', '--data', 'nowhere'], 'nowhere: is not a folder'),
+        (['views', '--data', '.', '--scale', 'small'], '--data has scans as they are'),
     ],
 )
 def test_bad_input(args, message, tmp_path):
