@@ -1,6 +1,6 @@
-"""Make the pictures of the pages on concepts from a fit of the foot: `python docs/make_pictures.py`, two minutes.
+"""Make the pictures of the pages on concepts from fits of the foot: `python docs/make_pictures.py`, six minutes.
 
-25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (from a projection to a fitted cloud)
+25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (LINGO, from a projection to a fitted cloud)
 and docs/figures/two_stages.png (volumes from the measured views, from completed ones, and refined).
 """
 
@@ -19,15 +19,14 @@ matplotlib.use('agg')
 import matplotlib.pyplot as plt
 
 FIGURES = Path(__file__).resolve().parent / 'figures'
-VIEWS, ITERATIONS, ALL_VIEWS = 25, 800, 100
+VIEWS, STEPS, ALL_VIEWS = 25, 5000, 100  # steps of LINGO
 LOW, HIGH = '#f2b705', '#d1495b'
 
 
 def main():
     data = lm.simulate('x3d_foot', views=VIEWS, parameters=dict(pixels=256, pixel_size=2))
-    fit = lm.fit(data, lm.Fast(start=lm.MaskStart(density='fdk')), iterations=ITERATIONS)
-    lingo_steps(data, fit)
-    two_stages(data, fit)
+    lingo_steps(data, lm.fit(data, lm.LINGO(iterations=STEPS)))
+    two_stages(data, lm.fit(data, lm.Fast()))
 
 
 def lingo_steps(data, fit):
@@ -58,7 +57,7 @@ def lingo_steps(data, fit):
     cells.set_title(f'3  valid voxels of {grid[0]}³\n{len(low):,} low, {len(high):,} high')
 
     scatter(points, start.points / geometry.grid.scale, start.density, geometry)
-    points.set_title(f'4  initial cloud\n{len(start):,} points, FDK densities')
+    points.set_title(f'4  initial cloud\n{len(start):,} points, mean pixels for densities')
     scatter(cloud, fit.gaussians.means, fit.gaussians.density, geometry)
     cloud.set_title(f'5  fitted cloud\n{len(fit):,} Gaussians after {fit.steps} steps')
     slices.imshow(sagittal(fit.volume()), cmap='gray', vmin=0, vmax=data.volume.max())

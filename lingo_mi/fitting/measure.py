@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lingo_mi.fitting.fitted_model import FittedModel
+from lingo_mi.fitting.lingo_summary import lingo_summary
 from lingo_mi.fitting.stopping import sentence
 from lingo_mi.metrics import quality as metrics
 from lingo_mi.metrics.ipsd import ipsd, reverse_distance
@@ -44,6 +45,7 @@ def measure(fit: FittedModel) -> dict:
         ms_per_iteration=1e3 * fit.checkpoint.seconds / steps,
         history=fit.history,
         **({} if fit.search is None else dict(stopping=sentence(fit.search), search=fit.search)),
+        **({} if (lingo := lingo_summary(fit)) is None else dict(lingo=lingo)),
     )
 
 
@@ -89,6 +91,7 @@ def summary(result: dict) -> str:
             f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
             f'{result["seconds_fit"]:.0f} s to fit',
             *([f'                {result["stopping"]}'] if 'stopping' in result else []),
+            *([f'LINGO           {result["lingo"]}'] if 'lingo' in result else []),
         ]
     )
 

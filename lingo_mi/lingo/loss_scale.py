@@ -8,16 +8,16 @@ import drjit as dr
 import mitsuba as mi
 
 BINS = 256
+FLOOR = 0.01  # least T_g, which keeps the scale of an empty image finite (paper, section III-C)
 LANES = 32  # histograms per CPU thread
 
 
-def loss_scale(image: Any, floor: float = 0.01) -> Any:
-    """T_g + 1 / (4 T_g) with T_g = max(floor, `otsu_on_device`(image)): Float of width 1, detached.
+def loss_scale(image: Any) -> Any:
+    """T_g + 1 / (4 T_g) with T_g = max(FLOOR, `otsu_on_device`(image)): Float of width 1, detached.
 
     image : Float [N], line integrals
-    floor : > 0; keeps the scale of an empty image finite
     """
-    threshold = dr.maximum(otsu_on_device(image), floor)
+    threshold = dr.maximum(otsu_on_device(image), FLOOR)
     return threshold + 0.25 / threshold
 
 

@@ -77,6 +77,12 @@ SETTINGS = {
     'stopping': Number(
         'Early stop', '', '', 'Views that were held out told after which step more of them no longer helped.'
     ),
+    'lingo': Number(
+        "LINGO's parts",
+        '',
+        '',
+        'Otsu masks and the voxels that lie in those of all views, where Gaussians start; the factor on the loss.',
+    ),
     'seed': Number('Seed', '', '', 'Of every random choice; the same seed gives the same result.'),
     'variant': Number('Mitsuba variant', '', '', 'CPU or GPU.'),
     'versions': Number('Versions', '', '', 'The software that computed this result.'),

@@ -21,9 +21,9 @@ from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
-# The paper sets the path length to 1, so that a pixel p = integral of sigma "is" sigma. A point's mean pixel is then a density
-# up to a factor, which depends on the object's size and on the overlap of the Gaussians. The paper names no factor of its own.
-FACTORS = {'paper': 0.15, 'raw': 1.0}
+# The paper sets the path length to 1, so that a pixel p = integral of sigma "is" sigma, and a point's mean pixel its density.
+# True densities differ by a factor that depends on the object's size and on the overlap of the Gaussians.
+FACTORS = {'paper': 1.0, 'r2': 0.15}
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,9 @@ class MaskStart(NumberedStart):
     outside : {'invalid', 'ignore', 'auto'}
         What a cell counts that projects outside a view's image; see `voxel_filter.valid_voxels`. 'invalid' is the paper's,
         'ignore' serves truncated scans, 'auto' is 'ignore' if the object reaches the edge of the panel in some view.
-    density : {'lsq', 'paper', 'raw', 'fdk'}
-        The factor on the mean pixel: 'paper' takes R2-Gaussian's 0.15, 'raw' 1, 'lsq' the one that fits the projections best.
+    density : {'lsq', 'paper', 'r2', 'fdk'}
+        The factor on the mean pixel: 'paper' takes 1, 'r2' the 0.15 that R2-Gaussian puts on FDK densities, and 'lsq' the factor
+        that fits the projections best.
         'fdk' takes an FDK volume at the point in place of the mean pixel, times a factor as 'lsq' does; a scan that FDK cannot
         reconstruct has 'lsq' instead.
     """
@@ -86,7 +87,7 @@ class MaskStart(NumberedStart):
         rays, shape, half = scan.geometry.normalised_rays(), scan.geometry.grid.shape, scan.geometry.grid.half
         projections, valid = np.asarray(scan.normalised, np.float32), scan.valid
         if self.density not in FACTORS and render is None:
-            raise InputError(f"density '{self.density}' needs a render function: give one, or take 'paper' or 'raw'")
+            raise InputError(f"density '{self.density}' needs a render function: give one, or take 'paper' or 'r2'")
         if self.density == 'fdk' and fdk is None:
             raise InputError("density 'fdk' needs a reconstruction: give one, or take another density")
 
@@ -139,6 +140,7 @@ class MaskStart(NumberedStart):
             'repeats': int(repeats),
             'outside': outside,
             'T_high': float(image_masks.t_high.mean()),
+            'T_low': float(image_masks.t_low.mean()),
         }
         return StartingCloud(points, density * factor, spacing, info)
 

@@ -54,7 +54,7 @@ def test_values(name, text, value):
         ('rate_centre', '0', 'in [1e-12, 1000]'),
         ('occupancy_voxels', '0', 'in [1, 1e+06]'),
         ('high_fraction', '2', 'in [0, 1]'),
-        ('density', 'xyz', "density is 'paper', 'raw', 'lsq' or 'fdk', not 'xyz'"),
+        ('density', 'xyz', "density is 'paper', 'r2', 'lsq' or 'fdk', not 'xyz'"),
         ('start', 'lingo', "'masks'"),
         ('densify', 'double', "'clone', 'opacities' or 'halve', not 'double'"),
         ('coarse_share', '0.5', 'unknown'),

@@ -20,10 +20,10 @@ def scan(views=24, **changes):
     return ellipsoids(geometry(angles=circular(views), **changes), BALL)
 
 
-def start(of, n_points=300, seed=0, factor=1.0) -> StartingCloud:
+def start(of, n_points=300, seed=0, factor=1.0, within='masks') -> StartingCloud:
     """The cloud of a scan whose rendering is its projections divided by `factor`."""
     render = lambda *a: of.normalised[a[-1]] / factor  # noqa: E731
-    return EdgeStart(n_points).cloud(of, np.random.default_rng(seed), render, 1.0)
+    return EdgeStart(n_points, within).cloud(of, np.random.default_rng(seed), render, 1.0)
 
 
 def distances(cloud, of):
@@ -94,3 +94,31 @@ def test_a_single_slice():
 def test_nothing_to_see(ball):
     with pytest.raises(InputError, match='nothing to reconstruct'):
         start(replace(ball, projections=np.zeros_like(ball.projections)))
+
+
+def with_speck(ball):
+    """A scan with a bright pixel in one view: SART smears it along its ray, of which the other views know nothing."""
+    projections = ball.projections.copy()
+    projections[3, 4, 5] = 0.6 * projections.max()
+    return replace(ball, projections=projections)
+
+
+def test_points_lie_in_the_masks_of_all_views(ball):
+    spoilt = with_speck(ball)
+    free, masked = start(spoilt, 3000, within='volume'), start(spoilt, 3000)
+    assert (distances(free, spoilt) > 1.5).sum() > 20 and (distances(masked, spoilt) > 1.5).sum() == 0
+    assert masked.info['masks_used'] and 0 < masked.info['edges_lost'] < edges.MOST_LOST
+    assert masked.info['T_low'] == pytest.approx(0.1 * masked.info['T_high'])
+    volume = 4 / 3 * np.pi * np.prod(BALL[1]) / np.prod(ball.geometry.grid.spacing)
+    assert 0.8 < masked.info['cells_low'] / volume < 1.3
+    assert 'masks_used' not in free.info
+
+
+def test_masks_that_cut_off_the_object_are_not_used(ball):
+    """A view that shows nothing has an empty mask, and so has the intersection of all views."""
+    projections = ball.projections.copy()
+    projections[5] = 0
+    blank = replace(ball, projections=projections)
+    cloud = start(blank)
+    assert not cloud.info['masks_used'] and cloud.info['edges_lost'] == 1 and cloud.info['cells_low'] == 0
+    np.testing.assert_array_equal(cloud.points, start(blank, within='volume').points)

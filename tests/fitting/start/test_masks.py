@@ -59,7 +59,7 @@ def test_cloud_follows_the_paper():
     np.testing.assert_allclose(offset[500 : 500 + first], 0, atol=1e-12)
     assert info['repeats'] == max(1500 - len(low), 0) + max(500 - len(high), 0)
     np.testing.assert_allclose(
-        cloud.density, 0.15 * mean_pixel(frames, projections, voxel_centres(grid, geometry.grid.half, flat))
+        cloud.density, mean_pixel(frames, projections, voxel_centres(grid, geometry.grid.half, flat))
     )
     np.testing.assert_allclose(cloud.spacing, neighbour_distance(cloud.points, 1.0))
 
@@ -99,9 +99,9 @@ def test_density_modes(monkeypatch):
         return start.from_views(Scan(geometry, projections), np.random.default_rng(0), render)
 
     monkeypatch.setattr(densities, 'VIEWS', 3)
-    raw, paper, lsq = cloud(density='raw'), cloud(density='paper'), cloud(density='lsq')
-    np.testing.assert_allclose(paper.density, 0.15 * raw.density)
-    np.testing.assert_allclose(lsq.density, 0.25 * raw.density)
+    paper, r2, lsq = cloud(density='paper'), cloud(density='r2'), cloud(density='lsq')
+    np.testing.assert_allclose(r2.density, 0.15 * paper.density)
+    np.testing.assert_allclose(lsq.density, 0.25 * paper.density)
     assert calls == [(300, [0, 2, 4])] and lsq.info['density_factor'] == pytest.approx(0.25)
     with pytest.raises(InputError, match='render'):
         MaskStart().from_views(Scan(geometry, projections), np.random.default_rng(0))
@@ -136,7 +136,7 @@ def test_empty_high_set_leaves_all_to_the_low_set():
     projections[0, :2, :2] = 60.0  # one bright corner: nothing but it is above this view's threshold
     found = masks(projections)
     assert len(valid_voxels(frames, found, (16, 16, 16), geometry.grid.half)[1]) == 0
-    start = MaskStart(n_points=100, density='raw', low_factor=0.001)
+    start = MaskStart(n_points=100, density='paper', low_factor=0.001)
     cloud = start.from_views(Scan(geometry, projections), np.random.default_rng(0))
     assert cloud.info['points_high'] == 0 and len(cloud) == 100
 
