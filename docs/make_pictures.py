@@ -1,7 +1,7 @@
 """Make the pictures of the pages on concepts from fits of the foot: `python docs/make_pictures.py`, six minutes.
 
-25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (LINGO, from a projection to a fitted cloud)
-and docs/figures/two_stages.png (volumes from the measured views, from completed ones, and refined).
+25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (LINGO, from a projection to a cloud) and
+docs/figures/two_stages.png (volumes from the measured views, from completed ones, and refined).
 """
 
 from pathlib import Path
