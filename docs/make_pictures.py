@@ -1,6 +1,6 @@
 """Make the pictures of the pages on concepts from fits of the foot: `python docs/make_pictures.py`, six minutes.
 
-25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (LINGO, from projections to a cloud) and
+25 views of 256 x 256 pixels of `scenes/x3d_foot.xml`. Writes docs/figures/lingo_steps.png (LINGO, projections to a cloud) and
 docs/figures/two_stages.png (volumes from the measured views, from completed ones, and refined).
 """
 

@@ -60,7 +60,21 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.fitting.start.uniform import CuboidStart, RandomStart
     from lingo_mi.functional import Projector, project, voxelize
     from lingo_mi.geometry import Geometry, Grid, circular
-    from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Best, Reconstruction, Refined
+    from lingo_mi.reconstruction import (
+        ASDPOCS,
+        CGLS,
+        FDK,
+        OSSART,
+        SART,
+        SIRT,
+        TV,
+        Best,
+        Denoiser,
+        PenalisedLeastSquares,
+        Prior,
+        Reconstruction,
+        Refined,
+    )
     from lingo_mi.scan import Dataset, Scan
 
 # Module -> the public names that it defines, in the order of their use.
@@ -93,7 +107,7 @@ _MODULES = {
     'fitting.fit': 'Fit load_fit',
     'fitting.fitted_model': 'Gaussians',
     'api.volumes': 'reconstruct',
-    'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS Refined Best',
+    'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS PenalisedLeastSquares TV Denoiser Prior Refined Best',
     'functional': 'Projector project voxelize',
     'common.runtime': 'use_variant',
     'common.errors': 'InputError',

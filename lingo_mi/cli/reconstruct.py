@@ -52,7 +52,7 @@ from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
 from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.fitting.measure import volume_quality
 from lingo_mi.geometry import Geometry, Grid
-from lingo_mi.reconstruction import ALGORITHMS, Algorithm, Reconstruction
+from lingo_mi.reconstruction import ALGORITHMS, Algorithm, Prior, Reconstruction
 from lingo_mi.reconstruction.best import Chosen
 from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.run import check_room
@@ -168,7 +168,8 @@ def check_output(out: Path, args: argparse.Namespace) -> None:
 def algorithm_of(args: argparse.Namespace, given: dict[str, str]) -> Algorithm | None:
     """The algorithm with the -D values of its options, which have the types of their defaults; None: voxelize."""
     name, made = args.algorithm, ALGORITHMS.get(args.algorithm)
-    known, options = made().options if made else {}, {}
+    known = {k: v for k, v in made().options.items() if not isinstance(v, Prior)} if made else {}
+    options: dict = {}
     for option, text in given.items():
         if option not in known:
             raise InputError(

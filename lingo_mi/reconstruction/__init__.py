@@ -12,12 +12,15 @@ from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.best import Best
 from lingo_mi.reconstruction.cgls import CGLS
 from lingo_mi.reconstruction.fdk import FDK
+from lingo_mi.reconstruction.penalised import PenalisedLeastSquares
+from lingo_mi.reconstruction.priors import TV, Denoiser, Prior
 from lingo_mi.reconstruction.refined import Refined
 from lingo_mi.reconstruction.run import progress_bar, run_algorithm
 from lingo_mi.reconstruction.sart import OSSART, SART, SIRT
 
 ALGORITHMS: dict[str, type[Algorithm]] = {
-    algorithm.name: algorithm for algorithm in (FDK, SART, OSSART, SIRT, CGLS, ASDPOCS, Refined, Best)
+    algorithm.name: algorithm
+    for algorithm in (FDK, SART, OSSART, SIRT, CGLS, ASDPOCS, PenalisedLeastSquares, Refined, Best)
 }
 
 __all__ = [
@@ -28,8 +31,12 @@ __all__ = [
     'OSSART',
     'SART',
     'SIRT',
+    'TV',
     'Algorithm',
     'Best',
+    'Denoiser',
+    'PenalisedLeastSquares',
+    'Prior',
     'Reconstruction',
     'Refined',
     'progress_bar',

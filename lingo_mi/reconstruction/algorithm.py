@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar
@@ -106,7 +106,7 @@ class Algorithm(ABC):
     @property
     def options(self) -> dict[str, Any]:
         """The options by name."""
-        return asdict(self)  # type: ignore[call-overload] - of a dataclass, which every algorithm is
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type] - every algorithm is a dataclass
 
     def steps(self, scan: Scan) -> int:
         """The largest number of steps, for `progress`."""

@@ -67,6 +67,7 @@ def load(path):
         ('sirt', ['niter=2']),
         ('cgls', ['niter=3', 'tol=0.01']),
         ('asd-pocs', ['niter=2', 'tviter=3', 'noneg=true', 'maxl2err=5']),
+        ('pls', ['niter=2', 'strength=1e-4', 'upper=5']),
     ],
 )
 def test_every_algorithm(scene, dataset, tmp_path, algorithm, options):

@@ -97,7 +97,16 @@ def test_defaults_are_tigres():
 
 def test_iterations_by_default():
     """Our own; the tables in the docs are made with them."""
-    expected = {'sart': 20, 'os-sart': 50, 'sirt': 100, 'cgls': 20, 'asd-pocs': 50, 'refined': 20, 'best': 20}
+    expected = {
+        'sart': 20,
+        'os-sart': 50,
+        'sirt': 100,
+        'cgls': 20,
+        'asd-pocs': 50,
+        'pls': 60,
+        'refined': 20,
+        'best': 20,
+    }
     assert expected == {n: a().options['niter'] for n, a in ALGORITHMS.items() if 'niter' in a().options}
 
 

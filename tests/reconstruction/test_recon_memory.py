@@ -36,6 +36,7 @@ def run(size, pixels, views, offset=0):
     few, ramp = scan.subset(slice(0, None, 4)), np.linspace(0, 1, size ** 3, dtype=np.float32).reshape((size,) * 3)
     few_steps = dict(niter=1, tviter=2)
     options = {'fdk': {}, 'asd-pocs': few_steps, 'refined': dict(completed_niter=1) | few_steps, 'best': dict(niter=1, finer=1)}
+    options['pls'] = dict(niter=2, strength=1e-4)
     algorithm = ALGORITHMS[sys.argv[1]](**options.get(sys.argv[1], dict(niter=1)))
     if sys.argv[1] == 'refined':
         run_algorithm(few, algorithm, completed=scan, sample=lambda _: ramp)
