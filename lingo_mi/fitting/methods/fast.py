@@ -28,7 +28,8 @@ class Fast(DensityMethod):
     - Views in a row lie well apart.
     - The total variation covers eight times the volume, since with a short memory each Gaussian must be smoothed more often than
       once in 64 steps. More views have less of it.
-    - Densification starts early, and the scan's size limits it.
+    - Densification starts early, and the scan's size limits it. The loss scale, about 2 in this unit of density,
+      multiplies the gradients, and the threshold makes up for it.
     - The fit stops early if the scan says how many photons a pixel counts.
 
     The options are those of `DensityMethod`.
@@ -60,6 +61,6 @@ class Fast(DensityMethod):
         lambda_ssim=1.0, lambda_gradient=3.0, lambda_tv=0.4, tv_stride=2, tv_views=25, loss_scale='dynamic'
     )
     densify: Densify = Halve(
-        densify_from=50, densify_until=300, densify_every=25, densify_threshold=1e-4, values_per_gaussian=14.0
+        densify_from=50, densify_until=300, densify_every=25, densify_threshold=2e-4, values_per_gaussian=14.0
     )
     normalise: bool = True
