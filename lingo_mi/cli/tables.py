@@ -167,8 +167,9 @@ def main() -> None:
         raise InputError(f'{folder}: is a file, not a folder; choose another --out')
     require_writable(folder, folder, 'choose another --out')
     check_threads(args)
-    record = None if args.record is None else Record(args.record)
-    if record is not None:
+    record = None
+    if args.record is not None:
+        record = Record(args.record)
         require_writable(args.record.parent, args.record, 'choose another --record')
     every = [Cells(folder, scale, seed, record=record) for seed in seeds]
     rows = groups(args.table, views, iterations, args.methods, args.algorithms)

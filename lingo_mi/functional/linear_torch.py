@@ -63,6 +63,6 @@ def _one(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
     x = x.reshape(-1)
     if x.data_ptr() % ALIGNED:
         x = x.clone()
-    out = mi.TensorXf(linear_map.on_device(mi.Float(x)), linear_map.range_shape).torch()
+    out: Any = mi.TensorXf(linear_map.on_device(mi.Float(x)), linear_map.range_shape).torch()
     dr.sync_thread()
     return out
