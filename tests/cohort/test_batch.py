@@ -306,7 +306,7 @@ def test_methods_side_by_side(home):
     assert [(m.name, m.iterations) for m in methods] == [('fast', 5), ('naf', 4), ('r2', 6), ('fast', 7)]
     assert methods[1].field.field_levels == 8 and methods[2].loss.lambda_tv == 0.2 and methods[3].start.name == 'masks'
     (home / 'list.csv').write_text(
-        'name,geometry,method,start,density,fit_air\na,tiny.xml,fast,masks,raw,\nb,tiny.xml,naf,,,view\n'
+        'name,geometry,method,start,density,fit_air\na,tiny.xml,fast,masks,r2,\nb,tiny.xml,naf,,,view\n'
     )
     with pytest.raises(BadList) as caught:
         read_list(home / 'list.csv')
