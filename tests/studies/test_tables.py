@@ -275,7 +275,7 @@ def test_killed(tmp_path):
 
 
 def test_means_over_seeds_and_objects_with_their_errors():
-    """Gains are differences object by object, so what makes an object easy for every method is no part of their error."""
+    """A gain is a difference for each object. An object that is easy for every method does not widen its error."""
     found = groups('views', [5], [20], ['r2', 'lingo'])
     values = {
         ('a', 'r2'): (30.0, 32.0),
