@@ -8,6 +8,7 @@ import numpy as np
 
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.fitting.options.loss import Loss
+from lingo_mi.geometry.trajectories import spread
 from lingo_mi.lingo.loss_scale import FLOOR
 from lingo_mi.lingo.otsu import otsu
 
@@ -41,8 +42,9 @@ def _loss(fit: FittedModel) -> list[str]:
     if not isinstance(loss, Loss) or loss.loss_scale == 'none':
         return []
     geometry = fit.geometry
-    chosen = np.unique(np.arange(min(len(geometry), VIEWS)) * len(geometry) // min(len(geometry), VIEWS))
-    images = fit.render(geometry.subset(chosen)) * (geometry.grid.scale / fit.model.unit)
+    images = fit.render(geometry.subset(spread(len(geometry), min(len(geometry), VIEWS)))) * (
+        geometry.grid.scale / fit.model.unit
+    )
     thresholds = np.maximum([otsu(image) for image in images], FLOOR)
     factors = thresholds + 0.25 / thresholds
     on = ' on the densification alone' if loss.loss_scale == 'statistic' else ''

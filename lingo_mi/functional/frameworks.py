@@ -60,14 +60,14 @@ def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...],
 
 
 def _kind(arrays, name: str) -> str:
-    kinds = [kind_of(a) for a in arrays]
+    kinds = [framework_of(a) for a in arrays]
     if len(set(kinds)) > 1:
         found = ', '.join(f'{n} of {k}' for n, k in zip(NAMES, kinds))
         raise InputError(f'{name}: the arrays must be of one kind, not {found}')
     return kinds[0]
 
 
-def kind_of(array) -> str:
+def framework_of(array) -> str:
     """'NumPy', 'Dr.Jit', 'PyTorch' or 'JAX', without importing the last two."""
     if dr.is_array_v(array):
         return 'Dr.Jit'

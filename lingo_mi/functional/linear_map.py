@@ -15,7 +15,7 @@ from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.memory import room
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
-from lingo_mi.functional.frameworks import kind_of
+from lingo_mi.functional.frameworks import framework_of
 from lingo_mi.projectors.upload import uploaded
 
 BASIS, TOLERANCE = 12, 1e-4  # of `norm`: vectors of its Krylov space; its own error is about the square of this
@@ -52,7 +52,7 @@ class LinearMap(ABC):
         InputError
             For an array of another shape, or with NaN or infinity, or if the result does not fit into memory.
         """
-        kind = kind_of(x)
+        kind = framework_of(x)
         if kind == 'NumPy':
             x = as_numpy(x, f'the argument of {self!r}', np.float32)
         shape = tuple(x.shape)

@@ -41,8 +41,8 @@ def split_views(scan: Scan, every: int) -> tuple[Scan, Scan]:
         scan = scan.subset(np.flatnonzero(scan.valid.any((1, 2))))
     if len(scan) < LEAST_VIEWS:
         raise InputError(
-            f'best holds views out to choose by, and needs at least {LEAST_VIEWS}, but the scan has {len(scan)}: '
-            'take another algorithm'
+            f'choosing settings by held-out views needs at least {LEAST_VIEWS}, but the scan has {len(scan)}: '
+            'take another algorithm, or give the settings'
         )
     held = held_out_views(len(scan), every)
     return scan.subset(np.setdiff1d(np.arange(len(scan)), held)), scan.subset(held)
