@@ -11,7 +11,7 @@ differentiation are compared with
 For a scene in transmission, I = exp(-p), both use dL = -sum(weights * I * dp).
 
     rows = check_gradients(load_scene_file('scene.xml'))
-    print(table(rows))
+    print(gradient_table(rows))
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 
     return rows
 
 
-def table(rows: list[Row]) -> str:
+def gradient_table(rows: list[Row]) -> str:
     """The rows as text, one a line."""
     width = max(len(row.parameter) for row in rows)
     lines = [f'{"parameter":{width}s} {"AD":>14s} {"differences":>14s} {"error":>9s}']

@@ -5,7 +5,7 @@ interrupted one continues.
 
     comparison = Comparison(Path('out/recipes'), views=25, iterations=5000)
     results = comparison.results(['x3d_foot'], ['fast', 'lingo:V_S=1'])
-    print(table(results))
+    print(recipe_table(results))
     draw(results, Path('out/recipes/recipes.png'))
 """
 
@@ -131,7 +131,7 @@ def run_command(command: list[str]) -> int:
         raise KeyboardInterrupt('the same command goes on from here') from None
 
 
-def table(results: Results) -> str:
+def recipe_table(results: Results) -> str:
     """The Markdown table."""
     lines = [
         '| scene | method | ' + ' | '.join(title for title, _ in COLUMNS.values()) + ' |',

@@ -13,7 +13,7 @@ from lingo_mi.geometry.base import Geometry
 NEAR = 1e-6  # radians that are none
 
 
-def times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
+def scan_times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     """The time of views at `angles` [m] radians, -1 for a scan's first view and 1 for its last: their place between its angles.
 
     The views of the scan are in the order of their time, at even intervals. Where its angles turn back, or there is one view
@@ -82,5 +82,5 @@ class Drift:
         """The panel in the views of a geometry, which need not be those of the scan, but were taken among them."""
         if self.constant:
             return Panel(self.v[0], self.u[0], self.yaw)
-        t = times(self.scan, geometry.angles)
+        t = scan_times(self.scan, geometry.angles)
         return Panel(legendre.legval(t, self.v), legendre.legval(t, self.u), self.yaw)

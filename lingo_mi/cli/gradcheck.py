@@ -40,10 +40,10 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.studies.gradient_check import TOLERANCE, check_gradients, load_scene_file, table
+    from lingo_mi.studies.gradient_check import TOLERANCE, check_gradients, gradient_table, load_scene_file
 
     rows = check_gradients(load_scene_file(scene_path(args.scene)), args.step, args.count)
     worst = max(row.error for row in rows)
-    print(table(rows))
+    print(gradient_table(rows))
     print(f'largest error {worst:.1e}, tolerance {TOLERANCE:.0e}')
     return int(not worst <= TOLERANCE)

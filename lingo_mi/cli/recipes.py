@@ -49,14 +49,14 @@ def main() -> None:
     args = arguments()
     from lingo_mi.studies.cuda.model import beside
     from lingo_mi.studies.provenance import write_provenance
-    from lingo_mi.studies.recipes import Comparison, draw, table
+    from lingo_mi.studies.recipes import Comparison, draw, recipe_table
 
     require_writable(args.out, args.out, 'choose another --out')
     if args.figure:
         require_writable(args.figure.parent, args.figure, 'choose another --figure')
     comparison = Comparison(args.out, args.views, args.iterations, tuple(args.define))
     results = comparison.results(args.scenes, args.methods)
-    text = table(results)
+    text = recipe_table(results)
     print(text)
     for (scene, method), metrics in results.items():
         if str(metrics.get('variant')).startswith('cuda'):

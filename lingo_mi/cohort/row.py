@@ -87,7 +87,7 @@ class Row:
     def _named(self):
         """The files that the geometry names and the numbers depend on."""
         if self.scene is not None:
-            return [f for f in outline.named_files(self.scene, self.parameters) if f.resolve() != self.scene.resolve()]
+            return [f for f in outline.scene_files(self.scene, self.parameters) if f.resolve() != self.scene.resolve()]
         return scans.named_files(Path(self.folder) / self.geometry) if self.geometry else []
 
 

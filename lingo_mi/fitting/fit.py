@@ -20,7 +20,7 @@ from lingo_mi.files.slabs import THICKNESS, write_slabs
 from lingo_mi.fitting import average
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fitted_model import FittedModel
-from lingo_mi.fitting.measure import comparable, measure
+from lingo_mi.fitting.measure import comparable, fit_metrics
 from lingo_mi.fitting.save import description, result_names, write_fit
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.report.data import ReportData
@@ -105,7 +105,7 @@ class Fit(FittedModel):
     @cached_property
     def numbers(self) -> dict:
         """All numbers, with the history. What a loaded fit has no truth for is as it was saved."""
-        numbers = measure(self)
+        numbers = fit_metrics(self)
         if self.data is None and self._stored:
             missing = {k: self._stored.get(k) for k, value in numbers.items() if value is None}
             numbers |= _scalars(missing)
@@ -129,7 +129,7 @@ class Fit(FittedModel):
         """
         if data is not None:
             require_type('data', data, Dataset, 'write lm.Dataset(scan, test, volume)')
-            return _scalars(measure(self.with_data(data)))
+            return _scalars(fit_metrics(self.with_data(data)))
         if self.data is None and self._stored is not None:
             return _scalars(self._stored)
         return _scalars(self.numbers)

@@ -14,7 +14,7 @@ from lingo_mi.metrics.ipsd import ipsd, reverse_distance
 from lingo_mi.scan import Dataset, Scan
 
 
-def measure(fit: FittedModel) -> dict:
+def fit_metrics(fit: FittedModel) -> dict:
     """All numbers of a fit: quality of the held-out views and of the volume, None without a truth; IPSD; times; the history."""
     data, views = fit.data, fit.views
     test = None if data is None else data.test

@@ -66,7 +66,7 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     voxel_grid = grid_of(voxels) if vol_geom is None else grid(vol_geom)
     if kind_of(proj_geom) in CIRCLES:
         return CircularGeometry(**circle(proj_geom), grid=voxel_grid)
-    rays, nDetector = views(proj_geom)
+    rays, nDetector = pose_rays(proj_geom)
     return Geometry.from_poses(rays, nDetector, grid=voxel_grid)
 
 
@@ -108,7 +108,7 @@ def circle(proj_geom: dict) -> dict[str, Any]:
     )
 
 
-def views(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
+def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     """The views of a dict of the types `VECTORS`, ASTRA's rows reversed, and the panel's pixels (v, u).
 
     The beam of a parallel scan is taken to come from in front of its panel; its line integrals know no direction.

@@ -159,10 +159,10 @@ class Geometry(ABC):
         >>> one.grid == same.grid
         True
         """
-        from lingo_mi.geometry.constructors import placed
+        from lingo_mi.geometry.constructors import circle_or_poses
 
         scan = dict(DSO=DSO, DSD=DSD, nDetector=nDetector, dDetector=dDetector, angles=angles)
-        return placed('cone', scan | placement)
+        return circle_or_poses('cone', scan | placement)
 
     @classmethod
     def parallel(
@@ -178,10 +178,10 @@ class Geometry(ABC):
         >>> len(Geometry.parallel(nDetector=(1, 512), dDetector=1, grid=flat, angles=[0.0, 0.7]))
         2
         """
-        from lingo_mi.geometry.constructors import placed
+        from lingo_mi.geometry.constructors import circle_or_poses
 
         scan = dict(DSO=0.0, DSD=0.0, nDetector=nDetector, dDetector=dDetector, angles=angles)
-        return placed('parallel', scan | placement)
+        return circle_or_poses('parallel', scan | placement)
 
     @classmethod
     def helix(cls, *, angles: ArrayLike, pitch: float, **scan: Unpack[ConeNumbers]) -> Geometry:
@@ -207,9 +207,9 @@ class Geometry(ABC):
         >>> float(g.rays().source[0, 2])
         -64.0
         """
-        from lingo_mi.geometry.constructors import placed
+        from lingo_mi.geometry.constructors import circle_or_poses
 
-        return placed('cone', dict(scan, angles=angles), limits.vector('pitch', pitch, 1)[0])
+        return circle_or_poses('cone', dict(scan, angles=angles), limits.vector('pitch', pitch, 1)[0])
 
     @classmethod
     def per_view(

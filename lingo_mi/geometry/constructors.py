@@ -18,7 +18,7 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix, scanner_rays
 
 
-def placed(mode: str, scan: dict[str, Any], pitch: float = 0.0) -> Geometry:
+def circle_or_poses(mode: str, scan: dict[str, Any], pitch: float = 0.0) -> Geometry:
     """The circle of the numbers `scan`, or what its motion makes of it if any of that is not zero."""
     motion = _taken(scan, ('rotDetector', 'COR', 'height', 'tilt'))
     circle = CircularGeometry(mode=mode, grid=grid_of(_taken(scan, Voxels.__annotations__)), **scan)

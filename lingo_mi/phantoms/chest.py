@@ -24,12 +24,12 @@ from lingo_mi.phantoms.solids import (
     RoundedBox,
     Texture,
     branches,
-    rotation,
     smooth_max,
     smooth_min,
     subdivide,
     tube,
     union,
+    yaw_pitch_roll,
 )
 
 SIDE = 380.0  # mm
@@ -158,10 +158,10 @@ def _front(z):
 def _girdle():
     """Sternum, clavicles, scapulae and humeri."""
     out = [
-        Blend((RoundedBox((0, _front(78), 82), (25, 6, 22), 5, rotation(pitch=22)),), 0),
+        Blend((RoundedBox((0, _front(78), 82), (25, 6, 22), 5, yaw_pitch_roll(pitch=22)),), 0),
         Blend(
             (
-                RoundedBox((0, _front(12), 12), (17, 5.5, 44), 5, rotation(pitch=7)),
+                RoundedBox((0, _front(12), 12), (17, 5.5, 44), 5, yaw_pitch_roll(pitch=7)),
                 Cone((0, _front(-32), -30), (0, _front(-52) - 3, -54), 6, 3.5),
             ),
             5.0,
@@ -179,7 +179,7 @@ def _girdle():
             ),
             Blend(
                 (
-                    Ellipsoid((s * 92, -83, 62), (31, 3.6, 60), rotation(yaw=s * 32, roll=-s * 8)),
+                    Ellipsoid((s * 92, -83, 62), (31, 3.6, 60), yaw_pitch_roll(yaw=s * 32, roll=-s * 8)),
                     Cone((s * 70, -98, 92), (s * 124, -48, 122), 4.5, 6),
                     Cone((s * 108, -70, 100), (s * 122, -38, 112), 8, 13),
                 ),
@@ -217,7 +217,7 @@ def _lungs(coarse, cage):
     x, y, z = coarse.at((slice(None),) * 3)
     heart = Blend(
         (
-            Ellipsoid((-28, 30, -38), (52, 40, 58), rotation(roll=38)),
+            Ellipsoid((-28, 30, -38), (52, 40, 58), yaw_pitch_roll(roll=38)),
             Ellipsoid((24, 22, -28), (30, 32, 44)),
             Cone((0, 18, 10), (4, 14, 60), 30, 24),
         ),
@@ -290,7 +290,7 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
         ((24, 20, -24), (20, 21, 30)),
         ((-16, -4, -8), (30, 15, 20)),
     ):
-        fill(Ellipsoid(c, r, rotation(roll=30))(x, y, z), BLOOD, 4.0)  # the four chambers
+        fill(Ellipsoid(c, r, yaw_pitch_roll(roll=30))(x, y, z), BLOOD, 4.0)  # the four chambers
     fat = np.float32(FAT) + np.float32(0.004) * mottle
     tissue += np.clip((skin + np.float32(8)) / 3, 0, 1) * (fat - tissue)  # under the skin
 

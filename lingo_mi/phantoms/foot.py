@@ -30,12 +30,12 @@ from lingo_mi.phantoms.solids import (
     RoundedBox,
     Texture,
     branches,
-    rotation,
     smooth_max,
     smooth_min,
     subdivide,
     tube,
     union,
+    yaw_pitch_roll,
 )
 
 SIDE = 256.0  # mm
@@ -106,7 +106,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # calcaneus
-                    Ellipsoid((4, 26, 33), (13.5, 14, 20), rotation(pitch=-18)),
+                    Ellipsoid((4, 26, 33), (13.5, 14, 20), yaw_pitch_roll(pitch=-18)),
                     Cone((4, 30, 36), (9, 62, 41), 15, 12.5),
                     Cone((9, 60, 41), (17, 84, 36), 12.5, 11.5),
                     Ellipsoid((6, 59, 46), (12, 14, 9)),
@@ -132,7 +132,7 @@ def bones() -> list[Bone]:
                 (  # tibia
                     Cone((-4, 66, 285), (-4, 66, 140), 12.5, 11.5),
                     Cone((-4, 66, 140), (-4, 67, 112), 11.5, 16),
-                    RoundedBox((-4, 67, 98), (19, 18, 13), 8, rotation(yaw=8)),
+                    RoundedBox((-4, 67, 98), (19, 18, 13), 8, yaw_pitch_roll(yaw=8)),
                     Cone((-20, 66, 98), (-23.5, 67, 77), 9.5, 6),
                 ),
                 7.0,
@@ -159,7 +159,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # navicular
-                    Ellipsoid((-13, 117, 54), (19.5, 10.5, 14.5), rotation(yaw=6, roll=-28)),
+                    Ellipsoid((-13, 117, 54), (19.5, 10.5, 14.5), yaw_pitch_roll(yaw=6, roll=-28)),
                     Cone((-24, 114, 47), (-33, 111, 43), 8.5, 6),
                 ),
                 5.0,
@@ -168,8 +168,8 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # cuboid: medially longest
-                    RoundedBox((17, 110, 32), (10, 17, 11), 7.5, rotation(yaw=-8, pitch=-8, roll=18)),
-                    Ellipsoid((25, 108, 29), (9, 12, 10), rotation(yaw=-18)),
+                    RoundedBox((17, 110, 32), (10, 17, 11), 7.5, yaw_pitch_roll(yaw=-8, pitch=-8, roll=18)),
+                    Ellipsoid((25, 108, 29), (9, 12, 10), yaw_pitch_roll(yaw=-18)),
                     Cone((12, 106, 23), (26, 112, 21), 5, 4),
                 ),
                 6.0,
@@ -180,7 +180,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (
-                    RoundedBox((-22, 138, 44), (6.5, 12, 12), 6, rotation(yaw=4, roll=16)),
+                    RoundedBox((-22, 138, 44), (6.5, 12, 12), 6, yaw_pitch_roll(yaw=4, roll=16)),
                     Ellipsoid((-23, 137, 34), (8.5, 11.5, 8.5)),
                 ),
                 6.0,
@@ -198,7 +198,7 @@ def bones() -> list[Bone]:
         Bone(
             Blend(
                 (  # lateral: a wedge
-                    RoundedBox((8, 135, 48), (7.5, 11, 7.5), 5.5, rotation(yaw=-5, roll=8)),
+                    RoundedBox((8, 135, 48), (7.5, 11, 7.5), 5.5, yaw_pitch_roll(yaw=-5, roll=8)),
                     Ellipsoid((8, 134, 38), (5.5, 9, 8.5)),
                 ),
                 5.0,

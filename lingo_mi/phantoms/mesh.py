@@ -20,7 +20,7 @@ import trimesh
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.triangles import add_lengths, voxelize_triangles
-from lingo_mi.phantoms.solids import rotation
+from lingo_mi.phantoms.solids import yaw_pitch_roll
 
 SIDE = 256.0  # mm
 BORE, NECK, ROOT, RIM = 32.0, 40.0, 54.0, 96.0  # radii, mm
@@ -111,7 +111,7 @@ def bolts() -> trimesh.Trimesh:
 
 def _tilted(triangles):
     """A closed mesh of triangles [n, 3, 3], tilted against all axes; those without area are dropped."""
-    points = triangles.reshape(-1, 3) @ rotation(25, 32, 14)
+    points = triangles.reshape(-1, 3) @ yaw_pitch_roll(25, 32, 14)
     # Vertices of neighbours agree to rounding; merge them to make the mesh closed.
     points, index = np.unique(np.round(points, 6), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)

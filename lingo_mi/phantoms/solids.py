@@ -195,7 +195,7 @@ def local(x: np.ndarray, y: np.ndarray, z: np.ndarray, centre: Point, axes: np.n
     return p if axes is None else [r[0] * p[0] + r[1] * p[1] + r[2] * p[2] for r in _f(axes)]
 
 
-def rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+def yaw_pitch_roll(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
     """Axes [3, 3] (rows) turned by yaw about z, then pitch about x, then roll about y, in degrees."""
     angles = np.radians([yaw, pitch, roll])
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)

@@ -19,7 +19,7 @@ from lingo_mi.raw.options import Options
 
 
 def grid_given(geometry: PathLike | str | Geometry) -> bool:
-    """Whether it says how many voxels there are; else they are those of `own_grid`."""
+    """Whether it says how many voxels there are; else they are those of `grid_in_view`."""
     if isinstance(geometry, Geometry):
         return True
     suffix = Path(geometry).suffix.lower()
@@ -113,7 +113,7 @@ def geometry_of(
     return posed_geometry(values, n, path), None, (-1 if rows_run_up(values) else 1, 1)
 
 
-def placed(geometry: Geometry, crop: tuple[int, int, int, int]) -> Geometry:
+def cropped(geometry: Geometry, crop: tuple[int, int, int, int]) -> Geometry:
     """The geometry of the pixels (v0, v1, u0, u1) alone."""
     v0, v1, u0, u1 = crop
     if isinstance(geometry, CircularGeometry):
@@ -126,7 +126,7 @@ def placed(geometry: Geometry, crop: tuple[int, int, int, int]) -> Geometry:
     return Geometry.from_poses(rays, (v1 - v0, u1 - u0), grid=geometry.grid)
 
 
-def own_grid(geometry: Geometry) -> Geometry:
+def grid_in_view(geometry: Geometry) -> Geometry:
     """Voxels as large as a pixel on the axis, around it, as far as the panel sees; without an offOrigin as high as its rows."""
     (nv, nu), step = geometry.nDetector, geometry.dDetector[1]
     if geometry.mode == 'cone':

@@ -13,7 +13,7 @@ from lingo_mi.common.memory import require_room
 from lingo_mi.common.progress import Progress
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.raw.beam import Beam
-from lingo_mi.raw.frame_geometry import geometry_of, grid_given, own_grid, placed
+from lingo_mi.raw.frame_geometry import cropped, geometry_of, grid_given, grid_in_view
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.line_integrals import counts_to_line_integrals, photons_of_images
 from lingo_mi.raw.options import Options, chosen_views, exposures, region_of
@@ -48,13 +48,13 @@ def import_raw(
 
     (nv, nu), (down, across) = views.shape, steps
     rows, columns = (v0, v1) if down > 0 else (nv - v1, nv - v0), (u0, u1) if across > 0 else (nu - u1, nu - u0)
-    out = placed(given, (*rows, *columns))
+    out = cropped(given, (*rows, *columns))
     bins = out.bins(options.binning)
     if options.binning > max(out.nDetector):
         raise InputError(f'binning {options.binning} is more than the {max(out.nDetector)} pixels of a view')
     out = out.binned(options.binning).subset(chosen)
     if not grid_given(geometry):
-        out = own_grid(out)
+        out = grid_in_view(out)
     # Line integrals and their mask, and the scan's copy of them without invalid pixels.
     require_room(9 * len(chosen) * float(np.prod(out.nDetector)), path)
 

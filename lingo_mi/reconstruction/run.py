@@ -17,7 +17,7 @@ from lingo_mi.files.slabs import write_slabs
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.fdk import FDK
-from lingo_mi.reconstruction.memory_needs import needed
+from lingo_mi.reconstruction.memory_needs import memory_needed
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.reconstruction.slab_sweeps import discard
@@ -112,7 +112,7 @@ def check_room(
     if algorithm is None:
         check_memory(geometry, views=views)
     else:
-        check_memory(fine, views=views, needed=needed(algorithm.name, fine, views) + beside)
+        check_memory(fine, views=views, needed=memory_needed(algorithm.name, fine, views) + beside)
 
 
 @contextmanager

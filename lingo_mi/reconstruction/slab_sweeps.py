@@ -63,7 +63,9 @@ def swept(
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
     grid = scan.geometry.grid
     blocksize = max(len(views) for _, views in updates)
-    check_memory(scan.geometry.on(grid.slab(*grid.slabs(thickness)[0])), needed=needed(scan, thickness, blocksize))
+    check_memory(
+        scan.geometry.on(grid.slab(*grid.slabs(thickness)[0])), needed=sweep_memory(scan, thickness, blocksize)
+    )
     with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
         if volume.done < len(updates):
             _complete(_Slabs(scan, volume), updates, noneg, progress)
@@ -74,7 +76,7 @@ def swept(
             yield slab
 
 
-def needed(scan: Scan, thickness: int, blocksize: int) -> int:
+def sweep_memory(scan: Scan, thickness: int, blocksize: int) -> int:
     """Peak memory of `swept` with updates of so many views, bytes."""
     nx, ny, nz = scan.geometry.grid.shape
     slab = nx * ny * min(thickness + 2, nz)  # with its slices of zeros

@@ -55,10 +55,10 @@ class Arrays(dict[str, Packed]):
         self._given[name] = array, low, high, bits
         given, packed = self._earlier.get(name, (None, None))
         same = given is not None and given[1:] == (low, high, bits) and np.array_equal(given[0], array)
-        self[name] = packed if same and packed is not None else pack(array, low, high, bits)
+        self[name] = packed if same and packed is not None else quantised(array, low, high, bits)
 
 
-def pack(array: np.ndarray, low: float, high: float, bits: int = 16, level: int = 5) -> Packed:
+def quantised(array: np.ndarray, low: float, high: float, bits: int = 16, level: int = 5) -> Packed:
     """An array whose values lie in [low, high], the first axis the fastest; `low` is a code, and so is 0 if low <= 0 <= high."""
     low, step = _scale(low, high, bits)
     return Packed(array.shape, low, step, base64.b64encode(_compressed(array, low, step, level)).decode('ascii'))

@@ -53,8 +53,8 @@ def _numbers(data: ReportData) -> str:
         for key, value in metrics.items()
         if key not in {*QUALITY, *SETTINGS, *LISTED} and np.ndim(value) == 0 and not isinstance(value, dict)
     ]
-    out = [template.table('Quality and cost', quality, 'numbers')] if quality else []
-    out.append(template.table('What was done', settings + others, 'numbers'))
+    out = [template.html_table('Quality and cost', quality, 'numbers')] if quality else []
+    out.append(template.html_table('What was done', settings + others, 'numbers'))
     more = {}
     for key, title in (('settings', 'All settings of the fit'), ('initial', 'The initial cloud')):
         if isinstance(metrics.get(key), dict):

@@ -32,7 +32,7 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
         volumes = {'Reconstruction': data.volume}
         if data.truth is not None:
             volumes['Truth'] = data.truth
-        known['slices'] = slices(
+        known['slices'] = slice_payload(
             volumes,
             data.spacing,
             data.centre,
@@ -47,12 +47,12 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
         if data.views_truth is not None:
             images['Measured'] = data.views_truth
         reference = 'Measured' if len(images) == 2 else None
-        known['views'] = views(images, data.views_angles, data.pixel, arrays, reference)
+        known['views'] = view_payload(images, data.views_angles, data.pixel, arrays, reference)
     known['space'] = _space(data, arrays, surfaces)
     return known, arrays
 
 
-def slices(
+def slice_payload(
     volumes: dict[str, np.ndarray],
     spacing: Any,
     centre: Any,
@@ -109,7 +109,7 @@ def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict
     return dict(maps=[dict(name=name, array=f'map{i}') for i, name in enumerate(maps)])
 
 
-def views(
+def view_payload(
     images: dict[str, np.ndarray],
     angles: Any,
     pixel: Any,

@@ -22,12 +22,12 @@ def plane_extent(
     shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike, axis: int
 ) -> tuple[float, float, float, float]:
     """(left, right, bottom, top) of a slice across `axis`, in mm: the outer edges of its voxels."""
-    low, high = bounds(shape, spacing, centre)
+    low, high = volume_bounds(shape, spacing, centre)
     a, b = (i for i in range(3) if i != axis)
     return low[a], high[a], low[b], high[b]
 
 
-def bounds(shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike) -> Any:
+def volume_bounds(shape: Sequence[int], spacing: ArrayLike, centre: ArrayLike) -> Any:
     """The corners (low, high) of a volume, each [3], mm."""
     half, middle = np.array(shape) * np.asarray(spacing) / 2, np.asarray(centre)
     return middle - half, middle + half

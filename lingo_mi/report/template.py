@@ -50,7 +50,7 @@ def as_json(value: object) -> str:
     return json.dumps(value, allow_nan=False, separators=(',', ':')).replace('<', '\\u003c')
 
 
-def table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tuple[str, ...] = ()) -> str:
+def html_table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tuple[str, ...] = ()) -> str:
     """A section with a table: of each row the name, the values, and what it means where `kind` is 'numbers'."""
     out = [f'<section><h2>{html.escape(title)}</h2><div class="scroll"><table class="{kind}">']
     if head:

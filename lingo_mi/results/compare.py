@@ -18,7 +18,7 @@ from lingo_mi.fitting.fit import Fit
 from lingo_mi.report import template
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text
 from lingo_mi.report.packing import Arrays
-from lingo_mi.report.payload import colour_maps, error_maps, slices, views
+from lingo_mi.report.payload import colour_maps, error_maps, slice_payload, view_payload
 from lingo_mi.scan import values_digest
 from lingo_mi.storage.file_access import as_path, parsed_json
 
@@ -117,7 +117,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
                 )
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]
         data = {name: volume.data for name, volume in volumes.items()}
-        known['slices'] = slices(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)
+        known['slices'] = slice_payload(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)
         maps = {
             f'Error map: {name}': r.error_map.data
             for name, r in named.items()
@@ -131,7 +131,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
     alike = len({images.shape for images in shown.values()}) == 1
     if len(shown) > 1 and alike and all(np.allclose(a, angles[0], atol=1e-3) for a in angles):
         one = next(iter(shown))
-        known['views'] = views(shown, angles[0], fits[one].nominal_geometry.dDetector, arrays, one)
+        known['views'] = view_payload(shown, angles[0], fits[one].nominal_geometry.dDetector, arrays, one)
     title = brief(title or ' · '.join(names), 120)
     return template.page(title, f'{len(results)} results side by side', _tables(named), '', known, arrays)
 
@@ -177,7 +177,7 @@ def _tables(named: dict[str, Fit | VolumeFile]) -> str:
 
     out = []
     if quality := rows({key: number.label for key, number in QUALITY.items()}):
-        out.append(template.table('Quality and cost', quality, 'numbers', head))
+        out.append(template.html_table('Quality and cost', quality, 'numbers', head))
     done = rows({key: number.label for key, number in SETTINGS.items()})
     changed = [
         (key, *(as_text('', s.get(key)) for s in settings))
@@ -185,7 +185,7 @@ def _tables(named: dict[str, Fit | VolumeFile]) -> str:
         if len({repr(s.get(key)) for s in settings if s}) > 1 and key not in SETTINGS
     ]
     if done or changed:
-        out.append(template.table('What was done, and settings that differ', done + changed, 'numbers', head))
+        out.append(template.html_table('What was done, and settings that differ', done + changed, 'numbers', head))
     for name, m in zip(named, metrics):
         if m.get('command'):
             out.append(template.code(f'Make {name} again', str(m['command'])))

@@ -23,7 +23,7 @@ MOST_INCLUDES = 15  # within each other, as in Mitsuba
 _ENCODINGS = 'utf-8', 'us-ascii', 'ascii', 'iso-8859-1', 'latin-1'
 
 
-def named_files(path: PathLike | str, parameters: dict | None = None) -> list[Path]:
+def scene_files(path: PathLike | str, parameters: dict | None = None) -> list[Path]:
     """A scene file, those that it includes, and all files that its texts name, where they exist, also in LINGO_MI_DATA.
 
     Raises InputError as `outline`.

@@ -8,7 +8,7 @@ import pytest
 import lingo_mi as lm
 from lingo_mi.calibration.calibration import Calibration
 from lingo_mi.calibration.cross_prediction import coarse
-from lingo_mi.calibration.drift import Drift, times
+from lingo_mi.calibration.drift import Drift, scan_times
 from lingo_mi.calibration.panel import Panel
 from lingo_mi.calibration.response.response import Response
 from lingo_mi.calibration.search import Found
@@ -206,14 +206,14 @@ def test_parallel_and_posed():
 
 def test_times_of_views():
     geometry, _ = scanner(10)
-    np.testing.assert_allclose(times(geometry, geometry.angles), np.linspace(-1, 1, 10), atol=1e-12)
+    np.testing.assert_allclose(scan_times(geometry, geometry.angles), np.linspace(-1, 1, 10), atol=1e-12)
     between = circular(10, start=18)  # the last one after the last of the scan
-    np.testing.assert_allclose(times(geometry, between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-12)
-    np.testing.assert_allclose(times(geometry, between + 2 * np.pi), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
+    np.testing.assert_allclose(scan_times(geometry, between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-12)
+    np.testing.assert_allclose(scan_times(geometry, between + 2 * np.pi), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
     reverse = replace(geometry, angles=-geometry.angles + 1)
-    np.testing.assert_allclose(times(reverse, 1 - between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
+    np.testing.assert_allclose(scan_times(reverse, 1 - between), np.linspace(-1, 1, 10) + 1 / 9, atol=1e-9)
     shuffled = replace(geometry, angles=geometry.angles[[0, 2, 1, 3, 4, 5, 6, 7, 8, 9]])
-    np.testing.assert_allclose(times(shuffled, between), np.linspace(-1, 1, 10))
+    np.testing.assert_allclose(scan_times(shuffled, between), np.linspace(-1, 1, 10))
 
 
 @pytest.mark.parametrize('total', [720.0, 1440.0])
@@ -223,8 +223,8 @@ def test_times_of_several_turns(total):
     counted = replace(geometry, angles=circular(48, total))
     for scan in (counted, replace(counted, angles=np.mod(counted.angles, 2 * np.pi))):
         own = np.linspace(-1, 1, 48)
-        np.testing.assert_allclose(times(scan, scan.angles), own, atol=1e-9)
-        np.testing.assert_allclose(times(scan, scan.angles[1::3]), own[1::3], atol=1e-6)
+        np.testing.assert_allclose(scan_times(scan, scan.angles), own, atol=1e-9)
+        np.testing.assert_allclose(scan_times(scan, scan.angles[1::3]), own[1::3], atol=1e-6)
 
 
 def test_pixels_that_are_not_valid_leave_the_others():

@@ -8,7 +8,7 @@ import pytest
 
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.reconstruction.memory_needs import NEEDS, needed
+from lingo_mi.reconstruction.memory_needs import NEEDS, memory_needed
 
 # Not `resource`, whose maximum begins with that of the process which started this one.
 pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
@@ -71,7 +71,7 @@ def taken(algorithm, *sizes):
         [sys.executable, '-c', PROGRAM, algorithm, *map(str, sizes)], capture_output=True, text=True, check=True
     ).stdout
     before, peak = (1024 * int(word) for word in out.split())
-    expected = needed(algorithm, scanned(*sizes), sizes[2])
+    expected = memory_needed(algorithm, scanned(*sizes), sizes[2])
     print(f'{algorithm} {sizes}: {peak / 1e9:.2f} GB, {(peak - before) / expected:.2f} of what is expected')
     return (peak - before) / expected, peak
 
@@ -108,7 +108,7 @@ def test_peak_memory_of_large_scans(algorithm):
 def test_needs_are_counted_in_float32(algorithm):
     """4 bytes a voxel and a pixel: many voxels, or many pixels."""
     need, voxels, pixels = NEEDS[algorithm], 4 * 300**3, 4 * 900**2
-    assert needed(algorithm, scanned(300, 900, 1), 1) == pytest.approx(
+    assert memory_needed(algorithm, scanned(300, 900, 1), 1) == pytest.approx(
         need.volumes * voxels + min(need.projections, 2) * pixels
     )
-    assert needed(algorithm, scanned(20, 900, 99), 99) == pytest.approx(need.projections * 99 * pixels, rel=1e-3)
+    assert memory_needed(algorithm, scanned(20, 900, 99), 99) == pytest.approx(need.projections * 99 * pixels, rel=1e-3)

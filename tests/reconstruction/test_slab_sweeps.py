@@ -222,7 +222,7 @@ PROGRAM = """
 import sys
 import numpy as np
 import lingo_mi as lm
-from lingo_mi.reconstruction.slab_sweeps import needed
+from lingo_mi.reconstruction.slab_sweeps import sweep_memory
 from lingo_mi.common.runtime import use_variant
 use_variant('llvm_ad_mono')
 
@@ -234,7 +234,7 @@ def go(side, slices, pixels, views, thickness, blocksize):
     scan = lm.Scan(g, np.ones((views, pixels, pixels), np.float32))
     for slab in lm.OSSART(niter=1, blocksize=blocksize).slabs(scan, thickness, f'{sys.argv[1]}/{side}_{slices}_{pixels}'):
         pass
-    return needed(scan, thickness, blocksize)
+    return sweep_memory(scan, thickness, blocksize)
 
 def peak():
     return 1024 * next(int(l.split()[1]) for l in open('/proc/self/status') if l.startswith('VmHWM'))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lingo_mi.report.packing import Arrays, bits_within, pack, preview
-from lingo_mi.report.payload import error_maps, slices
+from lingo_mi.report.packing import Arrays, bits_within, preview, quantised
+from lingo_mi.report.payload import error_maps, slice_payload
 
 
 def unpacked(packed):
@@ -25,7 +25,7 @@ def unpacked(packed):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([8, 10, 12, 14, 16]), st.floats(-50, 50), st.floats(1e-6, 1e4))
 def test_values_are_right_to_half_a_step(seed, bits, low, size):
     array = low + size * np.random.default_rng(seed).random((5, 4, 3))
-    packed = pack(array, low, low + size, bits)
+    packed = quantised(array, low, low + size, bits)
     assert packed.step <= size / (2**bits - 2) * 1.0001
     assert np.abs(unpacked(packed) - array).max() <= packed.step * 0.501
 
@@ -33,17 +33,17 @@ def test_values_are_right_to_half_a_step(seed, bits, low, size):
 def test_nothing_stays_nothing():
     array = np.array([-0.3, 0.0, 0.7])[:, None, None]
     for bits in (8, 16):
-        assert abs(unpacked(pack(array, -0.3, 0.7, bits))[1, 0, 0]) < 1e-12
+        assert abs(unpacked(quantised(array, -0.3, 0.7, bits))[1, 0, 0]) < 1e-12
 
 
 def test_one_value():
-    assert (unpacked(pack(np.full((2, 2, 2), 3.0), 3.0, 3.0)) == 3).all()
+    assert (unpacked(quantised(np.full((2, 2, 2), 3.0), 3.0, 3.0)) == 3).all()
 
 
 def test_bits_are_as_many_as_the_budget_allows():
     rng = np.random.default_rng(0)
     noise = rng.random((48, 48, 48)).astype(np.float32)
-    sizes = {bits: len(pack(noise, 0, 1, bits).text) for bits in (16, 12, 8)}
+    sizes = {bits: len(quantised(noise, 0, 1, bits).text) for bits in (16, 12, 8)}
     assert bits_within([noise], 0, 1, 1.05 * sizes[16]) == 16
     assert bits_within([noise], 0, 1, 1.05 * sizes[12]) == 12
     assert bits_within([noise], 0, 1, 0.5 * sizes[8]) is None
@@ -51,7 +51,7 @@ def test_bits_are_as_many_as_the_budget_allows():
 
 def test_a_map_of_errors_is_on_the_grid_of_its_volumes():
     noise, arrays = np.random.default_rng(0).random((51, 51, 51)).astype(np.float32), Arrays()
-    known = slices({'a': noise, 'b': 1 - noise}, (1, 1, 1), (0, 0, 0), arrays, budget=3e4)
+    known = slice_payload({'a': noise, 'b': 1 - noise}, (1, 1, 1), (0, 0, 0), arrays, budget=3e4)
     assert known['preview'] > 1
     error_maps({'map': noise}, known, arrays)
     assert list(arrays['map0'].shape) == known['shape']
@@ -60,9 +60,9 @@ def test_a_map_of_errors_is_on_the_grid_of_its_volumes():
 def test_places_of_a_volume_that_is_a_preview_already():
     shape, spacing, centre = (10, 10, 7), (2.0, 2.0, 3.0), (1.0, 0.0, -1.0)
     volume = np.random.default_rng(0).random(shape).astype(np.float32)
-    full = slices({'a': volume}, spacing, centre, Arrays())
+    full = slice_payload({'a': volume}, spacing, centre, Arrays())
     small, by = preview(volume, 100)
-    known = slices({'a': small}, spacing, centre, Arrays(), of=(shape, by))
+    known = slice_payload({'a': small}, spacing, centre, Arrays(), of=(shape, by))
     assert known['preview'] == by and known['spacing'] == [by * s for s in spacing]
     first = [c - (n - 1) / 2 * s for c, n, s in zip(full['centre'], full['shape'], full['spacing'])]  # a voxel's centre
     block = [c - (n - 1) / 2 * s for c, n, s in zip(known['centre'], known['shape'], known['spacing'])]
@@ -83,7 +83,7 @@ def test_the_worst_volume_stays_within_the_budget(size):
     rng = np.random.default_rng(0)
     budget, arrays = 20e6 * (size / 256) ** 3, Arrays()
     volumes = {name: rng.random((size, size, size), dtype=np.float32) for name in ('Reconstruction', 'Truth')}
-    known = slices(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
+    known = slice_payload(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
     assert sum(len(a.text) for a in arrays.values()) <= 1.02 * budget and known['preview'] == 2
     half = size // 2
     assert known['shape'] == [half] * 3 and known['spacing'] == [2, 2, 2] and known['centre'] == [0, 0, 0]

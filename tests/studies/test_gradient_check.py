@@ -14,7 +14,7 @@ from helpers.same import assert_same
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.studies import gradient_check
-from lingo_mi.studies.gradient_check import check_gradients, load_scene_file, table
+from lingo_mi.studies.gradient_check import check_gradients, gradient_table, load_scene_file
 from lingo_mi.studies.oracle import random_cloud
 
 SCRIPT = Path(__file__).parents[2] / 'scripts' / 'gradcheck.py'
@@ -72,7 +72,7 @@ def test_right_derivatives_pass(tmp_path, sensor, output):
     assert len(rows) == 3 * (3 + 3 + 4 + 1) + 3
     assert max(row.error for row in rows) < 1e-5
     assert all(row.ad != 0 for row in rows)
-    lines = table(rows).splitlines()
+    lines = gradient_table(rows).splitlines()
     assert len(lines) == len(rows) + 1
     assert 'cloud.centre[' in lines[1] and 'box.interior_medium.sigma_t.data[' in lines[-1]
     assert_same(mi.render(scene), before)  # the scene is given back as it was

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from lingo_mi.calibration.drift import times
+from lingo_mi.calibration.drift import scan_times
 from lingo_mi.calibration.response.air import Air, Gain
 from lingo_mi.calibration.response.curve import Curve
 from lingo_mi.calibration.response.part import SMOOTH, Place, ResponsePart
@@ -186,7 +186,7 @@ class Response:
         own = len(geometry) == len(self.geometry) and np.array_equal(geometry.angles, self.geometry.angles)
         if own:
             return self._in_time(np.linspace(-1, 1, len(geometry)), np.arange(len(geometry)))
-        t = times(self.geometry, geometry.angles)
+        t = scan_times(self.geometry, geometry.angles)
         return self._in_time(t, np.clip((t + 1) / 2, 0, 1) * (len(self.geometry) - 1))
 
     def _in_time(self, t, index):

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.calibration.drift import times
+from lingo_mi.calibration.drift import scan_times
 from lingo_mi.calibration.response.part import SMOOTH
 from lingo_mi.fitting.corrections.correction import CorrectedFit, Correction
 from lingo_mi.fitting.options.rates import Rates
@@ -85,7 +85,7 @@ class Poses:
         """
         if self.projection is None:
             return geometry
-        t, own = times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))
+        t, own = scan_times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))
         there = Poses(len(geometry))
         for name in ('turn', 'shift'):
             values = getattr(self, name)

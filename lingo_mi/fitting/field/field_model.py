@@ -13,7 +13,7 @@ import numpy as np
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.network import Network
 from lingo_mi.fitting.field.options import Field
-from lingo_mi.fitting.field.rays import Cube, integrals, pixels_of
+from lingo_mi.fitting.field.rays import FieldBox, integrals, pixels_of
 from lingo_mi.fitting.models.model import Model
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.grid import view_table
@@ -30,7 +30,7 @@ class FieldModel(Model):
 
     def __init__(self, options: Field, geometry: Geometry, unit: float):
         super().__init__(geometry, unit)
-        self.options, self.cube = options, Cube(geometry, options.field_cube)
+        self.options, self.cube = options, FieldBox(geometry, options.field_cube)
 
     @cached_property
     def network(self) -> Network:

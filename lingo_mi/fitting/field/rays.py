@@ -15,7 +15,7 @@ from lingo_mi.projectors.grid import pixel_walk
 
 
 @dataclass(frozen=True)
-class Cube:
+class FieldBox:
     """The cube that a field is encoded in, about the centre of a scan's volume; its box is the volume itself.
 
     geometry   of the scan
@@ -35,7 +35,7 @@ class Cube:
 
 
 def integrals(
-    density: Callable[[Sequence[Any]], Any], cube: Cube, row: Any, x: Any, y: Any, samples: int, within: Any
+    density: Callable[[Sequence[Any]], Any], cube: FieldBox, row: Any, x: Any, y: Any, samples: int, within: Any
 ) -> Any:
     """Line integrals of a field along rays of one view, Float [rays], in units of the field's density times mm.
 
