@@ -31,7 +31,7 @@ from lingo_mi.files.scans import read_scan
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fit import Fit as Fitted
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.measure import measure
+from lingo_mi.fitting.measure import fit_metrics
 from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.metrics import quality as metrics
@@ -297,7 +297,7 @@ class Cells:
                     report(iteration)
 
             fitted = run(dataset.train, method, self.seed, progress=progress, path=saved, resume=resume)
-        return measure(fitted.with_data(dataset)) | dict(
+        return fit_metrics(fitted.with_data(dataset)) | dict(
             method=cell.method, settings=method.flat(), initial=fitted.info
         )
 

@@ -15,7 +15,7 @@ from lingo_mi.fitting import loop
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.loop import run
-from lingo_mi.fitting.measure import measure, summary
+from lingo_mi.fitting.measure import fit_metrics, summary
 from lingo_mi.fitting.methods.by_name import METHODS
 from lingo_mi.fitting.stopping import HeldOut, sentence
 
@@ -112,7 +112,7 @@ def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
 
 
 def test_what_is_told(scan, whole):
-    numbers = measure(whole)
+    numbers = fit_metrics(whole)
     assert numbers['iterations'] == whole.steps and numbers['search']['best'] == whole.steps
     assert numbers['stopping'] == f'stopped at step {whole.steps}: held-out error did not fall for 30 steps more'
     assert numbers['stopping'] in summary(numbers)
