@@ -3,10 +3,16 @@
 A class that derives from a Mitsuba class belongs to one variant, so every file here is loaded anew for each variant.
 """
 
+from __future__ import annotations
+
 import importlib
 import sys
+from functools import partial
+from typing import Any
 
 import mitsuba as mi
+
+from lingo_mi.common.errors import InputError
 
 # plugin name -> (module, what to call with it and with the plugin's constructor)
 PLUGINS = {
@@ -21,20 +27,41 @@ PLUGINS = {
 
 
 def register() -> None:
-    """Register all plugins with the active variant."""
+    """Register all plugins with the active variant: where it has no derivatives, what says which variants have."""
+    works = 'ad' in (mi.variant() or '').split('_')
     for name, (module, registrar) in PLUGINS.items():
+        if not works:
+            getattr(mi, registrar)(name, partial(_refuse, name))
+            continue
         path = f'{__name__}.{module}'
         loaded = importlib.reload(sys.modules[path]) if path in sys.modules else importlib.import_module(path)
         getattr(mi, registrar)(name, loaded.create)
+
+
+def _refuse(name: str, *_: Any) -> None:
+    raise InputError(
+        f'{name} does not work in {mi.variant()}: call mitsuba.set_variant with llvm_ad_mono, llvm_ad_rgb, cuda_ad_mono or '
+        'cuda_ad_rgb before the scene is loaded'
+    )
+
+
+def render(*args: Any, **kwargs: Any) -> Any:
+    """Mitsuba's `render`, whose last line of a traceback is the InputError of a plugin, not that Dr.Jit met one."""
+    try:
+        return mi.util.render(*args, **kwargs)
+    except RuntimeError as error:
+        if isinstance(error.__cause__, InputError):
+            raise error.__cause__ from None
+        raise
 
 
 def watch_variants() -> None:
     """Register the plugins with the active variant, and again with whichever is set later."""
 
     def on_variant(*_):
-        variant = mi.variant()
-        if variant is not None and 'ad' in variant.split('_'):
+        if mi.variant() is not None:
             register()
+            mi.render = render
 
     mi.detail.add_variant_callback(on_variant)
     on_variant()

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import require_whole
 
 
 class CTDetector(mi.Film):
@@ -67,11 +68,7 @@ class CTDetector(mi.Film):
         except InputError as error:
             raise InputError(f'ct_detector {props.id()!r}: {error}') from None
         super().__init__(props)
-        if any(self.crop_size()[i] != self.size()[i] for i in (0, 1)):
-            raise InputError(
-                f'ct_detector {props.id()!r}: has no crop window, since blur, gains and noise are of the whole panel; '
-                'crop the image'
-            )
+        require_whole(self, f'ct_detector {props.id()!r}')
         self.film = mi.load_dict(
             dict(
                 type='hdrfilm',

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -115,7 +116,7 @@ class CTScanner(mi.Sensor):
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
         rays = self.geometry.rays()
-        self.frame = View.of(rays, self.index, *self.geometry.nDetector)
+        self.panel = View.of(rays, self.index, *self.geometry.nDetector)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
             np.linalg.norm(rays.corner[self.index])
@@ -134,6 +135,24 @@ class CTScanner(mi.Sensor):
             return scan.on(own_grid(props, scan.geometry.grid))
 
         return Dataset(on_grid(found.train), found.test and on_grid(found.test))
+
+    @property
+    def frame(self) -> View:
+        """The rays through the film's crop window, the whole panel unless `mi.traverse` changed it.
+
+        Raises InputError if the film has other pixels than the panel.
+        """
+        film, panel = self.film(), self.panel
+        if (film.size()[0], film.size()[1]) != (panel.width, panel.height):
+            raise InputError(
+                f'ct_scanner {self.id()!r}: the film has {film.size()[0]} x {film.size()[1]} pixels, the panel '
+                f'{panel.width} x {panel.height}: change nDetector instead, or give a batch of n scanners a film of n '
+                f'times {panel.width} x {panel.height}'
+            )
+        (x, y), (width, height) = film.crop_offset(), film.crop_size()
+        if (width, height) == (panel.width, panel.height):
+            return panel
+        return replace(panel, corner=panel.corner + x * panel.u + y * panel.v, width=width, height=height)
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
         """The sensor of one view, of this scan or of another geometry, with the same detector."""
@@ -175,7 +194,7 @@ class CTScanner(mi.Sensor):
         return mi.RayDifferential3f(ray), weight
 
     def bbox(self) -> mi.ScalarBoundingBox3f:
-        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*np.array(self.frame.source).ravel()))
+        return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*np.array(self.panel.source).ravel()))
 
     def to_string(self) -> str:
         g = self.geometry

@@ -12,7 +12,8 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import find_effects
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.options import RenderOptions
-from lingo_mi.projectors.sensors import view_of
+from lingo_mi.projectors.sensors import views_of
+from lingo_mi.projectors.usable import require_unfrozen
 
 
 class LingoXray(mi.ad.integrators.common.ADIntegrator):
@@ -67,7 +68,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
       `lingo_mi.projectors.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
     - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation. Mitsuba does
       not tell which `filter_type` and `wrap_mode` a volume has, so the defaults, `trilinear` and `clamp`, are assumed;
-    - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation.
+    - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation;
+    - an `instance` of a `shapegroup` of such shapes, moved by its `to_world`.
 
     An emitter `xray_tube` (spectrum, focal spot) and a film `ct_detector` (blur, noise and more) make the image what a
     detector sees, -ln of the detected signal; docs/effects.md says how. Without them, nothing of their code is compiled.
@@ -75,11 +77,14 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
     centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
-    `perspective` and `orthographic`. Integrals begin at a cone beam's source, and do not end at the panel.
+    `perspective` and `orthographic`, and a `batch` of them, whose views stand side by side in its film. Of a film with a
+    crop window, only that is rendered. Integrals begin at a cone beam's source, and do not end at the panel.
     Those of a parallel beam are never cut.
 
-    Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`. Gradients reach the Gaussians' centres, scales, rotations and
-    densities, the grid's values and its scale, and a mesh's `sigma_t` (not its vertices), in forward and in reverse mode.
+    Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`; not within `dr.freeze`, nor inside `aov` or `moment`, since it
+    renders whole images and no single rays. The film gets the image, for `sensor.film().bitmap()`. Gradients reach the
+    Gaussians' centres, scales, rotations and densities, the grid's values and its scale, a mesh's `sigma_t` (not its
+    vertices, for which it raises an error) and the `to_world` of an instance, in forward and in reverse mode.
     """
 
     def __init__(self, props):
@@ -105,8 +110,11 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     ) -> mi.TensorXf:
         if not develop:
             raise InputError('lingo_xray renders with develop=True only: there are no samples to accumulate')
+        require_unfrozen('mi.render with lingo_xray')
         with dr.suspend_grad():
+            sensor = _sensor(scene, sensor)
             image = self._image(scene, sensor, seed=int(np.ravel(seed)[0]))  # of any type that Mitsuba takes
+            _expose(sensor.film(), image)
             if evaluate:
                 dr.eval(image)
             return image
@@ -114,7 +122,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     def render_forward(
         self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: int = 0, spp: int = 0
     ) -> mi.TensorXf:
-        image = self._image(scene, sensor)
+        image = self._image(scene, _sensor(scene, sensor))
         dr.forward_to(image)
         return dr.grad(image)
 
@@ -128,27 +136,35 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         spp: int = 0,
     ) -> None:
         # A line integral is linear in what was splatted, so its image need not be computed again.
-        image = self._image(scene, sensor, primal=self.output == 'transmission')
+        image = self._image(scene, _sensor(scene, sensor), primal=self.output == 'transmission')
         dr.backward_from(image * grad_in)
+
+    def sample(self, *_: Any, **__: Any) -> Any:
+        """What an integrator around this one asks for: a single ray. Raises InputError."""
+        raise InputError(
+            'lingo_xray renders whole images, no single rays: take it out of the integrator around it (aov, moment), and '
+            'render that one by itself, mi.render(scene, integrator=...)'
+        )
 
     def _image(self, scene, sensor, primal=True, seed=None):
         """The image as a tensor [height, width, channels of the film]; with a seed, as measured."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        view = view_of(sensor)
-        effects = find_effects(scene, sensor)
-        if effects is None:
-            total = self._ideal(find_objects(scene), view, primal)
-        else:
-            total = effects.line_integrals(find_objects(scene), view, self.options)
-            total = effects.expected(total, view) if seed is None else effects.measured(total, view, seed)
-            if self.output == 'transmission':
-                total = dr.exp(-total)
         film = sensor.film()
         film.prepare([])
         channels = film.develop().shape[2]
-        if channels > 1:
-            total = dr.repeat(total, channels)
-        return mi.TensorXf(total, shape=(view.height, view.width, channels))
+        images = []
+        for one, view in views_of(sensor):
+            effects = find_effects(scene, one)
+            if effects is None:
+                total = self._ideal(find_objects(scene), view, primal)
+            else:
+                total = effects.line_integrals(find_objects(scene), view, self.options)
+                total = effects.expected(total, view) if seed is None else effects.measured(total, view, seed)
+                if self.output == 'transmission':
+                    total = dr.exp(-total)
+            if channels > 1:
+                total = dr.repeat(total, channels)
+            images.append(mi.TensorXf(total, shape=(view.height, view.width, channels)))
+        return images[0] if len(images) == 1 else dr.concat(images, axis=1)
 
     def _ideal(self, objects, view, primal):
         """Line integrals, or transmissions, of every pixel of a scene without effects."""
@@ -164,6 +180,25 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         o = self.options
         pixel = 'area' if o.area else f'{o.pixel} x {o.pixel}'
         return f'LingoXray[extent = {o.extent:g}, footprint = {o.footprint}, pixel = {pixel}, output = {self.output}]'
+
+
+def _sensor(scene, sensor):
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _expose(film, image):
+    """Give a film, which was prepared, the image, so that `film.bitmap()` and `film.write()` have it."""
+    block = film.create_block()
+    height, width = image.shape[:2]
+    channels = block.channel_count()  # colours, alpha if the film has it, and the weight, which is 1
+    colours = 1 if image.shape[2] == 1 else min(3, image.shape[2])
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    index = dr.arange(mi.UInt32, height * width * channels)
+    channel, pixel = index % channels, index // channels
+    value = dr.gather(mi.Float, image.array, pixel * image.shape[2] + dr.minimum(channel, colours - 1))
+    value = dr.select(channel < channels - 1 - has_alpha, value, 1)
+    tensor: Any = mi.TensorXf(value, (height, width, channels))
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
 create = LingoXray

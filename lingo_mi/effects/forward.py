@@ -180,6 +180,14 @@ def effects_of(scan: Scan) -> Effects | None:
     return cast('Effects | None', scan.effects)
 
 
+def require_whole(film: Any, where: str) -> None:
+    """Raises InputError for a film with a crop window. where: whose it is, for the message."""
+    if any(film.crop_size()[i] != film.size()[i] for i in (0, 1)):
+        raise InputError(
+            f'{where}: has no crop window, since blur, gains, noise and scatter are of the whole panel; crop the image'
+        )
+
+
 def find_effects(scene: Any, sensor: Any) -> Effects | None:
     """The effects of a scene with a sensor; None without any. Raises InputError for impossible ones."""
     tubes = [e for e in scene.emitters() if hasattr(e, 'tube')]
@@ -194,6 +202,8 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
         raise InputError(
             f'xray_tube {tubes[0].id()!r}: material_{unknown[0]} names none of the shapes {", ".join(sorted(shapes))}'
         )
+    if detector is not None or scatter is not None:
+        require_whole(sensor.film(), f'the film of {sensor.id()!r} under a ct_detector or with scatter')
     geometry = getattr(sensor, 'geometry', None)
     if detector is not None and detector.psf and geometry is None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')

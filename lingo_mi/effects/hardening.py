@@ -205,7 +205,7 @@ def _parts(thing, split):
             )
         first.density, second.density = thing.density * (1 - thing.second), thing.density * thing.second
     else:
-        raise InputError(f'the mesh {thing.name!r} is homogeneous and cannot be of two materials')
+        raise InputError(f'{thing.name!r}, a mesh or in a shapegroup, cannot be of two materials: give it one')
     return first, second
 
 

@@ -33,7 +33,7 @@ from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
-from lingo_mi.projectors.usable import require_usable
+from lingo_mi.projectors.usable import require_unfrozen, require_usable
 from lingo_mi.projectors.view import View, vector64
 
 
@@ -120,6 +120,7 @@ def _checked(function, name: str):
     """A function of Gaussians that first makes sure that they are usable."""
 
     def wrapped(*gaussians):
+        require_unfrozen(f'lm.{name}')
         require_usable(*gaussians, where=f'the arrays given to {name}')
         return function(*gaussians)
 

@@ -155,9 +155,9 @@ def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     Raises InputError if the shape is not a mesh, and as `MeshPaths` does.
     """
     name = shape.id()
-    if not shape.is_mesh():
-        raise InputError(f'the shape {name!r} is not a triangle mesh: use a ply, obj or cube shape, for example')
     parameters = mi.traverse(shape)
+    if not (shape.is_mesh() and 'vertex_positions' in parameters):  # a rectangle is one without
+        raise InputError(f'the shape {name!r} is not a triangle mesh: use a ply, obj or cube shape, for example')
     vertices, faces = (np.array(parameters[key]).reshape(-1, 3) for key in ('vertex_positions', 'faces'))
     return MeshPaths(vertices, faces, name)
 

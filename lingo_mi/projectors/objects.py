@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -11,6 +12,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.projectors import cloud, grid
+from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.usable import require_usable
 from lingo_mi.projectors.view import View
@@ -28,13 +30,29 @@ def find_objects(scene: mi.Scene) -> list:
 
     Raises InputError for an object that `lingo_xray` cannot integrate, and for a scene without objects.
     """
-    found = [thing for shape in scene.shapes() if (thing := _object(shape)) is not None]
+    found = [thing for shape in scene.shapes() for thing in _objects(shape, scene)]
     if not found:
         raise InputError(
             'the scene has nothing that attenuates: add ellipsoids with a density, a cube with a '
             'heterogeneous medium or a closed mesh with a homogeneous one'
         )
     return found
+
+
+def _objects(shape: mi.Shape, scene: mi.Scene) -> list:
+    """What attenuates in a shape; an instance has what its group has, moved."""
+    if shape.class_name() != 'Instance':
+        thing = _object(shape)
+        return [] if thing is None else [thing]
+    # An instance does not tell its group: the name is read from its description, the group found among the scene's.
+    name = re.findall(r'ShapeGroup\[\s*name = "(.*)"', str(shape))
+    nodes = mi.traverse(scene).hierarchy
+    groups = [node for node in nodes if isinstance(node, mi.Shape) and str(node).startswith('ShapeGroup[')]
+    groups = [group for group in groups if [group.id()] == name]
+    if len(groups) != 1:
+        raise InputError(f'lingo_xray does not find the shapegroup of the instance {shape.id()!r}: give each an id')
+    inside = [node for node, (parent, _) in nodes.items() if parent is groups[0] and isinstance(node, mi.Shape)]
+    return [Instance(shape, thing) for part in inside if (thing := _object(part)) is not None]
 
 
 def _object(shape: mi.Shape) -> Ellipsoids | GridInCube | HomogeneousMesh | None:
@@ -173,6 +191,44 @@ def _axis_aligned(cube, volume) -> bool:
     )
 
 
+class Instance:
+    """An object of a `shapegroup`, moved by an affine transform, the `to_world` of an `instance`.
+
+    The rays are moved back instead: a ray o + t D of the world is M^-1 o + t M^-1 D in the object's frame, so the line
+    integral is that of the object, times |D| / |M^-1 D|. Derivatives reach the object and the transform.
+    """
+
+    def __init__(self, shape: mi.Shape, thing: Any):
+        self.name, self.thing = thing.name, thing
+        params: Any = mi.traverse(shape)
+        self.to_world = params['to_world'].matrix
+
+    def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
+        local, stretch = self._moved(view)
+        return self.thing.line_integrals(local, options, primal) * stretch
+
+    @full_float64()
+    def _moved(self, view):
+        """The view in the object's frame, and |D| / |M^-1 D| of every pixel."""
+        Vector3d = mi.Vector3d
+        Float64 = dr.value_t(Vector3d)
+        m = self.to_world
+        columns = [Vector3d(*(Float64(m[i, j]) for i in range(3))) for j in range(4)]
+        dr.make_opaque(columns)  # every pose would be a kernel of its own otherwise
+        a, b, c, origin = columns
+        rows = [r / dr.dot(a, dr.cross(b, c)) for r in (dr.cross(b, c), dr.cross(c, a), dr.cross(a, b))]
+
+        def back(d):
+            return Vector3d(*(dr.dot(row, d) for row in rows))
+
+        source = back(view.source) if view.parallel else back(view.source - origin)
+        local = replace(view, corner=back(view.corner - origin), u=back(view.u), v=back(view.v), source=source)
+        if view.parallel:
+            length = dr.norm(source)
+            return replace(local, source=source / length), mi.Float(1 / length)
+        return local, view.lengths() / local.lengths()
+
+
 class HomogeneousMesh:
     """A closed mesh with a homogeneous medium inside."""
 
@@ -180,16 +236,22 @@ class HomogeneousMesh:
         from lingo_mi.projectors.mesh import from_mitsuba
 
         self.name = shape.id()
-        if not shape.is_mesh():
+        geometry: Any = mi.traverse(shape)
+        if not shape.is_mesh() or 'vertex_positions' not in geometry:  # a rectangle says that it is a mesh
             raise InputError(
                 f'the shape {shape.id()!r} has a homogeneous medium, but is not a mesh: use ply, obj or cube'
             )
+        with dr.resume_grad():
+            if dr.grad_enabled(geometry['vertex_positions']):
+                raise InputError(
+                    f'derivatives do not reach the vertices of the mesh {shape.id()!r}: switch them off with '
+                    'dr.disable_grad, or fit ellipsoids or a grid instead'
+                )
         params: Any = mi.traverse(medium)
         self.sigma = next(
             v for k, v in params.items() if k.endswith('sigma_t.value.value') or k.endswith('sigma_t.value')
         )
         self.scale = params.get('scale', 1.0)
-        geometry: Any = mi.traverse(shape)
         # A kept array's index is unique, so a moved mesh does not match the old entry.
         arrays = geometry['vertex_positions'], geometry['faces']
         key = (id(shape), *(x.index for x in arrays))

@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import triangles
 from lingo_mi.projectors import cutoff
-from lingo_mi.projectors.objects import Ellipsoids, GridInCube, HomogeneousMesh
+from lingo_mi.projectors.objects import Ellipsoids, GridInCube, HomogeneousMesh, Instance
 from lingo_mi.projectors.rotation import rows_of
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
@@ -35,6 +36,7 @@ def on_grid(
     interpolated trilinearly, and averaged over voxels larger than its own; on its own voxels it is returned unchanged.
     """
     nx, ny, nz = shape
+    _require_own_place(thing)
     if isinstance(thing, Ellipsoids):
         cells = Lattice(vector64(corner), vector64(step), (nx, ny, nz))
         return cells.volume(
@@ -75,7 +77,16 @@ def bounds(objects: Iterable) -> tuple[np.ndarray, np.ndarray]:
     return np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)
 
 
+def _require_own_place(thing):
+    if isinstance(thing, Instance):
+        raise InputError(
+            f'the density of {thing.name!r} in a shapegroup is not sampled, which scattered light needs: put the shape into the '
+            'scene itself, with the to_world of its instance'
+        )
+
+
 def _box(thing):
+    _require_own_place(thing)
     if isinstance(thing, GridInCube):
         return np.array(thing.low, float).ravel(), np.array(thing.high, float).ravel()
     if isinstance(thing, HomogeneousMesh):

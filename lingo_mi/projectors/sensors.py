@@ -12,6 +12,17 @@ from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View
 
 
+def views_of(sensor: Any) -> list[tuple[Any, View]]:
+    """The sensors within a `mi.Sensor` and their rays: those of a `batch` from left to right, of any other the sensor itself.
+
+    Mitsuba gives each sensor of a batch a film of the size of its part. Raises InputError as `view_of`.
+    """
+    if sensor.class_name() != 'BatchSensor':
+        return [(sensor, view_of(sensor))]
+    members = [node for node in mi.traverse(sensor).hierarchy if isinstance(node, mi.Sensor) and node is not sensor]
+    return [(member, view_of(member)) for member in members]
+
+
 @full_float64()
 def view_of(sensor: Any) -> View:
     """The rays through the pixel centres of the film of a flat `mi.Sensor`.
@@ -25,7 +36,7 @@ def view_of(sensor: Any) -> View:
     if kind not in ('PerspectiveCamera', 'OrthographicCamera'):
         raise InputError(
             f'lingo_xray cannot use the sensor {sensor.id()!r} ({kind}): '
-            'it takes ct_scanner, perspective and orthographic'
+            'it takes ct_scanner, perspective, orthographic and a batch of them'
         )
     film = sensor.film()
     params: Any = mi.traverse(sensor)

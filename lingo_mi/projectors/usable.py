@@ -1,4 +1,4 @@
-"""Checks which Gaussians can be integrated, and which of them accurately."""
+"""Checks which Gaussians can be integrated, which of them accurately, and whether Dr.Jit can record the kernels."""
 
 from __future__ import annotations
 
@@ -55,6 +55,21 @@ def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: 
                 stacklevel=3,
             )
     return worst == 0
+
+
+def require_unfrozen(what: str) -> None:
+    """Raises InputError within a function under `dr.freeze`.
+
+    A projection shares its work out by counts that it reads back from the device, and these change with the cloud: a recording
+    cannot be replayed, and Dr.Jit ends the process where one is tried.
+
+    what   that is called, for the message
+    """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise InputError(
+            f'{what} cannot be recorded by dr.freeze, since it reads back how much work each view is: call it outside the '
+            'frozen function'
+        )
 
 
 def _first(where: Any) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.grid import project_volume
-from lingo_mi.projectors.objects import Ellipsoids, GridInCube
+from lingo_mi.projectors.objects import Ellipsoids, GridInCube, Instance
 from lingo_mi.projectors.sampling import on_grid
 
 
@@ -18,6 +18,8 @@ def true_volume(objects: Iterable, grid: Grid) -> np.ndarray | None:
     for thing in objects:
         if isinstance(thing, ScannedVolume):
             total += thing.data
+        elif isinstance(thing, Instance):
+            return None
         elif not isinstance(thing, GridInCube) or fills_grid(thing, grid):
             total += on_grid(thing, grid.low, grid.spacing, grid.shape)
         else:

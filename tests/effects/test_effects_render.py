@@ -347,7 +347,7 @@ def test_a_panel_has_no_crop_window():
 @physics
 def test_second_material_of_a_mesh():
     tube = dict(TUBE, material='soft tissue + bone', split='0.3, 0.7')
-    for thing, match in ((block(), 'homogeneous and cannot'), (ellipsoids(cloud_of()), 'no attribute "second"')):
+    for thing, match in ((block(), 'cannot be of two materials'), (ellipsoids(cloud_of()), 'no attribute "second"')):
         scene = scene_of(dict(thing=thing), tube)
         with pytest.raises(InputError, match=match):
             through_mitsuba(scene)

@@ -79,3 +79,12 @@ def cloud_of(n=6, seed=0):
 
 def values_of(shape=(5, 4, 6)):
     return np.random.default_rng(1).random(shape)
+
+
+def mitsuba_rays(sensor):
+    """Mitsuba's own rays through the pixel centres: start and unit direction, [pixels, 3]."""
+    width, height = sensor.film().crop_size()
+    y, x = np.divmod(np.arange(width * height), width)
+    at = mi.Point2f(((x + 0.5) / width).tolist(), ((y + 0.5) / height).tolist())
+    ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    return (np.broadcast_to(np.array(x, float).T, (width * height, 3)) for x in (ray.o, ray.d))
