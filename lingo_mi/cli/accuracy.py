@@ -7,7 +7,7 @@
     lingo-mi accuracy --presets --beside out/cuda/accuracy.json
 
 Writes accuracy.json, accuracy.md and the plots to --out, and to accuracy.provenance.json how they were made. The full run takes
-6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go there and the tables into a page there, too.
+6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go there, and conditions and presets into a page there, too.
 
 --presets measures the table of the presets alone, which needs no ray tracing. --beside adds another variant's errors to it.
 """
@@ -42,11 +42,11 @@ def main() -> None:
     use_variant(args.variant)
     from lingo_mi.studies.accuracy import FULL, QUICK, measure, measure_presets
     from lingo_mi.studies.accuracy.report import write
-    from lingo_mi.studies.accuracy.tables import TITLES, read_presets
+    from lingo_mi.studies.accuracy.tables import SHOWN, read_presets
     from lingo_mi.studies.markdown import check_places
 
     if document:
-        check_places(document, ['presets'] if args.presets else TITLES)
+        check_places(document, ['presets'] if args.presets else SHOWN)
     beside = read_presets(args.beside) if args.beside else None
     sizes = QUICK if args.quick else FULL
     if args.presets:

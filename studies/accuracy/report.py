@@ -7,17 +7,17 @@ from pathlib import Path
 
 from lingo_mi.storage.file_access import write_text
 from lingo_mi.studies.accuracy.plots import draw
-from lingo_mi.studies.accuracy.tables import TITLES, make_tables
+from lingo_mi.studies.accuracy.tables import SHOWN, TITLES, make_tables
 from lingo_mi.studies.markdown import insert_into
 from lingo_mi.studies.provenance import write_provenance
 
 
 def write(found: dict, folder: Path, figures: Path, document: Path | None = None, beside: dict | None = None) -> None:
-    """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables into a document.
+    """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables of `tables.SHOWN` into a document.
 
     Of presets alone there is one table and no plot.
 
-    document   a Markdown file with a place for each table; None: no document
+    document   a Markdown file with a place for each table that it shows; None: no document
     beside     another variant's presets, `tables.read_presets`
 
     `provenance` is written beside accuracy.md and beside the document.
@@ -32,5 +32,5 @@ def write(found: dict, folder: Path, figures: Path, document: Path | None = None
         figures.mkdir(parents=True, exist_ok=True)
         draw(found, figures)
     if document:
-        insert_into(document, tables)
+        insert_into(document, {name: table for name, table in tables.items() if name in SHOWN})
         write_provenance(document)

@@ -29,6 +29,7 @@ TITLES = dict(
     fits='Fits',
     field='Neural fields',
 )
+SHOWN = 'conditions', 'presets'  # what the page of the documentation shows; it links to the others as data
 
 
 def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:

@@ -57,10 +57,8 @@ def make_table(numbers: dict) -> str:
 
     columns = [
         ('effect', lambda r: r['title']),
-        ('largest line integral', lambda r: f'{r["largest"]:.1f}'),
         *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
         ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
-        ('fits, s', lambda r: ', '.join(f'{r[kind]["seconds"]:.0f}' for kind in FITS)),
         ('extra, s', lambda r: f'{round(r["model"]["seconds"] - r["ignore"]["seconds"]):+d}'),
     ]
     return table(columns, numbers.values())
