@@ -13,7 +13,7 @@ from lingo_mi.studies.provenance import write_provenance
 
 
 def write(found: dict, folder: Path, figures: Path, document: Path | None = None, beside: dict | None = None) -> None:
-    """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables of `tables.SHOWN` into a document.
+    """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables SHOWN into a document.
 
     Of presets alone there is one table and no plot.
 

@@ -2,7 +2,6 @@
 
 import subprocess
 from collections import Counter
-from importlib import resources
 
 import pytest
 
