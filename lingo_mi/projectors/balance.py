@@ -154,7 +154,7 @@ def _on_cpu() -> bool:
     return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
-SHARING = Sharing()  # as measured: docs/accuracy.md
+SHARING = Sharing()  # as measured: docs/tables/accuracy_shares_of_the_work.csv
 
 
 @dataclass

@@ -43,8 +43,7 @@ class Refined(Algorithm):
 
     Structure finer than the voxels causes streaks. A cloud can be sampled on smaller voxels: with `finer`, all steps use these,
     and the result is their mean over each voxel. This helps for clean projections of objects finer than the voxels. It blurs
-    an object that was simulated on the scan's own voxels, and lets in more noise (docs/benchmarks/volumes.md, "Better volumes
-    from 25 views").
+    an object that was simulated on the scan's own voxels, and lets in more noise (docs/benchmarks/volumes.md).
 
     niter             passes over the measured views, at least 1
     completed_niter   passes over the completed views before, at least 0

@@ -1,6 +1,8 @@
 """The table of docs/gpu.md: what the model predicts for cards that were not at hand, from what `count` counted.
 
-python -m lingo_mi.studies.cuda.report docs/gpu.md
+    python -m lingo_mi.studies.cuda.report docs/gpu.md
+
+writes it between its markers.
 """
 
 from __future__ import annotations
