@@ -7,7 +7,7 @@
     fit.volume()                                        # [x, y, z], density per mm
     fit.render(data.test.geometry)                      # [view, v, u], line integrals
     lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
-    images = lm.project(*fit.gaussians, data.test.geometry, extent=fit.method.extent)   # NumPy, Dr.Jit, PyTorch, JAX
+    images = lm.project(fit.gaussians, data.test.geometry)    # also of arrays of NumPy, Dr.Jit, PyTorch, JAX
 
 The names below are loaded on first use, and choose a variant of Mitsuba if none is active. `import lingo_mi` and
 `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba.
@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.common.runtime import use_variant
     from lingo_mi.fitting.field.options import Field
     from lingo_mi.fitting.fit import Fit, load_fit
-    from lingo_mi.fitting.fitted_model import Gaussians
     from lingo_mi.fitting.method import Method
     from lingo_mi.fitting.methods.densities import DensityMethod
     from lingo_mi.fitting.methods.fast import Fast
@@ -59,6 +58,7 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.fitting.start.start import Start, StartingCloud
     from lingo_mi.fitting.start.uniform import CuboidStart, RandomStart
     from lingo_mi.functional import Projector, project, voxelize
+    from lingo_mi.functional.gaussians import Gaussians
     from lingo_mi.geometry import Geometry, Grid, circular
     from lingo_mi.reconstruction import (
         ASDPOCS,
@@ -105,10 +105,10 @@ _MODULES = {
     'fitting.options.bounds': 'ScaleBounds',
     'fitting.field.options': 'Field',
     'fitting.fit': 'Fit load_fit',
-    'fitting.fitted_model': 'Gaussians',
     'api.volumes': 'reconstruct',
     'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS PenalisedLeastSquares TV Denoiser Prior Refined Best',
     'functional': 'Projector project voxelize',
+    'functional.gaussians': 'Gaussians',
     'common.runtime': 'use_variant',
     'common.errors': 'InputError',
 }

@@ -149,11 +149,24 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--shape', type=int, nargs=3, metavar='N', help='voxels x y z of a raw --volume')
     parser.add_argument('--dtype', help='type of a raw --volume, such as uint8')
+    spacing_argument(parser, '--volume')
     parser.add_argument(
         '--mu-water',
         type=float,
         metavar='MU',
         help='a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to densities in [0, 1])',
+    )
+
+
+def spacing_argument(parser: argparse.ArgumentParser, of: str) -> None:
+    """Add --spacing, the voxel size of the volume that the option `of` names."""
+    parser.add_argument(
+        '--spacing',
+        type=float,
+        nargs='+',
+        metavar='MM',
+        help=f'voxel size of a {of} whose file does not say it (.npy, .npz, raw, most TIFF), one number or x y z '
+        '(default: 1 mm)',
     )
 
 
@@ -174,8 +187,8 @@ def check_input(args: argparse.Namespace) -> None:
             raise InputError(f'--{name} names no file')
     if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
-    if not args.volume and (args.shape or args.dtype or args.mu_water is not None):
-        raise InputError('--shape, --dtype and --mu-water go with --volume')
+    if not args.volume and (args.shape or args.dtype or args.spacing or args.mu_water is not None):
+        raise InputError('--shape, --dtype, --spacing and --mu-water go with --volume')
     if args.dtype and not _of_numbers(args.dtype):
         raise InputError(f'--dtype must be a NumPy type of real numbers, such as uint8, not {shown(args.dtype)}')
     if args.projections and args.volume:
@@ -212,7 +225,7 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
         check_memory(thinned(dataset.train.geometry, slab))
         warn_if_truncated(dataset.train.geometry)
         return dataset
-    volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype) if args.volume else None
+    volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype, args.spacing) if args.volume else None
     return take_scan(scene, views or 0, volume, seed, truth=not slab)
 
 

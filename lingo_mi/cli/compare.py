@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lingo_mi.cli.common import Parser
+from lingo_mi.cli.common import Parser, spacing_argument
 from lingo_mi.common.errors import InputError
 from lingo_mi.storage.file_access import require_writable, write_text
 from lingo_mi.storage.folder_lock import writing_file
@@ -31,6 +31,7 @@ def main() -> None:
         metavar='MU',
         help='where the truth has Hounsfield units: the attenuation of water, 1/mm, that the results were made with',
     )
+    spacing_argument(parser, '--truth')
     parser.add_argument(
         '--out', type=Path, default=Path('compare.html'), metavar='F.html', help='the page (default: compare.html)'
     )
@@ -44,11 +45,12 @@ def main() -> None:
         raise InputError(f'{args.out}: a comparison is a page; give a name that ends in .html')
     if args.out.exists() and not args.force:
         raise InputError(f'{args.out}: exists already; give --force to replace it, or another --out')
-    if args.mu_water is not None and args.truth is None:
-        raise InputError('--mu-water goes with --truth')
+    if args.truth is None and (args.spacing or args.mu_water is not None):
+        raise InputError('--spacing and --mu-water go with --truth')
     require_writable(args.out.parent, args.out)
     found = [load_result(path) for path in args.results]
-    page = compare_page(found, read_volume(args.truth, args.mu_water) if args.truth else None, args.title)
+    truth = read_volume(args.truth, args.mu_water, spacing=args.spacing) if args.truth else None
+    page = compare_page(found, truth, args.title)
     with writing_file(args.out):
         write_text(args.out, page)
     print(args.out)

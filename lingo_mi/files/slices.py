@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 import os
 import re
@@ -22,17 +23,26 @@ _DEFLATED_DICOM = '1.2.840.10008.1.2.1.99'
 _RATIO = {1: 1, 5: 4096, 8: 1032, 32946: 1032, 32773: 64}
 
 
-def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """The values [x, y, z] of a folder of TIFF slices, or of a DICOM series with its affine [4, 4] in mm (NIfTI's axes).
+# Of the units that ImageJ and OME write: mm.
+_MILLIMETRES = {
+    **dict.fromkeys(('um', '\u00b5m', '\u03bcm', '\\u00b5m', 'micron', 'microns', 'micrometer'), 1e-3),
+    **dict.fromkeys(('mm', 'millimeter', 'millimeters'), 1.0),
+    **dict.fromkeys(('in', 'inch', 'inches'), 25.4),
+    **dict(nm=1e-6, cm=10.0, m=1e3),
+}
+
+
+def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None, Path | None]:
+    """The values [x, y, z] of a folder of slices; a DICOM series' affine [4, 4] in mm (NIfTI's axes); the first slice of TIFF.
 
     Raises InputError where there are none, or they do not make one volume.
     """
     with reading(folder, folder=True):
         tiffs = sorted((f for f in folder.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=by_number)
     if tiffs:
-        return read_tiff(tiffs), None
+        return read_tiff(tiffs), None, tiffs[0]
     with quiet('pydicom'):
-        return _dicom(folder)
+        return *_dicom(folder), None
 
 
 def by_number(path: Path) -> list:
@@ -60,6 +70,51 @@ def require_chain(path: Path) -> None:
             if left < 0:
                 raise InputError(f'{path}: is a damaged TIFF file: its list of images has no end; write it again')
             (at,) = struct.unpack(order + link, following)
+
+
+def tiff_spacing(path: Path) -> tuple[float, float, float | None] | None:
+    """The voxel size (x, y, z) in mm that ImageJ or OME wrote into a TIFF file that `read_tiff_file` has read.
+
+    z is None where the file says nothing of it. Returns None for files of others: their resolution is that of a printer.
+    """
+    tifffile = optional('tifffile')
+    try:
+        with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False) as file:
+            page: Any = file.pages[0]
+            said = _of_ome(page.description) if '<OME' in page.description[:2000] else _of_imagej(file, page)
+    except InputError:
+        raise
+    except Exception:  # a description of another form, of which nothing is known
+        return None
+    steps = [size * _MILLIMETRES.get(unit.strip().lower(), math.nan) for size, unit in said]
+    if len(steps) < 2 or not all(math.isfinite(step) and step > 0 for step in steps):
+        return None
+    return steps[0], steps[1], steps[2] if len(steps) > 2 else None
+
+
+def _of_ome(text):
+    """(size, unit) along x, y and, if it is there, z."""
+    out = []
+    for axis in 'XYZ':
+        size = re.search(rf'\bPhysicalSize{axis}\s*=\s*["\']([-+.eE\d]+)["\']', text)
+        unit = re.search(rf'\bPhysicalSize{axis}Unit\s*=\s*["\']([^"\']*)["\']', text)
+        if size is None:
+            break
+        out.append((float(size[1]), html.unescape(unit[1]) if unit else '\u00b5m'))  # OME's default
+    return out
+
+
+def _of_imagej(file, page):
+    """As `_of_ome`. A stack whose slices are 1 unit apart does not say so."""
+    said = file.imagej_metadata or {}
+    if 'unit' not in said or not {'XResolution', 'YResolution'} <= {tag.name for tag in page.tags}:
+        return []
+    unit, out = str(said['unit']), []
+    for name in ('XResolution', 'YResolution'):
+        pixels, length = page.tags[name].value
+        out.append((length / pixels if pixels else math.nan, unit))
+    depth = said.get('spacing', 1.0 if int(said.get('slices', said.get('images', 1))) > 1 else None)
+    return out if depth is None else [*out, (abs(float(depth)), str(said.get('zunit', unit)))]
 
 
 def read_tiff_file(path: Path) -> np.ndarray:

@@ -179,7 +179,8 @@ def read_volume(
     shape      of raw bytes, (x, y, z), x fastest
     dtype      of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3
                `foot`
-    spacing    voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm)
+    spacing    voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm); TIFF has it where ImageJ or
+               OME wrote it
     hu         whether the values are Hounsfield units, if that is not clear from the values
 
     Values become densities by the rules of the module. Raises InputError if the file is missing, damaged,
@@ -187,7 +188,7 @@ def read_volume(
     missing.
     """
     path = Path(path)
-    name, description, affine = path.name.lower(), '', None
+    name, description, affine, tiff = path.name.lower(), '', None, None
     if mu_water is not None and not (np.isfinite(mu_water) and mu_water > 0):
         raise InputError(f'mu_water must be positive, in 1/mm, not {shown(mu_water)}; water at 60 keV has 0.0206')
     if (shape is None) != (dtype is None) and not name.endswith('.raw'):
@@ -195,7 +196,7 @@ def read_volume(
     if name.endswith('.zarr'):
         data, affine, description = ome_zarr.read_ome_zarr(path)
     elif path.is_dir():
-        data, affine = slices.read_folder(path)
+        data, affine, tiff = slices.read_folder(path)
         hu = True if hu is None and affine is not None else hu  # DICOM's
     elif shape is not None and dtype is not None or name.endswith('.raw'):
         data = _raw(path, shape, dtype)
@@ -209,7 +210,7 @@ def read_volume(
     elif name.endswith('.npz'):
         data = _npz(path)
     elif name.endswith(('.tif', '.tiff')):
-        data = slices.read_tiff([path])
+        data, tiff = slices.read_tiff([path]), path
     elif name.endswith('.dcm'):
         raise InputError(f'{path}: is a single DICOM slice; give the folder of the series')
     else:
@@ -220,6 +221,15 @@ def read_volume(
             'folder of slices, or shape and dtype of raw bytes'
         )
     data = numeric(data, path, 3)
+    if tiff is not None and (steps := slices.tiff_spacing(tiff)) is not None:
+        x, y, z = steps
+        if z is not None:
+            affine = centred_affine(data.shape, (x, y, z))
+        elif spacing is None:
+            raise InputError(
+                f'{path}: its pixels are {x:g} x {y:g} mm, but it does not say how far its slices are apart: give '
+                f'spacing=({x:g}, {y:g}, MM)'
+            )
     if affine is None:
         try:
             steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,32 +16,13 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.models.model import Model
 from lingo_mi.fitting.state import State
+from lingo_mi.functional.gaussians import Gaussians
 from lingo_mi.geometry import Geometry, Grid
+from lingo_mi.projectors import cutoff
 from lingo_mi.projectors.objects import Ellipsoids
 from lingo_mi.scan import Dataset
 from lingo_mi.storage.file_access import parsed_json, reading
 from lingo_mi.storage.output_folder import METRICS, VIEWS, require_together
-
-
-class Gaussians(NamedTuple):
-    """A cloud of N Gaussians in the world frame of the scan, ready for `lm.project` and `lm.voxelize`.
-
-    Attributes
-    ----------
-    means : ndarray
-        Centres, mm, float [N, 3].
-    scales : ndarray
-        Standard deviations, mm, float [N, 3].
-    quaternions : ndarray
-        (x, y, z, w), unit length, float [N, 4].
-    density : ndarray
-        Values at the centres, 1/mm, float [N]; opacities for `GaussianSplatting` and `XGaussian`.
-    """
-
-    means: np.ndarray
-    scales: np.ndarray
-    quaternions: np.ndarray
-    density: np.ndarray
 
 
 class FittedModel:
@@ -110,8 +90,9 @@ class FittedModel:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The cloud, for `lm.project(*fit.gaussians, geometry, extent=fit.method.extent)`. Raises InputError for a field."""
-        return Gaussians(*self.model.gaussians(self._device))
+        """The cloud, with its cut-off: `lm.project(fit.gaussians, geometry)`. Raises InputError for a field."""
+        arrays = self.model.gaussians(self._device)
+        return Gaussians(*arrays, extent=getattr(self.method, 'extent', cutoff.RENDER))
 
     @property
     def _device(self) -> DeviceState:

@@ -19,7 +19,7 @@ import math
 import operator
 from collections.abc import Iterable
 from numbers import Real
-from typing import Any
+from typing import Any, overload
 
 import drjit as dr
 import mitsuba as mi
@@ -28,6 +28,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.common.memory import room
 from lingo_mi.functional.frameworks import call
+from lingo_mi.functional.gaussians import Gaussians
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
@@ -37,6 +38,13 @@ from lingo_mi.projectors.usable import require_unfrozen, require_usable
 from lingo_mi.projectors.view import View, vector64
 
 
+@overload
+def project(
+    means: Gaussians, geometry: Geometry, /, *, extent: float | None = None, views: Iterable[int] | None = None
+) -> Any: ...
+
+
+@overload
 def project(
     means: Any,
     scales: Any,
@@ -44,10 +52,24 @@ def project(
     density: Any,
     geometry: Geometry,
     *,
-    extent: float = cutoff.RENDER,
+    extent: float | None = None,
+    views: Iterable[int] | None = None,
+) -> Any: ...
+
+
+def project(
+    means: Any,
+    scales: Any = None,
+    quaternions: Any = None,
+    density: Any = None,
+    geometry: Any = None,
+    *,
+    extent: float | None = None,
     views: Iterable[int] | None = None,
 ) -> Any:
     """Line integrals of a cloud of Gaussians along the rays of a scan: images [n, v, u], float32, of the caller's kind.
+
+    Takes `project(gaussians, geometry)`, where `gaussians` is a `Gaussians` such as `fit.gaussians`, or its four arrays:
 
     means        [N, 3] centres, mm, in the world frame of `lingo_mi.geometry`
     scales       [N, 3] standard deviations along the Gaussians' own axes, mm, positive
@@ -55,8 +77,8 @@ def project(
     density      [N] values at the centres, in 1/mm for images without a unit
     geometry     the scan; its rays run from the source through the pixel centres and on, so that a virtual panel may stand
                  within the object (DSD = DSO); those of a parallel beam begin and end at infinity
-    extent       cut-off in standard deviations, 1 to 20; with 5, images are good to 2e-6 and derivatives to 4e-5
-                 (relative L2 norms, docs/accuracy.md)
+    extent       cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, 5 for arrays); with 5, images are good
+                 to 2e-6 and derivatives to 4e-5 (relative L2 norms, docs/accuracy.md)
     views        indices of the views to project, n of them; None for all
 
     The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
@@ -72,11 +94,12 @@ def project(
     extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
     `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
+    arrays, geometry, extent = _taken(means, scales, quaternions, density, geometry, extent)
     require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
     rays = geometry.rays()
     index = _indices(views, len(rays))
-    rays, options = rays[index], RenderOptions(_extent(extent))
+    rays, options = rays[index], RenderOptions(extent)
 
     def images(*gaussians):
         views = (View.of(rays, i, height, width) for i in range(len(index)))
@@ -85,13 +108,31 @@ def project(
 
     shape = len(index), height, width
     _require_room(shape, 'project')
-    return call(_checked(images, 'project'), (means, scales, quaternions, density), shape, 'project')
+    return call(_checked(images, 'project'), arrays, shape, 'project')
+
+
+@overload
+def voxelize(means: Gaussians, grid: Grid | Geometry, /, *, extent: float | None = None) -> Any: ...
+
+
+@overload
+def voxelize(
+    means: Any, scales: Any, quaternions: Any, density: Any, grid: Grid | Geometry, *, extent: float | None = None
+) -> Any: ...
 
 
 def voxelize(
-    means: Any, scales: Any, quaternions: Any, density: Any, grid: Grid | Geometry, *, extent: float = cutoff.RENDER
+    means: Any,
+    scales: Any = None,
+    quaternions: Any = None,
+    density: Any = None,
+    grid: Any = None,
+    *,
+    extent: float | None = None,
 ) -> Any:
     """Densities of a cloud of Gaussians at the voxel centres of a grid: [x, y, z], float32, of the caller's kind.
+
+    Takes `voxelize(gaussians, grid)`, or four arrays, as `project`.
 
     grid   or a geometry, whose grid it is
 
@@ -99,10 +140,10 @@ def voxelize(
 
         volume = voxelize(means, scales, quaternions, density, Grid(128, 2.0))
     """
+    arrays, grid, extent = _taken(means, scales, quaternions, density, grid, extent)
     require_type('grid', grid, (Grid, Geometry), 'of a scan give scan.geometry.grid')
     grid = grid.grid if isinstance(grid, Geometry) else grid
     corner, step, shape = grid.low, grid.spacing, grid.shape
-    extent = _extent(extent)
     _require_room(shape, 'voxelize')
 
     def volume(*gaussians):
@@ -113,7 +154,16 @@ def voxelize(
         x, rest = i // (ny * nz), i % (ny * nz)
         return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
 
-    return call(_checked(volume, 'voxelize'), (means, scales, quaternions, density), shape, 'voxelize')
+    return call(_checked(volume, 'voxelize'), arrays, shape, 'voxelize')
+
+
+def _taken(means, scales, quaternions, density, where, extent) -> tuple[tuple, Any, float]:
+    """Four arrays, where they are projected or sampled, and the cut-off, of a call with arrays or with `Gaussians`."""
+    if not isinstance(means, Gaussians):
+        return (means, scales, quaternions, density), where, _extent(cutoff.RENDER if extent is None else extent)
+    if quaternions is not None or density is not None or (scales is not None and where is not None):
+        raise InputError('Gaussians hold all four arrays: give them and the geometry or grid alone')
+    return tuple(means), scales if where is None else where, _extent(means.extent if extent is None else extent)
 
 
 def _checked(function, name: str):

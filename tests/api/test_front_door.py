@@ -252,10 +252,18 @@ def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
 
 def test_the_cloud_by_function(result, data):
     """`lm.project` and `lm.voxelize` of the result's Gaussians are what the result renders."""
-    views = lm.project(*result.gaussians, data.test.geometry, extent=result.method.extent)
-    np.testing.assert_allclose(views, result.render(data.test.geometry), atol=2e-4 * views.max())
-    grid = lm.voxelize(*result.gaussians, data.train.geometry, extent=result.method.extent)
+    cloud, geometry = result.gaussians, data.test.geometry
+    views = lm.project(cloud, geometry)
+    np.testing.assert_allclose(views, result.render(geometry), atol=2e-4 * views.max())
+    np.testing.assert_array_equal(lm.project(*cloud, geometry, extent=result.method.extent), views)
+    np.testing.assert_array_equal(lm.project(cloud, geometry=geometry), views)
+    assert not np.array_equal(lm.project(*cloud, geometry), views)  # arrays alone are cut off farther out
+    grid = lm.voxelize(cloud, data.train.geometry)
     np.testing.assert_allclose(grid, result.volume(), atol=2e-4 * grid.max())
+    with pytest.raises(lm.InputError, match='Gaussians hold all four arrays'):
+        lm.project(cloud, cloud.scales, cloud.quaternions, cloud.density, geometry)
+    with pytest.raises(lm.InputError, match='geometry must be a Geometry, not NoneType'):
+        lm.project(cloud)
 
 
 def test_save_and_load(result, data, tmp_path):

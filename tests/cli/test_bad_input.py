@@ -180,6 +180,7 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--iterations', '3', '-D', 'iterations=4'], 'leave one of them out'),
         (['-D', 'start=fdk', '--start', 'fdk'], '--start'),
         (['--mu-water', '0.02'], '--volume'),
+        (['--spacing', '0.5'], '--volume'),
         (['--resume'], 'no checkpoint'),
         (['--seed', '-1'], 'seed'),
         (['--seed', '9' * 400], '--seed'),

@@ -359,6 +359,43 @@ def test_bad_itk(tmp_path):
     refused(tmp_path / 'v.nrrd', '2 dimensions')
 
 
+IMAGEJ = dict(imagej=True, resolution=(1 / 4, 1 / 4))
+
+
+@pytest.mark.parametrize(
+    'name, written, spacing',
+    [
+        ('v.tif', dict(IMAGEJ, metadata=dict(axes='ZYX', spacing=5, unit='um')), (4e-3, 4e-3, 5e-3)),
+        ('v.tif', dict(IMAGEJ, metadata=dict(axes='ZYX', spacing=0.5, unit='mm')), (4, 4, 0.5)),
+        ('v.tif', dict(IMAGEJ, metadata=dict(axes='ZYX', unit='\\u00B5m')), (4e-3, 4e-3, 1e-3)),
+        ('v.tif', dict(IMAGEJ, metadata=dict(axes='ZYX', spacing=5, unit='pixel')), (1, 1, 1)),
+        (
+            'v.ome.tif',
+            dict(metadata=dict(axes='ZYX', PhysicalSizeX=4, PhysicalSizeY=3, PhysicalSizeZ=5, PhysicalSizeXUnit='nm')),
+            (4e-6, 3e-3, 5e-3),
+        ),
+        ('v.tif', dict(resolution=(72, 72), resolutionunit='INCH', metadata=None), (1, 1, 1)),  # of a printer
+    ],
+)
+def test_voxel_size_in_tiff(tmp_path, name, written, spacing):
+    tifffile = needs('tifffile')
+    tifffile.imwrite(tmp_path / name, COUNTS.transpose(2, 1, 0), photometric='minisblack', **written)
+    found = read_volume(tmp_path / name)
+    np.testing.assert_allclose(found.spacing, spacing, rtol=1e-6)
+    np.testing.assert_allclose(found.data, COUNTS / 119, rtol=1e-6)
+    if spacing[0] != 1:
+        refused(tmp_path / name, 'carries its own voxel size', spacing=2)
+
+
+def test_slices_of_known_pixels_at_an_unknown_distance(tmp_path):
+    tifffile = needs('tifffile')
+    for z in range(6):
+        metadata = dict(axes='YX', unit='um')
+        tifffile.imwrite(tmp_path / f's{z}.tif', COUNTS[:, :, z].T, metadata=metadata, **IMAGEJ)
+    refused(tmp_path, 'pixels are 0.004 x 0.004 mm.*give spacing=')
+    assert read_volume(tmp_path, spacing=(4e-3, 4e-3, 0.01)).spacing == pytest.approx((4e-3, 4e-3, 0.01))
+
+
 def test_tiff_stack_and_folder(tmp_path):
     tifffile = needs('tifffile')
     tifffile.imwrite(tmp_path / 'v.tif', COUNTS.transpose(2, 1, 0), photometric='minisblack')
