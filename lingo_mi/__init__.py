@@ -18,8 +18,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from lingo_mi.common.runtime import find_libllvm, mend_llvm
+from lingo_mi.common.runtime import calm_openmp, find_libllvm, mend_llvm
 
+calm_openmp()  # before anything loads PyTorch
 find_libllvm()  # before anything loads Dr.Jit
 mend_llvm()  # or after it
 

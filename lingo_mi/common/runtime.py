@@ -11,6 +11,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError
@@ -74,6 +75,30 @@ def find_libllvm() -> str | None:
             os.environ['DRJIT_LIBLLVM_PATH'] = found[0]
             return found[0]
     return None
+
+
+_POLICY = 'OMP_WAIT_POLICY'
+
+
+def calm_openmp() -> None:
+    """Let the threads of OpenMP sleep between two pieces of work, unless the user has chosen or PyTorch is loaded already.
+
+    PyTorch's spin by default, and take the cores from Dr.Jit's: calls of both in turn took four times the CPU's time. OpenMP
+    reads the environment once, when it is loaded.
+    """
+    if 'torch' not in sys.modules:
+        os.environ.setdefault(_POLICY, 'passive')
+
+
+@cache
+def warn_of_spinning() -> None:
+    """Warn, once, where PyTorch was loaded before `calm_openmp` could help."""
+    if _POLICY not in os.environ:
+        warnings.warn(
+            "PyTorch's threads spin while Dr.Jit works, and slow it down: import lingo_mi before torch, or set the environment "
+            f'variable {_POLICY}=passive',
+            stacklevel=2,
+        )
 
 
 def mend_llvm() -> None:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import torch
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time, warn_of_spinning
 from lingo_mi.functional.linear_map import LinearMap
 
 ALIGNED = 64  # bytes at which Dr.Jit's own arrays begin; the alignment of others is compiled into kernels
@@ -21,6 +21,8 @@ def apply_torch(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
         raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
     if x.device.type not in ('cpu', 'cuda'):
         raise InputError(f'{linear_map!r} takes tensors on the CPU or on a CUDA device, not on {x.device}')
+    if x.device.type == 'cpu':
+        warn_of_spinning()
     return _Apply.apply(x.as_subclass(torch.Tensor).to(torch.float32), linear_map)
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import torch
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import ensure_variant, one_at_a_time, warn_of_spinning
 
 
 def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any:
@@ -20,7 +20,10 @@ def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any
         raise InputError(
             f'{name}: the tensors must all be on the CPU or on one CUDA device, not on {", ".join(map(str, devices))}'
         )
-    ensure_variant(devices.pop().type)
+    device = devices.pop().type
+    ensure_variant(device)
+    if device == 'cpu':
+        warn_of_spinning()
     # Dr.Jit takes plain tensors alone: not nn.Parameter, which is a class of its own.
     plain = [a.as_subclass(torch.Tensor).to(torch.float32).contiguous() for a in arrays]
     return _OfDrJit.apply(function, *plain)
