@@ -12,7 +12,7 @@ import numpy as np
 import lingo_mi as lm
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.metrics.quality import psnr_3d
-from lingo_mi.studies.regret import Case, Study
+from studies.regret.study import Case, Study
 
 matplotlib.use('agg')
 import matplotlib.pyplot as plt

@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""The command `lingo-mi cuda-check`, to be run from a checkout: `python scripts/cuda_check.py --help` describes it."""
+"""The study `python -m studies.cuda_check`: `python scripts/cuda_check.py --help` describes it."""
 
-from lingo_mi.cli import run
+from studies.command import run_study
+from studies.cuda_check import main
 
 if __name__ == '__main__':
-    run('cuda-check')
+    run_study('cuda_check', main)

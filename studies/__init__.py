@@ -1,20 +1,18 @@
-"""Measurements of the package itself, installed as `lingo_mi.studies`. The library needs none of it.
+"""Measurements behind the documentation, run from a checkout. The package neither needs nor installs them.
 
-What is measured, each by a command of `lingo_mi.cli`:
+Each is a command, `python -m studies.NAME --help`:
 
-    accuracy         error against time, for all ways to compute the same projections
-    benchmarks       times against a hand-written kernel, Mitsuba's tree, RTK and diffct
-    effects          gain from modelling an effect of real projections
-    fuzz             mutated files for every reader
-    gradient_check   the derivatives of a scene's image against finite differences
-    hard_cases       needles, grazing rays, coincident Gaussians: cases at the limits of float32
-    recipes          quality of fits against time
-    tables           the paper's tables
-
-What it is measured against, and written down with:
-
-    oracle, closed_form     float64 references of clouds, by differences and by hand
-    alternatives            other ways to compute the projections of a cloud
-    pairs                   how much work an image is
-    markdown, provenance    tables in documents, and how they were made
+    bench_recon   reconstruction on voxels, timed beside RTK and diffct
+    bench_step    a step of a fit, timed part by part
+    cuda_check    the CUDA backend where there is no GPU
+    effects       what modelling an effect of real projections is worth
+    explain       which errors of a scanner explain the error of a reconstruction
+    fuzz          mutated files for every reader
+    growth        time and memory as voxels, pixels, views and Gaussians grow
+    hard_cases    needles, grazing rays, coincident Gaussians: cases at the limits of float32
+    noise         what an early stop and weights are worth to a fit of noisy projections
+    peers         volumes of one scan by this package, RTK and MBIRJAX
+    recipes       quality of fits against time
+    regret        how far the choice of `best` is behind the best fixed setting
+    tables        the paper's tables on simulated scans
 """

@@ -1,6 +1,6 @@
 """A scene's scan with voxels that are (nearly) boxes of constant density, as a file of X3D's kind.
 
-    python -m lingo_mi.studies.box_voxels x3d_aneurism aneurism_boxes.pickle
+    python -m studies.box_voxels x3d_aneurism aneurism_boxes.pickle
     lingo-mi fit x3d_aneurism --projections aneurism_boxes.pickle --method r2
 
 X3D's views are made by TIGRE's default projector, Siddon's, which takes a voxel for a box. Those of this package are exact for
@@ -17,12 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.api.data import simulate
+from lingo_mi.cli.common import Parser
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.files.scans import write_scan
 from lingo_mi.projectors import grid
 from lingo_mi.scan import Dataset, Scan
+from studies.command import run_study
 
 
 def with_boxes(dataset: Dataset, cut: int = 2) -> Dataset:
@@ -45,21 +47,18 @@ def with_boxes(dataset: Dataset, cut: int = 2) -> Dataset:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('scene', help='a scene file, or the name of a shipped one')
     p.add_argument('out', type=Path, metavar='F.pickle', help='the scan, for --projections')
     p.add_argument('--cut', type=int, default=2, metavar='N', help='pieces of a voxel along each side (default 2)')
     args = p.parse_args()
     if args.cut < 1:
-        p.error(f'--cut is 1 or more, not {args.cut}')
+        raise InputError(f'--cut must be at least 1, not {args.cut}')
     if args.out.exists():
-        p.error(f'{args.out}: exists already; choose another name')
+        raise InputError(f'{args.out}: exists already; choose another name')
     use_variant(None)
-    try:
-        write_scan(args.out, with_boxes(simulate(args.scene), args.cut), 'naf')
-    except InputError as error:
-        p.error(str(error))
+    write_scan(args.out, with_boxes(simulate(args.scene), args.cut), 'naf')
 
 
 if __name__ == '__main__':
-    main()
+    run_study('box_voxels', main)

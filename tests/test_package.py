@@ -1,4 +1,4 @@
-"""What an installation holds: every module, plugin, study and scene of the checkout."""
+"""What an installation holds: every module, plugin and scene of the checkout."""
 
 import os
 import shutil
@@ -11,13 +11,8 @@ import pytest
 import lingo_mi
 
 ROOT = Path(__file__).parents[1]
-PLACES = {
-    'lingo_mi': 'lingo_mi',
-    'plugins': 'lingo_mi/plugins',
-    'scenes': 'lingo_mi/scenes',
-    'studies': 'lingo_mi/studies',
-}
-KINDS = {'.py', '.xml', '.ply', '.cpp'}
+PLACES = {'lingo_mi': 'lingo_mi', 'plugins': 'lingo_mi/plugins', 'scenes': 'lingo_mi/scenes'}
+KINDS = {'.py', '.xml', '.ply', '.cpp', '.json'}
 
 
 def files(folder: Path) -> set[str]:
@@ -50,12 +45,12 @@ def test_an_installation_holds_every_file(built):
         'lingo_mi/scenes/effects/psf.xml',
         'lingo_mi/scenes/meshes/flange.ply',
         'lingo_mi/plugins/lingo_xray.py',
-        'lingo_mi/studies/hard_cases/cases.py',
-        'lingo_mi/studies/benchmarks/limit.cpp',
+        'lingo_mi/validation/limit.cpp',
+        'lingo_mi/validation/cuda_counts.json',
     } <= held
 
 
-def test_neither_tests_nor_scripts_are_installed(built):
+def test_neither_tests_nor_scripts_nor_studies_are_installed(built):
     assert [path.name for path in built.iterdir()] == ['lingo_mi']
 
 

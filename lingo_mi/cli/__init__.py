@@ -19,21 +19,9 @@ COMMANDS = {
     'calibrate': 'find where the panel really is: axis off centre, turn in its plane, drift',
     'phantom': 'make a test object and a scan of it',
     'gradcheck': "check the derivatives of a scene's image against differences",
-    'recipes': 'compare methods: quality against time',
-    'regret': 'measure how far the choice of best is behind the best fixed setting',
-    'peers': 'compare volumes of one scan with those of RTK and MBIRJAX',
-    'noise': 'measure what an early stop and weights are worth to a fit of noisy projections',
-    'tables': "regenerate the paper's tables",
     'accuracy': 'measure what accuracy costs in time',
-    'hard-cases': 'measure the hard cases: needles, grazing rays, coincident Gaussians',
-    'effects': 'measure what modelling the effects of a real detector is worth',
-    'growth': 'measure how time and memory grow with voxels, pixels, views and Gaussians',
-    'explain': 'measure which errors of a scanner explain what a reconstruction leaves of a measured scan',
     'bench': "time the integrator against a kernel written by hand and against Mitsuba's tree",
-    'bench-step': 'time a step of a fit, part by part',
-    'bench-recon': 'time reconstruction on voxels against other packages',
-    'fuzz': 'give every reader mutated files: a value, or one line that refuses it',
-    'cuda-check': 'check the CUDA backend where there is no GPU',
+    'x3d': "make the paper's tables from a folder of X3D's scans",
 }
 
 MODULES = {'import': 'import_frames', 'inspect': 'inspect_scan'}  # names that Python has a use for

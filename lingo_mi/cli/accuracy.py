@@ -40,10 +40,10 @@ def main() -> None:
     require_writable(args.out, args.out, 'choose another --out')
     document, figures = docs_of(args)
     use_variant(args.variant)
-    from lingo_mi.studies.accuracy import FULL, QUICK, measure, measure_presets
-    from lingo_mi.studies.accuracy.report import write
-    from lingo_mi.studies.accuracy.tables import SHOWN, read_presets
-    from lingo_mi.studies.markdown import check_places
+    from lingo_mi.validation.accuracy import FULL, QUICK, measure, measure_presets
+    from lingo_mi.validation.accuracy.report import write
+    from lingo_mi.validation.accuracy.tables import SHOWN, read_presets
+    from lingo_mi.validation.markdown import check_places
 
     if document:
         check_places(document, ['presets'] if args.presets else SHOWN)

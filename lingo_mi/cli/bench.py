@@ -4,7 +4,7 @@
     lingo-mi bench --gaussians 50000 --size 512 --extent 3 --json bench.json
 
 Renders a random cloud through mi.render and differentiates it through dr.backward, Python and set-up included, and runs
-limit.cpp of lingo_mi.studies.benchmarks (AVX2, two threads, nothing but the arithmetic of a pixel in a fixed box) on as many
+limit.cpp of lingo_mi.validation (AVX2, two threads, nothing but the arithmetic of a pixel in a fixed box) on as many
 pairs, in turn, so that both see the same machine; the best of five counts for both, and the median of all turns is printed. A
 pair is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
 
@@ -51,8 +51,8 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     args = arguments()
     variant = use_variant(args.variant)
-    from lingo_mi.studies.benchmarks.integrator import TREE, Bench, Work, describe_times, describe_tree
-    from lingo_mi.studies.cuda.model import beside
+    from lingo_mi.validation.benchmark import TREE, Bench, Work, describe_times, describe_tree
+    from lingo_mi.validation.cuda_model import beside
 
     if args.json:
         require_writable(args.json.parent, args.json, 'choose another --json')

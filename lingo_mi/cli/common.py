@@ -21,8 +21,7 @@ from lingo_mi.common import parsing
 from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.interrupts import noticed
 from lingo_mi.scene.shipped import scene_path, scenes
-from lingo_mi.storage.file_access import require_writable, write_text
-from lingo_mi.storage.folder_lock import locked
+from lingo_mi.storage.file_access import require_writable
 
 
 class Parser(argparse.ArgumentParser):
@@ -340,29 +339,3 @@ def definitions(pairs: Iterable[str]) -> dict[str, str]:
             raise InputError(f'-D {pair}: write it as name=value')
         out[name] = value
     return out
-
-
-@contextmanager
-def renewed_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[str], None]]:
-    """The table of a study that stores its cells one by one, as Markdown in a file whose folder is locked meanwhile.
-
-    Gives a function to call with a line after each cell: it prints the line and writes the table anew, with its provenance. At
-    the end the table is printed. After KeyboardInterrupt the same command goes on.
-    """
-    from lingo_mi.studies.provenance import write_provenance
-
-    def renew(line: str) -> None:
-        print(line, flush=True)
-        write()
-
-    def write() -> None:
-        write_text(file, table() + '\n')
-        write_provenance(file)
-
-    with locked(file.parent):
-        try:
-            yield renew
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt('the same command goes on from here') from None
-        write()
-    print(table())

@@ -40,7 +40,7 @@ def arguments() -> argparse.Namespace:
 def main() -> int:
     args = arguments()
     use_variant(args.variant)
-    from lingo_mi.studies.gradient_check import TOLERANCE, check_gradients, gradient_table, load_scene_file
+    from lingo_mi.validation.gradient_check import TOLERANCE, check_gradients, gradient_table, load_scene_file
 
     rows = check_gradients(load_scene_file(scene_path(args.scene)), args.step, args.count)
     worst = max(row.error for row in rows)

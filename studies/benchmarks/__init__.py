@@ -1,1 +1,1 @@
-"""Comparisons of time: the integrator with a hand-written kernel and Mitsuba's tree, voxel methods with RTK and diffct."""
+"""Times of a step of a fit, of voxel methods beside RTK and diffct, of neural fields and of arrays."""

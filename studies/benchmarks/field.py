@@ -1,7 +1,7 @@
 """Time of a step of a neural field, beside the same step in hand-written NumPy.
 
-    python -m lingo_mi.studies.benchmarks.field
-    python -m lingo_mi.studies.benchmarks.field --rays 256 --samples 96 --repeats 10
+    python -m studies.benchmarks.field
+    python -m studies.benchmarks.field --rays 256 --samples 96 --repeats 10
 
 Both encode random rays' samples, run the network, sum along the rays, backpropagate the mean squared error to all parameters and
 take one step of Adam, at NAF's published size. They run in turns; the ratio is that of the medians over all turns, of seconds of

@@ -1,7 +1,7 @@
 """Overhead of PyTorch: time of `functional.project` and its derivatives, relative to the same in Dr.Jit.
 
-    python -m lingo_mi.studies.benchmarks.functional
-    python -m lingo_mi.studies.benchmarks.functional --gaussians 50000 --pixels 512 --variant cuda_ad_mono
+    python -m studies.benchmarks.functional
+    python -m studies.benchmarks.functional --gaussians 50000 --pixels 512 --variant cuda_ad_mono
 
 Both project one view of a random cloud and backpropagate an image of random derivatives to the four parameters. They run in
 turns; the ratio is that of the medians over all turns.

@@ -18,7 +18,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.scan import Scan
-from lingo_mi.studies.benchmarks.rtk_bridge import require_every_pixel
+from studies.benchmarks.rtk_bridge import require_every_pixel
 
 
 def model(geometry: Geometry, mbirjax: Any) -> Any:

@@ -34,7 +34,7 @@ from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
-from lingo_mi.studies.benchmarks import rtk_bridge
+from studies.benchmarks import rtk_bridge
 
 Operations = dict[str, Callable[[], np.ndarray]]  # by name: projector, transpose, FDK, SART
 

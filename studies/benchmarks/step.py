@@ -22,7 +22,7 @@ from lingo_mi.fitting.options.loss import Loss
 from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.scan import Scan
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.markdown import table
 
 WARM = 3  # turns that are not counted
 VIEWS = 4  # at most

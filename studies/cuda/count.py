@@ -2,9 +2,9 @@
 
     lingo-mi fit x3d_foot --out out/foot
     lingo-mi fit chest --views 25 --iterations 400 --out out/chest
-    python -m lingo_mi.studies.cuda.count PROGRAM out/foot/checkpoint.npz out/chest/checkpoint.npz --json counts.json
+    python -m studies.cuda.count PROGRAM out/foot/checkpoint.npz out/chest/checkpoint.npz --json counts.json
 
-PROGRAM is a stand-in for the CUDA driver (see `lingo_mi.studies.cuda`), which counts what warps do. Instructions are PTX's,
+PROGRAM is a stand-in for the CUDA driver (see `studies.cuda`), which counts what warps do. Instructions are PTX's,
 without moves, most of which the assembler removes. A sector is 32 bytes, the least that memory moves.
 """
 
@@ -30,7 +30,7 @@ def profiled(stand_in: str, *arguments: str) -> tuple[str, dict]:
     A kernel's counts: launches; `warp`: instructions of warps by kind; `lanes`: their lanes at work, summed; sectors by kind.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = [stand_in, sys.executable, '-m', 'lingo_mi.studies.cuda.work', *arguments]
+        command = [stand_in, sys.executable, '-m', 'studies.cuda.work', *arguments]
         environment = os.environ | {'CUDA_ON_CPU_PROFILE': folder}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         kernels = {}

@@ -1,7 +1,7 @@
 """Times of a fit's image, derivatives and steps, as the device measures its kernels and as a clock measures the steps.
 
     lingo-mi fit x3d_foot --out out/foot
-    python -m lingo_mi.studies.cuda.measure out/foot/checkpoint.npz
+    python -m studies.cuda.measure out/foot/checkpoint.npz
 
 On a GPU the times that the model predicts stand beside.
 """
@@ -23,9 +23,9 @@ from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
-from lingo_mi.studies.cuda.model import Card, counts, predicted
-from lingo_mi.studies.cuda.work import VIEW, image
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.cuda_model import Card, counts, predicted
+from lingo_mi.validation.markdown import table
+from studies.cuda.work import VIEW, image
 
 WARM = 5
 SHORT = 0.05  # ms

@@ -1,20 +1,20 @@
-"""The Markdown page of what `lingo-mi cuda-check` found."""
+"""The Markdown page of what `python -m studies.cuda_check` found."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from lingo_mi.studies.cuda.assemble import Kernel
-from lingo_mi.studies.cuda.suite import Outcome
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.markdown import table
+from studies.cuda.assemble import Kernel
+from studies.cuda.suite import Outcome
 
 INTRODUCTION = """# CUDA without a GPU
 
-Written by `lingo-mi cuda-check --stand-in PROGRAM --markdown FILE`. The tests ran on `cuda_ad_mono` under a stand-in for the CUDA
-driver, which runs Dr.Jit's PTX on the CPU; it traces no rays and finds no races. Every kernel that they compiled went through
-`ptxas`, NVIDIA's assembler. Files of tests that load no kernel ran once for all devices. *Noise*: approximate instructions err
-by as much as NVIDIA allows. *Checked*: every address is."""
+Written by `python -m studies.cuda_check --stand-in PROGRAM --markdown FILE`. The tests ran on `cuda_ad_mono` under a stand-in for
+the CUDA driver, which runs Dr.Jit's PTX on the CPU; it traces no rays and finds no races. Every kernel that they compiled
+went through `ptxas`, NVIDIA's assembler. Files of tests that load no kernel ran once for all devices. *Noise*: approximate
+instructions err by as much as NVIDIA allows. *Checked*: every address is."""
 LARGEST = 8  # kernels listed
 
 

@@ -1,6 +1,6 @@
 """The table of docs/gpu.md: what the model predicts for cards that were not at hand, from what `count` counted.
 
-    python -m lingo_mi.studies.cuda.report docs/gpu.md
+    python -m studies.cuda.report docs/gpu.md
 
 writes it between its markers.
 """
@@ -10,8 +10,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from lingo_mi.studies.cuda.model import CARDS, counts, seconds
-from lingo_mi.studies.markdown import insert_into, table
+from lingo_mi.validation.cuda_model import CARDS, counts, seconds
+from lingo_mi.validation.markdown import insert_into, table
 
 
 def predictions(found: dict) -> str:

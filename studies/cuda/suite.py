@@ -15,8 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from lingo_mi.studies.cell_files import CellFiles
-from lingo_mi.studies.cuda.assemble import Kernel, assemble
+from studies.cell_files import CellFiles
+from studies.cuda.assemble import Kernel, assemble
 
 # Of every part that computes on the device, what takes few minutes.
 SHARE = (
@@ -32,7 +32,7 @@ SHARE = (
     'fitting/test_loop.py',
     'fitting/test_losses.py',
     'functional/test_functional.py',
-    'studies/test_gradient_check.py',
+    'validation/test_gradient_check.py',
     'common/test_memory.py',
 )
 WORKERS = 2  # test files at a time: the stand-in runs one thread

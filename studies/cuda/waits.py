@@ -1,8 +1,8 @@
 """How often a step of a fit waits for the GPU, copies, loads kernels and launches them.
 
-    python -m lingo_mi.studies.cuda.waits PROGRAM out/chest/checkpoint.npz
+    python -m studies.cuda.waits PROGRAM out/chest/checkpoint.npz
 
-PROGRAM is a stand-in for the CUDA driver (see `lingo_mi.studies.cuda`); on a machine with a GPU, `env`. gdb counts calls of the
+PROGRAM is a stand-in for the CUDA driver (see `studies.cuda`); on a machine with a GPU, `env`. gdb counts calls of the
 driver in runs of 6 and of 7 steps, and prints what the seventh adds.
 """
 
@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.markdown import table
 
 CALLS = {
     'waits': ('cuStreamSynchronize', 'cuEventSynchronize', 'cuCtxSynchronize'),
@@ -37,7 +37,7 @@ def calls(program: str, checkpoint: str, steps: int) -> dict[str, int]:
     with tempfile.NamedTemporaryFile('w', suffix='.gdb') as file:
         file.write('\n'.join(script))
         file.flush()
-        work = [sys.executable, '-m', 'lingo_mi.studies.cuda.work', checkpoint, 'steps', str(steps)]
+        work = [sys.executable, '-m', 'studies.cuda.work', checkpoint, 'steps', str(steps)]
         command = [program, 'gdb', '-batch', '-x', file.name, '--args', *work]
         try:
             done = subprocess.run(command, capture_output=True, text=True)

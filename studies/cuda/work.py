@@ -1,4 +1,4 @@
-"""What is counted, run under a stand-in for the CUDA driver: `python -m lingo_mi.studies.cuda.work CLOUD PART`.
+"""What is counted, run under a stand-in for the CUDA driver: `python -m studies.cuda.work CLOUD PART`.
 
 CLOUD is the checkpoint of a fit, or `giants`: 300 random Gaussians that fill the image. PART is
 
@@ -32,7 +32,7 @@ from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
-from lingo_mi.studies.pairs import count_pairs
+from lingo_mi.validation.pairs import count_pairs
 
 VIEW = 3
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from lingo_mi.report.figures import PADS, STYLE, plane, plane_extent, richest
 from lingo_mi.storage.file_access import read_object, replacing, write_text
-from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS
-from lingo_mi.studies.markdown import insert_into, table
-from lingo_mi.studies.provenance import provenance, write_provenance
+from lingo_mi.validation.markdown import insert_into, table
+from lingo_mi.validation.provenance import provenance, write_provenance
+from studies.effects.experiments import EXPERIMENTS, FITS
 
 TABLE = 'worth'  # its name in the document
 

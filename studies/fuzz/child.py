@@ -1,4 +1,4 @@
-"""Reads case after case and says on the standard output what came of each: `python -m lingo_mi.studies.fuzz.child`.
+"""Reads case after case and says on the standard output what came of each: `python -m studies.fuzz.child`.
 
 Lines in: reader, seed, first and last case, separated by tabs. Lines out: `start CASE` before a case, `end CASE RESULT` after it;
 the result is value, refused, or what is wrong.
@@ -16,7 +16,7 @@ from pathlib import Path
 from random import Random
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.studies.fuzz.readers import case, reader, write
+from studies.fuzz.readers import case, reader, write
 
 
 def verdict(name: str, folder: Path, rng: Random) -> str:

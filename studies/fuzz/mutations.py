@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.studies.fuzz.corpus import Structured, zipped
+from studies.fuzz.corpus import Structured, zipped
 
 LONGEST = 1 << 18  # bytes of a mutated file
 TOKENS = [

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import datetime
 
-from lingo_mi.studies.fuzz.pool import Tally
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.markdown import table
+from studies.fuzz.pool import Tally
 
 
 def page(tallies: dict[str, Tally], seed: int, wall: float, seconds: float, memory: int) -> str:
@@ -31,10 +31,10 @@ def page(tallies: dict[str, Tally], seed: int, wall: float, seconds: float, memo
     )
     return f"""# Mutated files
 
-Written by `lingo-mi fuzz --markdown FILE` with the seed {seed} on {date}: {total} files, each a good one with some mutations, in
-{wall:.0f} s. A case fails where its reader crashes, takes more than {seconds:g} s or {memory / 2**30:g} GiB, raises anything but
-an `InputError` of one printable line, or returns numbers that are not finite. {failed} failed. *Read*: the mutation
-left a file that makes sense.
+Written by `python -m studies.fuzz --markdown FILE` with the seed {seed} on {date}: {total} files, each a good one with some
+mutations, in {wall:.0f} s. A case fails where its reader crashes, takes more than {seconds:g} s or {memory / 2**30:g} GiB,
+raises anything but an `InputError` of one printable line, or returns numbers that are not finite. {failed} failed. *Read*: the
+mutation left a file that makes sense.
 
 {rows}
 """

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-from lingo_mi.studies.fuzz.readers import case, reader, write
+from studies.fuzz.readers import case, reader, write
 
 CHUNK = 100  # cases that a child is given at once
 
@@ -43,11 +43,11 @@ class Tally:
 
 
 def _command(memory: int) -> list[str]:
-    return [sys.executable, '-m', 'lingo_mi.studies.fuzz.child', str(memory)]
+    return [sys.executable, '-m', 'studies.fuzz.child', str(memory)]
 
 
 class _Child:
-    """A process that reads cases: see `lingo_mi.studies.fuzz.child`."""
+    """A process that reads cases: see `studies.fuzz.child`."""
 
     def __init__(self, memory: int):
         self.process = subprocess.Popen(

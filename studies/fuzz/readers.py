@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.studies.fuzz import corpus, mutations
-from lingo_mi.studies.fuzz.corpus import Sample
+from studies.fuzz import corpus, mutations
+from studies.fuzz.corpus import Sample
 
 # Shapes and types of raw bytes, which the command line gives.
 SHAPES = [

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from lingo_mi.storage.file_access import replacing
-from lingo_mi.studies.growth.stages import AXES, DEPENDS
-from lingo_mi.studies.growth.sweep import exponent
-from lingo_mi.studies.markdown import table
+from lingo_mi.validation.markdown import table
+from studies.growth.stages import AXES, DEPENDS
+from studies.growth.sweep import exponent
 
 
 def rows_of(found: list[dict], stage: str, axis: str) -> list[dict]:

@@ -1,6 +1,6 @@
 """The stages of a fit, as functions of the size of everything; run as a program, it measures one of them.
 
-    python -m lingo_mi.studies.growth.stages step 64,128,16,10000    # voxels a side, pixels a side, views, Gaussians; more sizes
+    python -m studies.growth.stages step 64,128,16,10000    # voxels a side, pixels a side, views, Gaussians; more sizes
 
 prints a line of JSON for every size: CPU seconds of a call (user and system), and the peak of memory in bytes, inputs included,
 above what libraries and a tiny call take.

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import astuple, replace
 
 from lingo_mi.common.errors import InputError, brief
-from lingo_mi.studies.growth.stages import DEPENDS, Size
+from studies.growth.stages import DEPENDS, Size
 
 BASE = Size(voxels=64, pixels=128, views=20, gaussians=10_000)
 FIELDS: dict[str, str] = dict(voxels='voxels', pixels='pixels', views='views', Gaussians='gaussians')
@@ -60,7 +60,7 @@ def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict], lis
 
 def _measured(stage: str, plan: list[tuple[str, int]]) -> list[dict]:
     words = [astuple(replace(BASE, **{FIELDS[axis]: value})) for axis, value in plan]
-    command = [sys.executable, '-m', 'lingo_mi.studies.growth.stages', stage]
+    command = [sys.executable, '-m', 'studies.growth.stages', stage]
     command += [','.join(map(str, word)) for word in words]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:

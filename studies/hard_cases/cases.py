@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from lingo_mi.studies.hard_cases.clouds import in_views
-from lingo_mi.studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
-from lingo_mi.studies.hard_cases.scans import of_scans
-from lingo_mi.studies.hard_cases.unusable import unusable
-from lingo_mi.studies.hard_cases.voxels import on_voxels
+from studies.hard_cases.clouds import in_views
+from studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
+from studies.hard_cases.scans import of_scans
+from studies.hard_cases.unusable import unusable
+from studies.hard_cases.voxels import on_voxels
 
 
 def all_cases(steps: int = 300) -> list[ViewCase | VoxelCase | ScanCase]:

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.studies.hard_cases.kinds import ViewCase
-from lingo_mi.studies.oracle import Cloud, random_cloud
+from lingo_mi.validation.oracle import Cloud, random_cloud
+from studies.hard_cases.kinds import ViewCase
 
 
 def in_views() -> Iterator[ViewCase]:

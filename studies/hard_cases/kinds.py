@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lingo_mi.geometry.rays import Rays
-from lingo_mi.studies.oracle import Cloud
+from lingo_mi.validation.oracle import Cloud
 
 IMAGE, GRADIENT = 1e-6, 1e-5  # what a case may show unless it says otherwise
 

@@ -32,10 +32,10 @@ from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
-from lingo_mi.studies import oracle
-from lingo_mi.studies.closed_form import NAMES, rays_and_gradients
-from lingo_mi.studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
-from lingo_mi.studies.oracle import Cloud, Pose
+from lingo_mi.validation import oracle
+from lingo_mi.validation.closed_form import NAMES, rays_and_gradients
+from lingo_mi.validation.oracle import Cloud, Pose
+from studies.hard_cases.kinds import ScanCase, ViewCase, VoxelCase
 
 PARAMETERS = tuple(NAMES)
 EXTENT = 8.0  # leaves e^-32 of a Gaussian out, 1e-14

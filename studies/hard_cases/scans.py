@@ -17,9 +17,9 @@ from lingo_mi.fitting.state import activate
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Scan
-from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases.kinds import ScanCase
-from lingo_mi.studies.oracle import Pose, random_cloud
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Pose, random_cloud
+from studies.hard_cases.kinds import ScanCase
 
 
 def measured(angles: ArrayLike, shape: tuple[int, int] = (24, 24)) -> Scan:

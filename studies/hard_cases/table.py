@@ -9,14 +9,14 @@ from pathlib import Path
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.storage.file_access import reading, replacing
-from lingo_mi.studies.hard_cases.measuring import PARAMETERS, Result, miss
+from studies.hard_cases.measuring import PARAMETERS, Result, miss
 
 INTRODUCTION = """# Hard cases
 
-Written by `lingo-mi hard-cases --markdown FILE`; asserted by `tests/studies/test_hard_cases.py`. Errors in float32
+Written by `python -m studies.hard_cases --markdown FILE`; asserted by `tests/studies/test_hard_cases.py`. Errors in float32
 against float64 on the same input, relative. Of the image: its root mean square deviation over its root mean square. Of
 derivatives, for each Gaussian and each kind of parameter: the norm of the deviation over the norm of all derivatives of that
-Gaussian, after all are converted to one unit (`lingo_mi.studies.hard_cases.measuring` says how); the worst Gaussian's is shown.
+Gaussian, after all are converted to one unit (`studies.hard_cases.measuring` says how); the worst Gaussian's is shown.
 *At most* is what the tests allow.
 """
 
@@ -64,7 +64,9 @@ def stored(path: Path) -> Stored:
         notes = {case['name']: case.pop('note') for case in cases}
         results = {case.pop('name'): Result(**case) for case in cases}
     except (ValueError, TypeError, KeyError, AttributeError):
-        raise InputError(f'{path}: is not a file of hard cases; write one with lingo-mi hard-cases --json') from None
+        raise InputError(
+            f'{path}: is not a file of hard cases; write one with python -m studies.hard_cases --json'
+        ) from None
     return Stored(variant, results, notes)
 
 

@@ -8,8 +8,8 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.studies.hard_cases.kinds import ScanCase
-from lingo_mi.studies.oracle import Cloud
+from lingo_mi.validation.oracle import Cloud
+from studies.hard_cases.kinds import ScanCase
 
 
 def unusable() -> Iterator[ScanCase]:

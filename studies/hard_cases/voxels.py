@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lingo_mi.studies.hard_cases.clouds import turned
-from lingo_mi.studies.hard_cases.kinds import VoxelCase
-from lingo_mi.studies.oracle import Cloud, random_cloud
+from lingo_mi.validation.oracle import Cloud, random_cloud
+from studies.hard_cases.clouds import turned
+from studies.hard_cases.kinds import VoxelCase
 
 
 def on_voxels() -> Iterator[VoxelCase]:

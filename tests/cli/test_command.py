@@ -1,4 +1,4 @@
-"""The console command `lingo-mi`: its help, its commands, and the scripts that are the same."""
+"""The console command `lingo-mi`: its help, its commands, the scripts that are the same, and the studies."""
 
 import runpy
 import subprocess
@@ -9,9 +9,14 @@ from pathlib import Path
 import pytest
 
 from lingo_mi import phantoms
-from lingo_mi.cli import COMMANDS, MODULES, main
+from lingo_mi.cli import COMMANDS, main
 
-SCRIPTS = Path(__file__).parents[2] / 'scripts'
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / 'scripts'
+STUDIES = sorted(
+    {path.stem for path in ROOT.glob('studies/*.py') if 'run_study(' in path.read_text() and path.stem != 'command'}
+    | {path.parent.name for path in ROOT.glob('studies/*/__main__.py')}
+)
 
 
 @pytest.fixture
@@ -60,17 +65,24 @@ def test_every_command_describes_itself(command, name):
     assert code == 0 and out.startswith(f'usage: lingo-mi {name} ') and not err
 
 
-@pytest.mark.parametrize('name', COMMANDS)
-def test_every_command_is_a_script(monkeypatch, capsys, name):
-    path = SCRIPTS / f'{MODULES.get(name, name.replace("-", "_"))}.py'
+@pytest.mark.parametrize('path', sorted(SCRIPTS.glob('*.py')), ids=lambda path: path.stem)
+def test_a_script_is_a_command(monkeypatch, capsys, path):
     monkeypatch.setattr(sys, 'argv', [str(path), '--help'])
     with pytest.raises(SystemExit) as stop:
         runpy.run_path(str(path), run_name='__main__')
-    assert stop.value.code == 0 and capsys.readouterr().out.startswith(f'usage: {path.name} ')
+    name = path.name if path.stem in COMMANDS else f'python -m studies.{path.stem}'
+    assert stop.value.code == 0 and capsys.readouterr().out.startswith(f'usage: {name} ')
 
 
-def test_there_are_no_other_scripts():
-    assert {path.stem for path in SCRIPTS.glob('*.py')} == {MODULES.get(c, c.replace('-', '_')) for c in COMMANDS}
+@pytest.mark.parametrize('name', STUDIES)
+def test_every_study_describes_itself(monkeypatch, capsys, name):
+    for args, expected in ((['--help'], 0), (['--no-such-option'], 2)):
+        monkeypatch.setattr(sys, 'argv', [name, *args])
+        with pytest.raises(SystemExit) as stop:
+            runpy.run_module(f'studies.{name}', run_name='__main__')
+        out, err = capsys.readouterr()
+        assert stop.value.code == expected and out.startswith(f'usage: python -m studies.{name} ') == (expected == 0)
+        assert not err if expected == 0 else err.startswith('error: ') and err.count('\n') == 1
 
 
 @pytest.mark.parametrize('name', COMMANDS)

@@ -35,7 +35,7 @@ def arguments(home, address):
 
 
 def start(home, address):
-    command = [sys.executable, BATCH, *arguments(home, address)]
+    command = [sys.executable, '-m', 'lingo_mi', BATCH, *arguments(home, address)]
     return subprocess.Popen([*map(str, command)], stdout=-1, stderr=-1, text=True, start_new_session=True)
 
 

@@ -11,7 +11,7 @@ from lingo_mi.fitting.densify import SHRINK, clone, densify, halve, prune, split
 from lingo_mi.fitting.methods.r2 import R2
 from lingo_mi.fitting.models.integral import PARAMETERS
 from lingo_mi.fitting.state import State, activate, start
-from lingo_mi.studies.oracle import whiten
+from lingo_mi.validation.oracle import whiten
 
 METHOD = R2().changed(densify_threshold=1.0, split_size=0.1)
 CONTROL, FORWARD = METHOD.densify, METHOD.forward

@@ -20,9 +20,9 @@ from lingo_mi.functional import project, voxelize
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors.upload import uploaded_tensor
-from lingo_mi.studies import oracle
-from lingo_mi.studies.closed_form import image_and_gradients
-from lingo_mi.studies.oracle import Pose, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.closed_form import image_and_gradients
+from lingo_mi.validation.oracle import Pose, random_cloud, relative
 
 EXTENT = 6.0
 NAMES = 'centre', 'scale', 'rotation', 'density'

@@ -1,4 +1,4 @@
-"""Mutated files: a share of what `lingo-mi fuzz` reads, shrunk where one fails."""
+"""Mutated files: a share of what `python -m studies.fuzz` reads, shrunk where one fails."""
 
 import sys
 import zipfile
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.checkpoint import Checkpoint
-from lingo_mi.studies.fuzz import corpus, pool
-from lingo_mi.studies.fuzz.child import verdict
-from lingo_mi.studies.fuzz.page import page
-from lingo_mi.studies.fuzz.pool import Tally, run, save_case
-from lingo_mi.studies.fuzz.readers import NAMES, reader, write
+from studies.fuzz import corpus, pool
+from studies.fuzz.child import verdict
+from studies.fuzz.page import page
+from studies.fuzz.pool import Tally, run, save_case
+from studies.fuzz.readers import NAMES, reader, write
 
 CHEAP = tuple(name for name in NAMES if name != 'scene')
 

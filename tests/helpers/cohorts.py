@@ -2,9 +2,7 @@
 
 import csv
 
-from helpers.script import FIT
-
-BATCH = FIT.with_name('batch.py')
+BATCH = 'batch'
 
 
 def results(home):

@@ -47,10 +47,11 @@ def work(request, calls):
 
     import lingo_mi as lm
     from helpers.write_faults import Faults
-    from lingo_mi.cli import fit, reconstruct, tables
+    from lingo_mi.cli import fit, reconstruct
     from lingo_mi.cli.common import guard
     from lingo_mi.common.runtime import use_variant
-    from lingo_mi.studies.tables import cells
+    from lingo_mi.validation.tables import cells
+    from studies import tables
 
     def save():
         use_variant('llvm_ad_mono')
@@ -79,8 +80,9 @@ def serve():
 
     import lingo_mi.fitting.save
     import lingo_mi.scene.load
-    import lingo_mi.studies.tables.report  # noqa: F401
-    from lingo_mi.cli import fit, reconstruct, tables  # noqa: F401
+    import lingo_mi.validation.tables.report  # noqa: F401
+    import studies.tables  # noqa: F401
+    from lingo_mi.cli import fit, reconstruct  # noqa: F401
 
     answers = os.dup(1)
     for line in sys.stdin:

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.studies.oracle import random_cloud
+from lingo_mi.validation.oracle import random_cloud
 
 SCANNER = dict(
     type='ct_scanner',

@@ -1,4 +1,4 @@
-"""Runs scripts/fit.py for tests: in this process, where Mitsuba is loaded already, or in a new one."""
+"""Runs scripts, commands and studies for tests: in this process, where Mitsuba is loaded already, or in a new one."""
 
 import contextlib
 import io
@@ -9,6 +9,8 @@ from pathlib import Path
 from unittest import mock
 
 import mitsuba as mi
+
+from lingo_mi.cli import run as run_command
 
 FIT = Path(__file__).parents[2] / 'scripts' / 'fit.py'
 
@@ -47,17 +49,24 @@ def fit(*args, report=False):
     return run(FIT, *args, report=report)
 
 
-def run(script, *args, report=False, variant=True):
-    """Exit code, standard output and standard error of `script ARGS`, run in this process; see `fit`.
+def run(what, *args, report=False, variant=True):
+    """Exit code, standard output and standard error of a command, run in this process; see `fit`.
 
-    variant   whether the script has a --variant, which is then the active one
+    what      the path of a script, the name of a study (`studies.NAME`), or a command of `lingo-mi`
+    variant   whether the command has a --variant, which is then the active one
     """
     out, err = io.StringIO(), io.StringIO()
-    argv = [str(script), *map(str, args), *(['--variant', mi.variant()] if variant and '--variant' not in args else [])]
+    argv = [str(what), *map(str, args), *(['--variant', mi.variant()] if variant and '--variant' not in args else [])]
     drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.fitting.save.write_report')
     with drawn, mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            runpy.run_path(str(script), run_name='__main__')
+            if isinstance(what, Path):
+                runpy.run_path(str(what), run_name='__main__')
+            elif what.startswith('studies.'):
+                runpy.run_module(what, run_name='__main__')
+            else:
+                sys.argv[0] = f'lingo-mi {what}'
+                run_command(what)
             code = 0
         except SystemExit as stop:
             code = stop.code

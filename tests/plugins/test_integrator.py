@@ -19,8 +19,8 @@ from lingo_mi.fitting.methods.r2 import R2
 from lingo_mi.fitting.state import start
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.sensors import view_of
-from lingo_mi.studies import oracle
-from lingo_mi.studies.oracle import Cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Cloud, relative
 
 FILM = dict(
     type='hdrfilm', width=26, height=19, rfilter=dict(type='box'), component_format='float32', pixel_format='luminance'

@@ -186,7 +186,7 @@ def test_batch_of_views():
 def test_batch_of_cameras():
     """The rays of each are those that Mitsuba's own integrators take through its part of the film."""
     from lingo_mi.projectors.sensors import views_of
-    from lingo_mi.studies import oracle
+    from lingo_mi.validation import oracle
 
     batch = mi.load_dict(dict(type='batch', film=FILM, first=camera(), second=camera(-1.0)))
     _, directions = mitsuba_rays(batch)

@@ -9,9 +9,9 @@ from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.backprop import Cuts
 from lingo_mi.projectors.footprint import project
 from lingo_mi.projectors.view import View
-from lingo_mi.studies.hard_cases.clouds import scanner
-from lingo_mi.studies.hard_cases.measuring import on_device
-from lingo_mi.studies.oracle import random_cloud
+from lingo_mi.validation.oracle import random_cloud
+from studies.hard_cases.clouds import scanner
+from studies.hard_cases.measuring import on_device
 
 
 def test_values_that_several_parts_use():

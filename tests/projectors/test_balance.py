@@ -15,10 +15,10 @@ from lingo_mi.projectors.mesh import MeshPaths
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
-from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases.clouds import scanner
-from lingo_mi.studies.hard_cases.measuring import on_device
-from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Cloud, Pose, random_cloud, relative
+from studies.hard_cases.clouds import scanner
+from studies.hard_cases.measuring import on_device
 
 # 2 lanes: a vector holds several teams, which do not end together. 32: a team is several vectors. A lane whose team is done
 # must divide by nothing: an integer division by zero ends the process.

@@ -22,9 +22,9 @@ from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.splat import splat
 from lingo_mi.projectors.usable import require_usable
 from lingo_mi.projectors.view import View
-from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
-from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Cloud, Pose, random_cloud, relative
+from studies.hard_cases.measuring import PARAMETERS, host, on_device
 
 EXTENT = 6.0
 POSE = 'source', 'corner', 'u', 'v'

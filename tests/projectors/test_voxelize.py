@@ -7,9 +7,9 @@ import pytest
 
 from lingo_mi.projectors.view import vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
-from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases.measuring import PARAMETERS, host, on_device
-from lingo_mi.studies.oracle import Cloud, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Cloud, random_cloud, relative
+from studies.hard_cases.measuring import PARAMETERS, host, on_device
 
 EXTENT = 6.0
 

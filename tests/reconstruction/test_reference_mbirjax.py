@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.projectors import grid
-from lingo_mi.studies.benchmarks import mbirjax_bridge
+from studies.benchmarks import mbirjax_bridge
 
 SCAN = dict(DSO=200, DSD=300, nDetector=(48, 64), dDetector=1.5, nVoxel=(40, 40, 24), angles=[0, 0.7, 2.0, 4.5])
 

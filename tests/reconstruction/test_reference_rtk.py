@@ -14,7 +14,7 @@ from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import sweep
 from lingo_mi.reconstruction.system import System
-from lingo_mi.studies.benchmarks import rtk_bridge as rtk
+from studies.benchmarks import rtk_bridge as rtk
 
 itk = pytest.importorskip('itk', reason="RTK is not installed: pip install -e '.[reference]'")
 if not hasattr(itk, 'RTK'):

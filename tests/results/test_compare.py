@@ -20,7 +20,7 @@ from lingo_mi.geometry import Grid
 from lingo_mi.results.compare import VolumeFile, compare_page, load_result
 from lingo_mi.scan import values_digest
 
-COMPARE = Path(__file__).parents[2] / 'scripts' / 'compare.py'
+COMPARE = 'compare'
 SHAPE = 12, 10, 8
 
 

@@ -1,4 +1,4 @@
-"""scripts/bench_recon.py at a few voxels; against RTK where it is installed."""
+"""`python -m studies.bench_recon` at a few voxels; against RTK where it is installed."""
 
 import json
 import runpy
@@ -7,19 +7,15 @@ import sys
 import numpy as np
 import pytest
 
-from helpers.script import FIT
-
-BENCH = FIT.with_name('bench_recon.py')
-
 
 @pytest.fixture
 def bench(tmp_path, monkeypatch, capsys):
     def run(*args, missing=()):
         for name in missing:
             monkeypatch.setitem(sys.modules, name, None)
-        monkeypatch.setattr(sys, 'argv', [str(BENCH), *args, '--json', str(tmp_path / 'a.json')])
+        monkeypatch.setattr(sys, 'argv', ['bench_recon', *args, '--json', str(tmp_path / 'a.json')])
         with pytest.raises(SystemExit) as stop:
-            runpy.run_path(str(BENCH), run_name='__main__')
+            runpy.run_module('studies.bench_recon', run_name='__main__')
         return stop.value.code, capsys.readouterr(), tmp_path / 'a.json'
 
     return run

@@ -3,8 +3,8 @@
 import pytest
 
 import lingo_mi as lm
-from helpers.script import FIT, run
-from lingo_mi.studies.benchmarks.step import described, measured
+from helpers.script import run
+from studies.benchmarks.step import described, measured
 
 
 def checkpoint(folder, method, **settings):
@@ -35,11 +35,11 @@ def test_a_loss_of_one_part(tmp_path):
 
 def test_another_kind_of_fit(tmp_path):
     path = checkpoint(tmp_path, '3dgs', n_points=50, iterations=2)
-    code, _, err = run(FIT.with_name('bench_step.py'), path)
+    code, _, err = run('studies.bench_step', path)
     assert code == 2 and 'composites opacities' in err and err.count('\n') == 1
 
 
 @pytest.mark.parametrize('args', [(), ('nothing.npz',), ('nothing.npz', '--repeats', 0)])
 def test_bad_input(args):
-    code, out, err = run(FIT.with_name('bench_step.py'), *args)
+    code, out, err = run('studies.bench_step', *args)
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1 and not out

@@ -6,7 +6,7 @@ import pytest
 import lingo_mi as lm
 from lingo_mi.common.errors import InputError
 from lingo_mi.scan import Dataset
-from lingo_mi.studies.box_voxels import with_boxes
+from studies.box_voxels import with_boxes
 
 
 def test_rays_through_one_voxel():

@@ -10,13 +10,14 @@ from helpers.script import FIT, run
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.gpu import GPU
 from lingo_mi.fitting.loop import run as run_fit
-from lingo_mi.studies.cell_files import CellFiles
-from lingo_mi.studies.cuda import assemble, measure, model, report, waits
-from lingo_mi.studies.cuda.assemble import Kernel, find_ptxas
-from lingo_mi.studies.cuda.count import KINDS, _counts, difference
-from lingo_mi.studies.cuda.model import CARDS, Card, counts, largest, predicted, seconds, times
-from lingo_mi.studies.cuda.page import page
-from lingo_mi.studies.cuda.suite import SHARE, Outcome, all_files, run_tests
+from lingo_mi.validation import cuda_model as model
+from lingo_mi.validation.cuda_model import CARDS, Card, counts, largest, predicted, seconds, times
+from studies.cell_files import CellFiles
+from studies.cuda import assemble, measure, report, waits
+from studies.cuda.assemble import Kernel, find_ptxas
+from studies.cuda.count import KINDS, _counts, difference
+from studies.cuda.page import page
+from studies.cuda.suite import SHARE, Outcome, all_files, run_tests
 
 CHECK = FIT.with_name('cuda_check.py')
 TESTS = FIT.parents[1] / 'tests'

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from helpers.script import FIT, run
+from helpers.script import run
 from lingo_mi.common.errors import InputError
 from lingo_mi.scene.shipped import scenes
-from lingo_mi.studies.effects.experiments import EXPERIMENTS, FITS, METHOD, measure, quality
-from lingo_mi.studies.effects.report import write
+from studies.effects.experiments import EXPERIMENTS, FITS, METHOD, measure, quality
+from studies.effects.report import write
 
 TINY = dict(views='6', voxels='16', voxel_size='8', pixels='24', pixel_size='12')
 
@@ -42,8 +42,8 @@ def test_an_experiment(tmp_path, monkeypatch):
     assert (out / 'effects.md').read_text().count('|') == document.read_text().count('|')
     assert all((folder / 'effects.provenance.json').exists() for folder in (out, tmp_path))
     assert (tmp_path / 'figures' / 'psf.png').stat().st_size > 10_000
-    monkeypatch.setattr('lingo_mi.studies.effects.experiments.measure', lambda name: result | dict(title=name))
-    script, again = FIT.with_name('effects.py'), tmp_path / 'again'
+    monkeypatch.setattr('studies.effects.experiments.measure', lambda name: result | dict(title=name))
+    script, again = 'studies.effects', tmp_path / 'again'
     code, text, err = run(script, '--only', 'psf', 'gain', '--out', again)
     assert code == 0 and '| gain |' in text and '| psf |' in text, err
     assert sorted(path.stem for path in again.glob('*.png')) == ['gain', 'psf']

@@ -9,7 +9,7 @@ import lingo_mi as lm
 from lingo_mi.calibration.drift import Drift
 from lingo_mi.geometry import circular
 from lingo_mi.projectors import grid
-from lingo_mi.studies import explain
+from studies.explain import residuals as explain
 
 
 def fan(views=60):

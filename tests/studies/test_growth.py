@@ -11,12 +11,10 @@ from unittest import mock
 
 import pytest
 
-from helpers.script import FIT
 from lingo_mi.common.errors import InputError
-from lingo_mi.studies.growth import stages, sweep
-from lingo_mi.studies.growth.report import exponents, rows_of
+from studies.growth import stages, sweep
+from studies.growth.report import exponents, rows_of
 
-GROWTH = FIT.with_name('growth.py')
 pytestmark = pytest.mark.skipif(not Path('/proc/self/clear_refs').exists(), reason='asks Linux for its peak memory')
 
 
@@ -66,12 +64,12 @@ def test_the_command(tmp_path, monkeypatch):
 
 
 def run_growth(folder):
-    """Exit code, standard output and standard error of `lingo-mi growth --out FOLDER`."""
+    """Exit code, standard output and standard error of `python -m studies.growth --out FOLDER`."""
     out, err = io.StringIO(), io.StringIO()
-    argv = [str(GROWTH), '--out', str(folder)]
+    argv = ['growth', '--out', str(folder)]
     with mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            runpy.run_path(str(GROWTH), run_name='__main__')
+            runpy.run_module('studies.growth', run_name='__main__')
             code = 0
         except SystemExit as stop:
             code = stop.code

@@ -29,24 +29,15 @@ from lingo_mi.projectors.cloud import line_integrals
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View, vector64
 from lingo_mi.projectors.voxelize import Lattice, voxelize
-from lingo_mi.studies import oracle
-from lingo_mi.studies.hard_cases import measuring
-from lingo_mi.studies.hard_cases.cases import all_cases
-from lingo_mi.studies.hard_cases.clouds import scanner
-from lingo_mi.studies.hard_cases.kinds import ScanCase
-from lingo_mi.studies.hard_cases.measuring import (
-    Result,
-    errors,
-    host,
-    image_and_gradients,
-    measure,
-    miss,
-    on_device,
-    weights_of,
-)
-from lingo_mi.studies.hard_cases.scans import adversarial, fit_to
-from lingo_mi.studies.hard_cases.table import markdown, store, stored
-from lingo_mi.studies.oracle import Cloud, Pose, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Cloud, Pose, random_cloud, relative
+from studies.hard_cases import measuring
+from studies.hard_cases.cases import all_cases
+from studies.hard_cases.clouds import scanner
+from studies.hard_cases.kinds import ScanCase
+from studies.hard_cases.measuring import Result, errors, host, image_and_gradients, measure, miss, on_device, weights_of
+from studies.hard_cases.scans import adversarial, fit_to
+from studies.hard_cases.table import markdown, store, stored
 
 CASES = all_cases()
 
@@ -139,25 +130,25 @@ def test_command(tmp_path, monkeypatch):
     """The page and how it was made; the exit code and a line for each case that misses its tolerance."""
     good = next(case for case in CASES if case.name == 'density 0, cone')
     cases = [good, replace(good, name='too good', warned=True)]
-    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases[:1])
+    monkeypatch.setattr('studies.hard_cases.cases.all_cases', lambda steps: cases[:1])
     page = tmp_path / 'page.md'
-    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--markdown', page)
+    code, out, err = run_script('studies.hard_cases', '--markdown', page)
     assert code == 0 and not err and page.read_text() == out and '| density 0, cone |' in out
     assert 'hard_cases.py' in (tmp_path / 'page.provenance.json').read_text()
-    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases)
-    code, out, err = run_script(FIT.with_name('hard_cases.py'))
+    monkeypatch.setattr('studies.hard_cases.cases.all_cases', lambda steps: cases)
+    code, out, err = run_script('studies.hard_cases')
     assert code == 1 and '| too good |' in out and err == 'missed its tolerance: too good: not warned of\n'
     there = tmp_path / 'there.json'
-    run_script(FIT.with_name('hard_cases.py'), '--json', there)
-    monkeypatch.setattr('lingo_mi.studies.hard_cases.cases.all_cases', lambda steps: cases[:steps])
+    run_script('studies.hard_cases', '--json', there)
+    monkeypatch.setattr('studies.hard_cases.cases.all_cases', lambda steps: cases[:steps])
     title = mi.variant().split('_')[0].upper()
-    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--beside', there, '--steps', 1)
+    code, out, err = run_script('studies.hard_cases', '--beside', there, '--steps', 1)
     assert code == 0 and not err and f'image, {title}' in out and 'too good' not in out
-    code, out, err = run_script(FIT.with_name('hard_cases.py'), '--beside', there)
+    code, out, err = run_script('studies.hard_cases', '--beside', there)
     assert code == 1 and f'missed its tolerance: too good, {title}: not warned of' in err
-    code, out, _ = run_script(FIT.with_name('hard_cases.py'), '--without', 'good', 'nothing')
+    code, out, _ = run_script('studies.hard_cases', '--without', 'good', 'nothing')
     assert code == 0 and '| density 0, cone |' in out and 'too good' not in out
-    assert run_script(FIT.with_name('hard_cases.py'), '--steps', 0)[0] == 2
+    assert run_script('studies.hard_cases', '--steps', 0)[0] == 2
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])

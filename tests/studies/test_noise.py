@@ -1,4 +1,4 @@
-"""`lingo-mi noise`: its cells, that they are kept, the table, and bad input in one line."""
+"""`python -m studies.noise`: its cells, that they are kept, the table, and bad input in one line."""
 
 import json
 import runpy
@@ -6,15 +6,14 @@ import sys
 
 import pytest
 
-from helpers.script import FIT
-from lingo_mi.studies.noise import SETTINGS, Case, Study
+from studies.noise.study import SETTINGS, Case, Study
 
 
 def noise(monkeypatch, capsys, *args):
     """Exit code, standard output and standard error of `noise.py ARGS`."""
     monkeypatch.setattr(sys, 'argv', ['noise.py', *map(str, args)])
     with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(FIT.with_name('noise.py')), run_name='__main__')
+        runpy.run_module('studies.noise', run_name='__main__')
     return stop.value.code, *capsys.readouterr()
 
 

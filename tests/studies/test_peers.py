@@ -1,4 +1,4 @@
-"""`lingo-mi peers`: its numbers against their definitions, kept cells, missing packages, bad input in one line."""
+"""`python -m studies.peers`: its numbers against their definitions, kept cells, missing packages, bad input in one line."""
 
 import json
 import runpy
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from helpers.script import FIT
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
 from lingo_mi.files.volumes import read_volume
@@ -18,8 +17,8 @@ from lingo_mi.geometry.trajectories import circular
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scan import Dataset, Scan
-from lingo_mi.studies.benchmarks import mbirjax_bridge, rtk_bridge
-from lingo_mi.studies.peers import Method, Study
+from studies.benchmarks import mbirjax_bridge, rtk_bridge
+from studies.peers.study import Method, Study
 
 SIZES = dict(DSO=200.0, DSD=300.0, dDetector=3.0)
 
@@ -49,7 +48,7 @@ def peers(monkeypatch, capsys, tmp_path, scan):
             sys, 'argv', ['peers.py', 'walnut', *small, *map(str, args), '--out', str(tmp_path / 'out')]
         )
         with pytest.raises(SystemExit) as stop:
-            runpy.run_path(str(FIT.with_name('peers.py')), run_name='__main__')
+            runpy.run_module('studies.peers', run_name='__main__')
         return stop.value.code, *capsys.readouterr()
 
     return run

@@ -1,4 +1,4 @@
-"""Which fits `lingo-mi recipes` runs, and which results it takes for them; the fits themselves are not run."""
+"""Which fits `python -m studies.recipes` runs, and which results it takes for them; the fits themselves are not run."""
 
 import json
 import runpy
@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from helpers.script import FIT
 from lingo_mi.common.errors import InputError
-from lingo_mi.studies import recipes as study
+from studies.recipes import comparison as study
 
 METRICS = dict(
     psnr_2d=30.0,
@@ -34,7 +33,7 @@ def recipes(monkeypatch, capsys, tmp_path):
     def call(*args):
         monkeypatch.setattr(sys, 'argv', ['recipes.py', 'a.xml', '--out', str(tmp_path), *args])
         with pytest.raises(SystemExit) as stop:
-            runpy.run_path(str(FIT.with_name('recipes.py')), run_name='__main__')
+            runpy.run_module('studies.recipes', run_name='__main__')
         return stop.value.code, *capsys.readouterr()
 
     return call

@@ -1,4 +1,4 @@
-"""`lingo-mi regret`: its cells, that they are kept, the table, and bad input in one line."""
+"""`python -m studies.regret`: its cells, that they are kept, the table, and bad input in one line."""
 
 import json
 import runpy
@@ -7,16 +7,15 @@ import sys
 import numpy as np
 import pytest
 
-from helpers.script import FIT
-from lingo_mi.studies.regret import BEST, CLOUDS, VOXELS, Case, Study
-from lingo_mi.studies.simulated import counting, noisy
+from lingo_mi.validation.tables.photons import counting, noisy
+from studies.regret.study import BEST, CLOUDS, VOXELS, Case, Study
 
 
 def regret(monkeypatch, capsys, *args):
     """Exit code, standard output and standard error of `regret.py ARGS`."""
     monkeypatch.setattr(sys, 'argv', ['regret.py', *map(str, args)])
     with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(FIT.with_name('regret.py')), run_name='__main__')
+        runpy.run_module('studies.regret', run_name='__main__')
     return stop.value.code, *capsys.readouterr()
 
 
@@ -44,7 +43,9 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     row = (tmp_path / 'regret.md').read_text().splitlines()[-1]
     assert row.startswith('| foot | x1 | 6 | no noise |') and f'| {behind:+.2f} |' in row and row in text
     assert '–' not in row and not any(label in text for label in CLOUDS.values() if label not in VOXELS.values())
-    assert json.loads((tmp_path / 'regret.provenance.json').read_text())['command'].split()[0].endswith('regret.py')
+    assert json.loads((tmp_path / 'regret.provenance.json').read_text())['command'].startswith(
+        'python -m studies.regret '
+    )
     kept = study.cells.path(study.name(case), 'refined')
     kept.write_text(json.dumps(cells['refined'] | dict(psnr_3d=99.0)))
     study.cells.path(study.name(case), BEST).write_text('{')  # cut short: computed again

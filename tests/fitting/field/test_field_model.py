@@ -11,7 +11,7 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.projectors import grid
-from lingo_mi.studies.benchmarks.field import NumpyField
+from studies.benchmarks.field import NumpyField
 
 # Features of two coarse levels, so that voxels of a 96th resolve the field.
 SMOOTH = SMALL.changed(field_levels=2, field_base=3, field_growth=1.5, field_samples=192)

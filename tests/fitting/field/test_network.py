@@ -10,7 +10,7 @@ from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.field.network import Network
 from lingo_mi.fitting.methods.naf import NAF
 from lingo_mi.projectors.upload import uploaded
-from lingo_mi.studies.benchmarks.field import NumpyField
+from studies.benchmarks.field import NumpyField
 
 
 @pytest.fixture(params=[{}, dict(field_skip=1, field_layers=3), dict(field_skip=3, field_growth=1.5)])

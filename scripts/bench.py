@@ -1,7 +1,0 @@
-#!/usr/bin/env python3
-"""The command `lingo-mi bench`, to be run from a checkout: `python scripts/bench.py --help` describes it."""
-
-from lingo_mi.cli import run
-
-if __name__ == '__main__':
-    run('bench')

@@ -1,7 +1,0 @@
-#!/usr/bin/env python3
-"""The command `lingo-mi fuzz`, to be run from a checkout: `python scripts/fuzz.py --help` describes it."""
-
-from lingo_mi.cli import run
-
-if __name__ == '__main__':
-    run('fuzz')

@@ -1,0 +1,1 @@
+"""Which errors of a scanner explain what a reconstruction leaves of a measured scan."""

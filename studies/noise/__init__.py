@@ -1,0 +1,1 @@
+"""What an early stop and weights of pixels are worth to a fit of noisy projections."""

@@ -1,0 +1,1 @@
+"""Volumes of one scan by this package, RTK and MBIRJAX."""

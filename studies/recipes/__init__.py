@@ -1,0 +1,1 @@
+"""Methods compared: quality against time."""
