@@ -72,7 +72,7 @@ def test_a_fit_of_other_settings_is_another(recipes, fits, tmp_path):
     assert asked('--methods', 'r2', '--views', '3') == [['iterations=5000']]
     assert (tmp_path / 'recipes.png').exists()
     assert '| a | r2 |' in (tmp_path / 'recipes.md').read_text()
-    assert 'recipes.py a.xml' in json.loads((tmp_path / 'recipes.provenance.json').read_text())['command']
+    assert 'studies.recipes a.xml' in json.loads((tmp_path / 'recipes.provenance.json').read_text())['command']
 
 
 def test_an_interrupted_fit_goes_on_and_a_failed_one_is_named(recipes, monkeypatch, tmp_path):
