@@ -2,6 +2,7 @@
 
 Each is a command, `python -m studies.NAME --help`:
 
+    as_csv        the tables of a page that a study has written, as data
     bench_recon   reconstruction on voxels, timed beside RTK and diffct
     bench_step    a step of a fit, timed part by part
     cuda_check    the CUDA backend where there is no GPU

@@ -1,7 +1,7 @@
 """Check the CUDA backend without a GPU: the tests on cuda_ad_mono under a stand-in for the driver, then NVIDIA's assembler.
 
     python -m studies.cuda_check --stand-in PROGRAM --share --sm 80
-    python -m studies.cuda_check --stand-in PROGRAM --noise --out out/cuda --markdown docs/tables/cuda.md
+    python -m studies.cuda_check --stand-in PROGRAM --noise --out out/cuda --markdown cuda.md
 
 PROGRAM COMMAND ... runs a command with a CUDA driver that executes Dr.Jit's PTX on the CPU (see studies.cuda). Needs a
 checkout, for its tests, and `pip install nvidia-cuda-nvcc-cu12` for ptxas. The exit code is 1 where a test fails, or a kernel

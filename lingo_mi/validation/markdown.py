@@ -1,14 +1,7 @@
-"""Markdown tables, their positions in a document, between `<!-- table NAME -->` and `<!-- end NAME -->`, and their cells as data.
-
-    python -m lingo_mi.validation.markdown out/tables/views.md docs/tables
-
-writes the table of the page to docs/tables/views.csv, or each of several tables to a file that also has its heading's name.
-"""
+"""Markdown tables, and their positions in a document: between `<!-- table NAME -->` and `<!-- end NAME -->`."""
 
 from __future__ import annotations
 
-import argparse
-import csv
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -64,46 +57,6 @@ def check_places(document: Path, names: Iterable[str]) -> None:
     insert(_read(document), dict.fromkeys(names, ''), document)
 
 
-def cells(page: str) -> dict[str, list[list[str]]]:
-    """The cells of the tables of a page, the titles first, by the heading above each.
-
-    >>> cells('# Times' + chr(10) + table([('a', str)], [1]))
-    {'Times': [['a'], ['1']]}
-    """
-    found: dict[str, list[list[str]]] = {}
-    heading = ''
-    for line in page.splitlines():
-        if line.startswith('#'):
-            heading = line.lstrip('#').strip()
-        elif line.startswith('|') and not re.fullmatch(r'[|:\- ]+', line):
-            found.setdefault(heading, []).append([cell.strip() for cell in line.strip().strip('|').split('|')])
-    return found
-
-
-def store(page: Path, folder: Path) -> list[Path]:
-    """Write the tables of a page as CSV files: PAGE.csv, or PAGE_HEADING.csv where there are several. Returns the files."""
-    found = cells(_read(page))
-    paths = []
-    for heading, rows in found.items():
-        name = page.stem if len(found) == 1 else f'{page.stem}_{re.sub("[^a-z0-9]+", "_", heading.lower())}'
-        paths.append(folder / f'{name}.csv')
-        with replacing(paths[-1]) as temporary, temporary.open('w', encoding='utf-8', newline='') as file:
-            csv.writer(file, lineterminator='\n').writerows(rows)
-    return paths
-
-
 def _read(document: Path) -> str:
     with reading(document):
         return Path(document).read_text(encoding='utf-8')
-
-
-def main() -> None:
-    p = argparse.ArgumentParser(description='Write the tables of a Markdown page as CSV files.')
-    p.add_argument('page', type=Path)
-    p.add_argument('folder', type=Path)
-    args = p.parse_args()
-    print(*store(args.page, args.folder), sep='\n')
-
-
-if __name__ == '__main__':
-    main()

@@ -1,7 +1,7 @@
 """Give every reader mutated files, each in a child with a limit of time and memory: a value, or one line that refuses it.
 
     python -m studies.fuzz --cases 200
-    python -m studies.fuzz --total 100000 --markdown docs/tables/fuzz.md
+    python -m studies.fuzz --total 100000 --markdown fuzz.md
     python -m studies.fuzz --readers nii tiff --cases 5000 --seed 7
 
 A case is its reader, the seed and its number. Those that fail are saved in --out, each in a folder with its files.

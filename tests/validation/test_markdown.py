@@ -4,7 +4,7 @@ import pytest
 
 from helpers.script import run
 from lingo_mi.common.errors import InputError
-from lingo_mi.validation.markdown import cells, check_places, insert, insert_into, store, table
+from lingo_mi.validation.markdown import check_places, insert, insert_into, table
 
 TEXT = 'a\n<!-- table x -->\nold\nrows\n<!-- end x -->\nb\n'
 
@@ -20,18 +20,6 @@ def test_tables_find_their_place():
     assert insert(new, dict(x='| new |')) == new
     with pytest.raises(InputError, match='no place for the table y'):
         insert(TEXT, dict(y=''))
-
-
-def test_tables_as_data(tmp_path):
-    """A page's table is a file of its name; of two, each has its heading's."""
-    page = tmp_path / 'page.md'
-    page.write_text('# Times\n\n| a | b, c |\n|---|---:|\n| x | 2.0 |\n')
-    assert (
-        store(page, tmp_path) == [tmp_path / 'page.csv'] and (tmp_path / 'page.csv').read_text() == 'a,"b, c"\nx,2.0\n'
-    )
-    page.write_text(page.read_text() + '\n## Two Errors\n\n| d |\n|---|\n| – |\n')
-    assert cells(page.read_text())['Two Errors'] == [['d'], ['–']]
-    assert [path.name for path in store(page, tmp_path)] == ['page_times.csv', 'page_two_errors.csv']
 
 
 def test_in_a_file(tmp_path):
