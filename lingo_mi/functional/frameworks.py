@@ -6,6 +6,7 @@ Neither PyTorch nor JAX is a dependency: arrays of theirs cannot come from a cal
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -17,32 +18,46 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.projectors.upload import uploaded_tensor
 
-NAMES = 'means', 'scales', 'quaternions', 'density'
-COMPONENTS = (3,), (3,), (4,), ()  # of each Gaussian
+
+@dataclass(frozen=True)
+class Argument:
+    """An array that a caller gave.
+
+    name      for messages
+    array     of any kind
+    shape     that it must have; None for a size that the first argument with a None decides
+    double    whether it is computed on in float64, not in float32
+    """
+
+    name: str
+    array: Any
+    shape: tuple[int | None, ...]
+    double: bool = False
 
 
-def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...], name: str) -> Any:
-    """function(centre, scale, rotation, density), which is Dr.Jit's, of a caller's arrays; a result of the caller's kind.
+def call(function: Callable[..., Any], arguments: Sequence[Argument], shape: tuple[int, ...], name: str) -> Any:
+    """A differentiable function of Dr.Jit's tensors, of a caller's arrays; a result of the caller's kind.
 
-    function   takes Point3f, Vector3f, Vector4f and Float [N], returns Float [prod(shape)]; differentiable
-    arrays     [N, 3], [N, 3], [N, 4] and [N], all of one kind
+    function   takes a tensor for each argument, or what a caller of Dr.Jit gave in its place; returns Float [prod(shape)]
+    arguments  arrays of one kind
     shape      of the result
     name       of the caller, for messages
 
     Raises InputError for arrays of several kinds, of other shapes, or on a device that the active variant does not use.
     """
-    kind = _kind(arrays, name)
+    kind = _kind(arguments, name)
     if kind == 'NumPy':
-        arrays = [as_numpy(a, f'{name}: {n}', np.float32) for a, n in zip(arrays, NAMES)]
-    _check_shapes(arrays, name)
+        arguments = [_on_host(a, name) for a in arguments]
+    _check_shapes(arguments, name)
+    arrays = [a.array for a in arguments]
 
     def of_tensors(*tensors):
-        return mi.TensorXf(function(*_gaussians(tensors)), shape)
+        return mi.TensorXf(function(*tensors), shape)
 
     if kind == 'NumPy':
         with one_at_a_time():
             ensure_variant()
-            return of_tensors(*map(uploaded_tensor, arrays)).numpy()
+            return of_tensors(*(uploaded_tensor(a.array, a.double) for a in arguments)).numpy()
     if kind == 'Dr.Jit':
         with one_at_a_time():
             ensure_variant('cuda' if dr.backend_v(arrays[0]) == dr.JitBackend.CUDA else 'cpu')
@@ -52,17 +67,22 @@ def call(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...],
         from lingo_mi.functional.through_torch import call_torch
 
         with one_at_a_time():
-            return call_torch(of_tensors, arrays, name)
+            return call_torch(of_tensors, arguments, name)
     from lingo_mi.functional.through_jax import call_jax
 
     ensure_variant()
-    return call_jax(of_tensors, arrays, shape)
+    return call_jax(of_tensors, arguments, shape)
 
 
-def _kind(arrays, name: str) -> str:
-    kinds = [framework_of(a) for a in arrays]
+def _on_host(argument: Argument, name: str) -> Argument:
+    dtype = np.float64 if argument.double else np.float32
+    return replace(argument, array=as_numpy(argument.array, f'{name}: {argument.name}', dtype))
+
+
+def _kind(arguments: Sequence[Argument], name: str) -> str:
+    kinds = [framework_of(a.array) for a in arguments]
     if len(set(kinds)) > 1:
-        found = ', '.join(f'{n} of {k}' for n, k in zip(NAMES, kinds))
+        found = ', '.join(f'{a.name} of {k}' for a, k in zip(arguments, kinds))
         raise InputError(f'{name}: the arrays must be of one kind, not {found}')
     return kinds[0]
 
@@ -75,15 +95,19 @@ def framework_of(array) -> str:
     return 'PyTorch' if 'torch' in packages else 'JAX' if packages & {'jax', 'jaxlib'} else 'NumPy'
 
 
-def _check_shapes(arrays, name: str):
-    shapes = [_shape(a) for a in arrays]
-    count = shapes[0][0] if shapes[0] else 0
-    for what, found, components in zip(NAMES, shapes, COMPONENTS):
-        if found != (count, *components):
-            wanted = [count if what != 'means' and shapes[0] else 'N', *components]
+def _check_shapes(arguments: Sequence[Argument], name: str):
+    count = None  # the size that None stands for
+    for argument in arguments:
+        found = _shape(argument.array)
+        size = found[0] if found else 0
+        if found != tuple((size if count is None else count) if n is None else n for n in argument.shape):
+            wanted = ('N' if count is None else count) if None in argument.shape else None
+            text = ', '.join(str(wanted if n is None else n) for n in argument.shape)
             raise InputError(
-                f'{name}: {what} must be of the shape [{", ".join(map(str, wanted))}], not [{", ".join(map(str, found))}]'
+                f'{name}: {argument.name} must be of the shape [{text}], not [{", ".join(map(str, found))}]'
             )
+        if None in argument.shape and count is None:
+            count = size
     if count == 0:
         raise InputError(f'{name}: the cloud is empty: it needs at least one Gaussian')
 
@@ -92,26 +116,3 @@ def _shape(array) -> tuple[int, ...]:
     shape = tuple(array.shape)
     # Dr.Jit's vectors have their components first.
     return shape[::-1] if dr.is_array_v(array) and not dr.is_tensor_v(array) else shape
-
-
-def _gaussians(tensors):
-    """Point3f, Vector3f, Vector4f and Float [N] of the four arrays, evaluated together.
-
-    They are copies in Dr.Jit's own memory: the kernels that follow would otherwise depend on how the caller's is aligned.
-    """
-    flat = [x.array if dr.is_tensor_v(x) else x for x in tensors]
-    dr.make_opaque(flat)  # a literal would be compiled in
-    columns = []
-    for array, tensor, Type, components in zip(flat, tensors, _types(), COMPONENTS):
-        if dr.is_tensor_v(tensor):
-            size, array = components or (1,), mi.Float(array)
-            i = dr.arange(mi.UInt32, tensor.shape[0]) * size[0]
-            # Every entry is read once, so the derivative needs no atomics.
-            array = Type(*(dr.gather(mi.Float, array, i + j, mode=dr.ReduceMode.Permute) for j in range(*size)))
-        columns.append(Type(array))
-    dr.eval(columns)
-    return columns
-
-
-def _types():
-    return mi.Point3f, mi.Vector3f, mi.Vector4f, mi.Float

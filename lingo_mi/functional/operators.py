@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any, overload
 
@@ -27,8 +27,9 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.common.memory import room
-from lingo_mi.functional.frameworks import call
+from lingo_mi.functional.frameworks import Argument, call
 from lingo_mi.functional.gaussians import Gaussians
+from lingo_mi.functional.rays import beams_of, on_host, rays_argument
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors import cutoff
 from lingo_mi.projectors import voxelize as voxels
@@ -40,7 +41,13 @@ from lingo_mi.projectors.view import View, vector64
 
 @overload
 def project(
-    means: Gaussians, geometry: Geometry, /, *, extent: float | None = None, views: Iterable[int] | None = None
+    means: Gaussians,
+    geometry: Geometry,
+    /,
+    *,
+    extent: float | None = None,
+    views: Iterable[int] | None = None,
+    rays: Any = None,
 ) -> Any: ...
 
 
@@ -54,6 +61,7 @@ def project(
     *,
     extent: float | None = None,
     views: Iterable[int] | None = None,
+    rays: Any = None,
 ) -> Any: ...
 
 
@@ -66,6 +74,7 @@ def project(
     *,
     extent: float | None = None,
     views: Iterable[int] | None = None,
+    rays: Any = None,
 ) -> Any:
     """Line integrals of a cloud of Gaussians along the rays of a scan: images [n, v, u], float32, of the caller's kind.
 
@@ -80,35 +89,45 @@ def project(
     extent       cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, 5 for arrays); with 5, images are good
                  to 2e-6 and derivatives to 4e-5 (relative L2 norms, docs/accuracy.md)
     views        indices of the views to project, n of them; None for all
+    rays         [n, 4, 3] source (of a parallel beam its direction), corner of the panel, and steps u and v from pixel to pixel,
+                 of these n views, mm, in the place of the geometry's own, which are `geometry.rays().vectors`
 
-    The four arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N.
-    Differentiable once in all four, not in the geometry: in reverse mode, in Dr.Jit also in forward mode. A result that is to
-    be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
-    project a few views, not all.
+    The arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N. Rays are computed
+    on in float64 where they are that. Differentiable once in all arrays: in reverse mode, in Dr.Jit also in forward mode.
+    A result that is to be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
+    project a few views, not all. Derivatives by the rays are exact but for the cut-off.
 
         images = project(means, scales, quaternions, density, geometry, views=[0, 7])
         loss = ((images - measured) ** 2).mean()
         loss.backward()                              # PyTorch
 
     Raises InputError for arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no
-    extent or no rotation, views that the scan has not, and arrays on another device than the active variant's. Within
-    `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
+    extent or no rotation, views that the scan has not, rays that make no view, and arrays on another device than the active
+    variant's. Within `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
     """
     arrays, geometry, extent = _taken(means, scales, quaternions, density, geometry, extent)
     require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
-    rays = geometry.rays()
-    index = _indices(views, len(rays))
-    rays, options = rays[index], RenderOptions(extent)
+    own = geometry.rays()
+    index, options = _indices(views, len(own)), RenderOptions(extent)
+    own = own[index]
 
-    def images(*gaussians):
-        views = (View.of(rays, i, height, width) for i in range(len(index)))
-        found = [line_integrals(*gaussians, view=view, options=options) for view in views]
+    def images(means, scales, quaternions, density, vectors=None):
+        cloud = gaussians_of((means, scales, quaternions, density), 'project')
+        if vectors is None:
+            seen = (View.of(own, i, height, width) for i in range(len(own)))
+        else:
+            on_host(vectors, geometry)
+            seen = beams_of(vectors, geometry)
+        found = [line_integrals(*cloud, view=view, options=options) for view in seen]
         return found[0] if len(found) == 1 else dr.concat(found)
 
     shape = len(index), height, width
     _require_room(shape, 'project')
-    return call(_checked(images, 'project'), arrays, shape, 'project')
+    arguments = _arguments(arrays)
+    if rays is not None:
+        arguments.append(rays_argument(rays, len(index)))
+    return call(images, arguments, shape, 'project')
 
 
 @overload
@@ -146,7 +165,8 @@ def voxelize(
     corner, step, shape = grid.low, grid.spacing, grid.shape
     _require_room(shape, 'voxelize')
 
-    def volume(*gaussians):
+    def volume(*tensors):
+        gaussians = gaussians_of(tensors, 'voxelize')
         cells = voxels.Lattice(vector64(corner), vector64(step), shape)
         values = voxels.voxelize(*gaussians, grid=cells, extent=extent, deep=True)
         i, (nx, ny, nz) = dr.arange(mi.UInt32, math.prod(shape)), (dr.opaque(mi.UInt32, n) for n in shape)
@@ -154,7 +174,7 @@ def voxelize(
         x, rest = i // (ny * nz), i % (ny * nz)
         return dr.gather(mi.Float, values, (rest % nz * ny + rest // nz) * nx + x, mode=dr.ReduceMode.Permute)
 
-    return call(_checked(volume, 'voxelize'), arrays, shape, 'voxelize')
+    return call(volume, _arguments(arrays), shape, 'voxelize')
 
 
 def _taken(means, scales, quaternions, density, where, extent) -> tuple[tuple, Any, float]:
@@ -166,15 +186,30 @@ def _taken(means, scales, quaternions, density, where, extent) -> tuple[tuple, A
     return tuple(means), scales if where is None else where, _extent(means.extent if extent is None else extent)
 
 
-def _checked(function, name: str):
-    """A function of Gaussians that first makes sure that they are usable."""
+def _arguments(arrays: Sequence) -> list[Argument]:
+    shapes = dict(means=(None, 3), scales=(None, 3), quaternions=(None, 4), density=(None,))
+    return [Argument(name, array, shape) for array, (name, shape) in zip(arrays, shapes.items())]
 
-    def wrapped(*gaussians):
-        require_unfrozen(f'lm.{name}')
-        require_usable(*gaussians, where=f'the arrays given to {name}')
-        return function(*gaussians)
 
-    return wrapped
+def gaussians_of(tensors: Sequence, name: str) -> list:
+    """Point3f, Vector3f, Vector4f and Float [N] of the four arrays, evaluated together. Raises InputError as `require_usable`.
+
+    They are copies in Dr.Jit's own memory: the kernels that follow would otherwise depend on how the caller's is aligned.
+    """
+    require_unfrozen(f'lm.{name}')
+    flat = [x.array if dr.is_tensor_v(x) else x for x in tensors]
+    dr.make_opaque(flat)  # a literal would be compiled in
+    columns = []
+    for array, tensor, Type in zip(flat, tensors, (mi.Point3f, mi.Vector3f, mi.Vector4f, mi.Float)):
+        if dr.is_tensor_v(tensor):
+            size, array = dr.size_v(Type) if dr.depth_v(Type) > 1 else 1, mi.Float(array)
+            i = dr.arange(mi.UInt32, tensor.shape[0]) * size
+            # Every entry is read once, so the derivative needs no atomics.
+            array = Type(*(dr.gather(mi.Float, array, i + j, mode=dr.ReduceMode.Permute) for j in range(size)))
+        columns.append(Type(array))
+    dr.eval(columns)
+    require_usable(*columns, where=f'the arrays given to {name}')
+    return columns
 
 
 def _require_room(shape: tuple[int, ...], name: str):

@@ -14,12 +14,17 @@ from numpy.typing import ArrayLike
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.common.runtime import ensure_variant
+from lingo_mi.functional.frameworks import Argument, call
 from lingo_mi.functional.linear_map import LinearMap
-from lingo_mi.geometry import Geometry
+from lingo_mi.functional.rays import beams_of, on_host, rays_argument
+from lingo_mi.geometry import Geometry, PosedGeometry
 from lingo_mi.geometry.rays import Index
 from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.projectors.grid_pair import GridPair
+from lingo_mi.projectors.ray_gradient import moving
 from lingo_mi.projectors.stack import Block
+from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.usable import require_unfrozen
 
 MODELS = 'joseph', 'exact'
 
@@ -31,6 +36,8 @@ class Projector(LinearMap):
     the sum over all pixels of their value times the length, in mm, that each voxel has in their rays. A.T is the transpose of A
     to rounding. Both take and give arrays of NumPy, Dr.Jit, PyTorch or JAX, with further axes in front, and are differentiable
     in them. All is computed in float32.
+
+    `A(volume, rays=rays)` takes the rays from an array, and is differentiable in it: see `__call__`.
 
     Parameters
     ----------
@@ -114,18 +121,79 @@ class Projector(LinearMap):
     def __repr__(self) -> str:
         return f'Projector({self.model}, {_by(self.domain_shape)} voxels to {_by(self.range_shape)} pixels)'
 
+    def __call__(self, x: Any, *, rays: Any = None) -> Any:
+        """Projections of a volume [..., x, y, z]: float32 [..., view, v, u], of the caller's kind, on its device.
+
+        Parameters
+        ----------
+        x : array
+            The volume. It may be differentiated any number of times, in reverse and in forward mode (of Dr.Jit's arrays once).
+        rays : array, optional
+            [view, 4, 3], of the volume's kind: source (of a parallel beam its direction), corner of the panel, and steps u and v
+            from pixel to pixel, mm, in the place of the geometry's own, which are `A.geometry.rays().vectors`. They are
+            computed on in float64 where they are that. The volume has no further axes then, and both are differentiable once: in
+            reverse mode, in Dr.Jit also in forward mode.
+
+        Returns
+        -------
+        array
+            With rays, those of the projector of a scan with these poses.
+
+        Raises
+        ------
+        InputError
+            For an array of another shape or kind, or with NaN or infinity, for rays that make no view, and if the result does
+            not fit into memory.
+
+        Notes
+        -----
+        Derivatives by the rays are those of the model, and at kinks of its interpolation the mean of both sides. Joseph's model
+        jumps where a sample enters the box, if the volume is not zero at its faces, and where the main axis of a ray changes (a
+        ray of a cone that is steeper than 45 degrees, in voxels, also where its panel begins to lean). These jumps are not in the
+        derivatives. Where they matter, take `model='exact'`, which has none of them.
+
+        Examples
+        --------
+        The derivatives of a loss by source, corner, u and v of each view, in PyTorch: ::
+
+            rays = torch.tensor(geometry.rays().vectors, requires_grad=True)
+            loss = (A(volume, rays=rays) - measured).square().sum()
+            loss.backward()                              # rays.grad [view, 4, 3]
+        """
+        if rays is None:
+            return super().__call__(x)
+        volume = Argument('the volume', x, self.domain_shape)
+        return call(self._with_rays, [volume, rays_argument(rays, len(self))], self.range_shape, repr(self))
+
+    def _with_rays(self, volume: Any, vectors: Any) -> Any:
+        """Projections of a tensor [x, y, z] along the rays of a tensor [view, 4, 3], Float [view * v * u]."""
+        require_unfrozen('a projector of other rays')
+        poses = on_host(vectors, self.geometry)
+        geometry = PosedGeometry(poses=poses, nDetector=self.geometry.nDetector, grid=self.geometry.grid)
+        there = Projector(geometry, model=self.model, valid=self.valid)
+        volume = mi.Float(volume.array)
+        images = there(volume)
+        if not dr.grad_enabled(vectors):
+            return images
+        views = [moving(volume, geometry, there._kind, view) for view in beams_of(vectors, geometry)]
+        moved = dr.gather(
+            mi.Float, dr.concat(views), _transposed(geometry.nDetector, len(self)), mode=dr.ReduceMode.Permute
+        )
+        change = moved - dr.detach(moved)
+        return images + (change if self.valid is None else change * uploaded(self.valid))
+
     def on_device(self, x: Any) -> Any:
         pair, block = self._pair()
         integrals, _ = pair.forward(x, block)
         out = dr.empty(mi.Float, math.prod(self.range_shape))
-        dr.scatter(out, integrals, _in_rows(pair, len(self)), mode=dr.ReduceMode.Permute)
+        dr.scatter(out, integrals, _transposed(pair.panel[::-1], len(self)), mode=dr.ReduceMode.Permute)
         dr.eval(out)
         return out
 
     def backproject(self, y: Any) -> Any:
         """`A.T.on_device`."""
         pair, block = self._pair()
-        out = pair.adjoint(dr.gather(mi.Float, y, _in_rows(pair, len(self))), block)
+        out = pair.adjoint(dr.gather(mi.Float, y, _transposed(pair.panel[::-1], len(self))), block)
         dr.eval(out)
         return out
 
@@ -161,12 +229,13 @@ class Backprojector(LinearMap):
         return f'{self._projector!r}.T'
 
 
-def _in_rows(pair: Any, views: int) -> Any:
-    """Where the pixels of device images, [view, u, v], stand in projections, [view, v, u]."""
-    (n_v, n_u), index = pair.panel, dr.arange(mi.UInt, views * pair.pixels)
-    column = index // n_v
-    view = column // n_u
-    return (view * n_v + index - column * n_v) * n_u + column - view * n_u
+def _transposed(shape: tuple[int, int], views: int) -> Any:
+    """Where the pixels of `views` images of a shape (slow, fast) stand in the images of the other order."""
+    slow, fast = shape
+    index = dr.arange(mi.UInt, views * slow * fast)
+    line = index // fast
+    view = line // slow
+    return (view * fast + index - line * fast) * slow + line - view * slow
 
 
 def _mask(valid: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

@@ -12,23 +12,28 @@ import numpy as np
 from jax.core import Tracer
 
 from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.functional.frameworks import Argument
 from lingo_mi.projectors.upload import uploaded_tensor
 
 
-def call_jax(function: Callable[..., Any], arrays: Sequence, shape: tuple[int, ...]) -> Any:
+def call_jax(function: Callable[..., Any], arguments: Sequence[Argument], shape: tuple[int, ...]) -> Any:
     """A function of Dr.Jit's tensors, of JAX's arrays: float32 of that shape, differentiable in reverse mode."""
-    arrays = [a.astype(jnp.float32) for a in arrays]
+    # Float64, which JAX has only where the caller has enabled it, stays that where it is computed on.
+    arrays = [a.array if a.double and a.array.dtype == np.float64 else a.array.astype(jnp.float32) for a in arguments]
+
+    def tensors_of(host):
+        return [uploaded_tensor(x, a.double) for x, a in zip(host, arguments)]
 
     def values(*host):
-        return function(*map(uploaded_tensor, host)).numpy()
+        return function(*tensors_of(host)).numpy()
 
     def gradients(upstream, *host):
-        tensors = [uploaded_tensor(a) for a in host]
+        tensors = tensors_of(host)
         dr.enable_grad(tensors)
         dr.set_grad(out := function(*tensors), uploaded_tensor(upstream))
         dr.enqueue(dr.ADMode.Backward, out)
         dr.traverse(dr.ADMode.Backward)
-        return [dr.grad(x).numpy() for x in tensors]
+        return [dr.grad(x).numpy().astype(a.dtype) for x, a in zip(tensors, host)]
 
     @jax.custom_vjp
     def operator(*arrays):

@@ -11,11 +11,12 @@ import torch
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time, warn_of_spinning
+from lingo_mi.functional.frameworks import Argument
 
 
-def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any:
+def call_torch(function: Callable[..., Any], arguments: Sequence[Argument], name: str) -> Any:
     """A function of Dr.Jit's tensors, of PyTorch's: float32 on their device, with gradients."""
-    devices = {a.device for a in arrays}
+    devices = {a.array.device for a in arguments}
     if len(devices) > 1 or next(iter(devices)).type not in ('cpu', 'cuda'):
         raise InputError(
             f'{name}: the tensors must all be on the CPU or on one CUDA device, not on {", ".join(map(str, devices))}'
@@ -25,7 +26,10 @@ def call_torch(function: Callable[..., Any], arrays: Sequence, name: str) -> Any
     if device == 'cpu':
         warn_of_spinning()
     # Dr.Jit takes plain tensors alone: not nn.Parameter, which is a class of its own.
-    plain = [a.as_subclass(torch.Tensor).to(torch.float32).contiguous() for a in arrays]
+    plain = [
+        a.array.as_subclass(torch.Tensor).to(torch.float64 if a.double else torch.float32).contiguous()
+        for a in arguments
+    ]
     return _OfDrJit.apply(function, *plain)
 
 
@@ -61,4 +65,4 @@ class _OfDrJit(torch.autograd.Function):
 
 def _tensor(array: Any) -> mi.TensorXf:
     """In the memory of PyTorch's."""
-    return mi.TensorXf(array)
+    return mi.TensorXd(array) if array.dtype == torch.float64 else mi.TensorXf(array)

@@ -56,6 +56,34 @@ class Rays:
     v: np.ndarray
     parallel: bool
 
+    @classmethod
+    def from_vectors(cls, vectors: ArrayLike, parallel: bool) -> Rays:
+        """The views whose `vectors` these are, [n, 4, 3], checked: see `checked`."""
+        array = numbers('the vectors of the poses', vectors)
+        if array.ndim != 3 or array.shape[1:] != (4, 3):
+            raise InputError(
+                f'the vectors of the poses are source, corner, u and v of each view, [view, 4, 3], not {list(array.shape)}'
+            )
+        return Rays(*array.transpose(1, 0, 2), parallel=parallel).checked()
+
+    @property
+    def vectors(self) -> np.ndarray:
+        """source, corner, u and v of each view as one array, float64 [n, 4, 3]."""
+        return np.stack(self._arrays(), 1)
+
+    def by_motion(self, by_vectors: ArrayLike) -> np.ndarray:
+        """Derivatives by a rigid motion of each view, [n, 6], of a number whose derivatives by `vectors` are [n, 4, 3].
+
+        The first three are by a turn about the origin, a rotation vector in radians; the others by a shift. Where all views
+        move together, sum over them.
+
+            turn, shift = rays.by_motion(gradient).sum(0).reshape(2, 3)
+        """
+        gradient = np.asarray(by_vectors, float)
+        turn = np.cross(self.vectors, gradient).sum(1)
+        shift = gradient[:, 1] if self.parallel else gradient[:, 1] + gradient[:, 0]
+        return np.concatenate([turn, shift], 1)
+
     def __len__(self) -> int:
         return len(self.corner)
 

@@ -73,7 +73,7 @@ def _clip(origin, direction, low, high, t_min, t_max):
     return d, inv, dr.maximum(dr.max(dr.minimum(a, b)), t_min), dr.minimum(dr.min(dr.maximum(a, b)), t_max)
 
 
-def _first_planes(origin, direction, t):
+def first_planes(origin, direction, t):
     """The next planes that a ray meets after t, the steps to the planes after these, and the cells' offsets."""
     start = dr.fma(direction, t, origin)
     up = direction > 0
@@ -81,7 +81,7 @@ def _first_planes(origin, direction, t):
     return plane, mi.Vector3i(dr.select(up, 1, -1)), mi.Vector3i(dr.select(up, -1, 0))
 
 
-def _corners(cell, size):
+def corners(cell, size):
     """Flat indices of the eight corners of a dual cell, z fastest. Clamping extends the edge values."""
     x0, y0, z0 = (dr.clip(cell[i], 0, n - 1) for i, n in enumerate(size))
     x1, y1, z1 = (dr.clip(cell[i] + 1, 0, n - 1) for i, n in enumerate(size))
@@ -95,13 +95,13 @@ def gather(data: Any, size: tuple[int, int, int], walk: Walk) -> Any:
     origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
     t = mi.Float(walk.t_first)
     total = mi.Float(0)
-    plane, step, below = _first_planes(origin, d, t)
+    plane, step, below = first_planes(origin, d, t)
     shift = -origin * inv
     while t < t_last:
         nearest = dr.fma(mi.Vector3f(plane), inv, shift)
         t_next = dr.maximum(dr.minimum(dr.min(nearest), t_last), t)
         cell = plane + below
-        f = [dr.gather(mi.Float, data, i) for i in _corners(cell, size)]
+        f = [dr.gather(mi.Float, data, i) for i in corners(cell, size)]
         length = t_next - t
         middle = dr.fma(0.5, length, t)
         base = origin - mi.Vector3f(cell)
@@ -130,7 +130,7 @@ def _segment_weights(weight, value, far, d, length, middle):
 
 
 def _cell_address(plane, step, size):
-    """Index of a cell's near corner, and offsets to the far corner along each axis, clamped as in `_corners`."""
+    """Index of a cell's near corner, and offsets to the far corner along each axis, clamped as in `corners`."""
     far = [dr.clip(plane[i], 0, n - 1) for i, n in enumerate(size)]
     near = [dr.clip(plane[i] - step[i], 0, n - 1) for i, n in enumerate(size)]
     stride = (size[1] * size[2], size[2], 1)
@@ -160,7 +160,7 @@ def scatter(target: Any, value: Any, size: tuple[int, int, int], walk: Walk) -> 
     origin, d, inv, t_last = walk.origin, walk.d, walk.inv, walk.t_last
     t = mi.Float(walk.t_first)
     weight = [mi.Float(0) for _ in range(8)]
-    plane, step, below = _first_planes(origin, d, t)
+    plane, step, below = first_planes(origin, d, t)
     shift = -origin * inv
     running = walk.t_first < t_last
     while running:
@@ -201,7 +201,7 @@ class _LineIntegrals(dr.CustomOp):
         return 'line_integrals'
 
 
-def _walk(size, box_min: Any, box_max: Any, lines: Lines, low: Any, high: Any) -> tuple[Walk, Any]:
+def walk_along(size, box_min: Any, box_max: Any, lines: Lines, low: Any, high: Any) -> tuple[Walk, Any]:
     """The `Walk` along lines through the part of a grid from `low` to `high`, and the length of a unit of t."""
     origin, direction = lines.origin, lines.direction
     box_min, shape = mi.Point3f(box_min), mi.Vector3f(*size)
@@ -236,7 +236,7 @@ def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, l
     size = nx, ny, nz
     if dr.width(data) != nx * ny * nz:
         raise InputError(f'the volume holds {dr.width(data)} values, but its shape says {size}')
-    walk, length = _walk(size, box_min, box_max, lines, *whole_box(size))
+    walk, length = walk_along(size, box_min, box_max, lines, *whole_box(size))
     return length * dr.custom(_LineIntegrals, data, size, dr.detach(walk))
 
 
@@ -305,7 +305,7 @@ def _occupied(volume):
 def pixel_walk(geometry: Geometry, rows: Any, x: Any, y: Any, view: Any = 0) -> tuple[Walk, Any]:
     """The `Walk` along `pixel_rays` through the whole volume, and the length of a unit of t, in mm."""
     half = mi.Vector3f(*(s / 2 for s in geometry.grid.size))
-    return _walk(
+    return walk_along(
         geometry.grid.shape, -half, half, Lines(*pixel_rays(rows, x, y, view)), *whole_box(geometry.grid.shape)
     )
 
@@ -316,7 +316,7 @@ def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, 
     row is one row of `view_table` as an evaluated mi.Float [19].
     """
     half = mi.Vector3f(*(s / 2 for s in geometry.grid.size))
-    return _walk(geometry.grid.shape, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
+    return walk_along(geometry.grid.shape, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
 
 
 def project_volume(

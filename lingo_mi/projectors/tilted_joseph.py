@@ -77,11 +77,11 @@ class TiltedJoseph(Gathered):
         self.matrices = uploaded(geometry.voxel_matrices())
 
     def _integrate(self, volume, view, u, v):
-        return _integrate(volume, self.size, _Ray.through(self.rays, view, u, v))
+        return _integrate(volume, self.size, Ray.through(self.rays, view, u, v))
 
     def _weighted(self, images, block, ones):
         pixels = self.pixels_of(block)
-        path = dr.select(self.used(*pixels), _Ray.through(self.rays, *pixels).path, 0)
+        path = dr.select(self.used(*pixels), Ray.through(self.rays, *pixels).path, 0)
         value = dr.select(path > 0, path * images, 0)  # whatever stands in invalid pixels
         return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
@@ -89,7 +89,7 @@ class TiltedJoseph(Gathered):
         return _collect(weighted, block.numbers, block.count, self, ones)
 
 
-class _Axes:
+class Axes:
     """The main axis of rays, the longest of their direction, and the other two. Ties go to x, then y."""
 
     def __init__(self, direction):
@@ -112,16 +112,16 @@ def _affine(first, step, position):
     return dr.fma(mi.Vector3f(position), step, first)
 
 
-class _Ray:
+class Ray:
     """Rays as indices a + b m along the axes that are not the main one, m the index along the main axis.
 
-    axes         `_Axes`
+    axes         `Axes` (default: of the direction)
     lines        (a, b) of both axes
     path         per slice, mm
     """
 
-    def __init__(self, origin, direction, voxel):
-        self.axes = _Axes(direction)
+    def __init__(self, origin, direction, voxel, axes: Axes | None = None):
+        self.axes = axes or Axes(direction)
         (o, *others), (d, *steps) = self.axes.of(origin), self.axes.of(direction)
         inv = dr.rcp(d)
         slopes = [step * inv for step in steps]
@@ -144,7 +144,7 @@ class _Ray:
 
 
 @dr.syntax
-def _integrate(data, size, ray: _Ray):
+def _integrate(data, size, ray: Ray):
     """(A x, A 1) of rays, one per lane."""
     nx, ny, nz = size
     n, n1, n2 = ray.axes.of([mi.Float(x) for x in size])
@@ -201,7 +201,7 @@ def _collect(weighted, chosen, n_views, A: TiltedJoseph, ones):
                 v = mi.Float(v_first)
                 column = (block * n_u + mi.UInt(u)) * n_v
                 while v <= v_last:
-                    ray = _Ray(_affine(origin, o_v, v + 0.5), _affine(direction, d_v, v + 0.5), voxel)
+                    ray = Ray(_affine(origin, o_v, v + 0.5), _affine(direction, d_v, v + 0.5), voxel)
                     w = ray.weight((x, y, z), (nx, ny, nz))
                     here = column + mi.UInt(v)
                     p = dr.gather(mi.Vector2f, weighted, here) if ones else [dr.gather(mi.Float, weighted, here)]

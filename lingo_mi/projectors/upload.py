@@ -10,21 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def uploaded(values: np.ndarray) -> Any:
+def uploaded(values: np.ndarray, double: bool = False) -> Any:
     """A copy of NumPy's values, of any shape, as Float [N] that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
+
+    double   whether it is Float64
 
     Dr.Jit uses NumPy's memory in place and compiles its alignment into kernels. Without this copy, each densification would
     compile new ones.
     """
-    room = np.empty(values.size + 16, np.float32)
-    start = -room.ctypes.data % 64 // 4
+    room = np.empty(values.size + 16, np.float64 if double else np.float32)
+    start = -room.ctypes.data % 64 // room.itemsize
     out = room[start : start + values.size]
     out.reshape(values.shape)[...] = values
-    out = mi.Float(out)
+    out = mi.Float64(out) if double else mi.Float(out)
     dr.make_opaque(out)  # a single value would otherwise become a literal, compiled into kernels
     return out
 
 
-def uploaded_tensor(values: ArrayLike) -> Any:
-    """A copy of NumPy's values of any shape, TensorXf."""
-    return mi.TensorXf(uploaded(np.asarray(values)), np.shape(values))
+def uploaded_tensor(values: ArrayLike, double: bool = False) -> Any:
+    """A copy of NumPy's values of any shape: TensorXf, or TensorXd where they are to be double."""
+    return (mi.TensorXd if double else mi.TensorXf)(uploaded(np.asarray(values), double), np.shape(values))

@@ -7,9 +7,9 @@ A view's correction turns source and panel about the volume's centre and shifts 
     d loss / d turn  = sum over source, corner, u, v of  x cross (d loss / d x)
     d loss / d shift = d loss / d source + d loss / d corner
 
-A common motion of all views equals a motion of the object; the projections do not determine it. So after every step the mean
-turn and the mean shift of all views are subtracted. Corrections may be restricted to cubic polynomials in time, which hold what
-a single view tells poorly.
+`Rays.by_motion` computes these. A common motion of all views equals a motion of the object; the projections do not determine
+it. So after every step the mean turn and the mean shift of all views are subtracted. Corrections may be restricted to cubic
+polynomials in time, which hold what a single view tells poorly.
 """
 
 from __future__ import annotations
@@ -92,15 +92,13 @@ class Poses:
             setattr(there, name, np.stack([np.interp(t, own, column) for column in values.T], 1))
         return there.corrected(geometry.on(scan.grid))
 
-    def step(self, view: int, rays: Rays, gradient: dict, rate: float, adam: Rates) -> None:
+    def step(self, view: int, rays: Rays, gradient: np.ndarray, rate: float, adam: Rates) -> None:
         """Move a view by one Adam step, then subtract the mean motion of all views.
 
         rays       the view with the corrections so far, [1]
-        gradient   derivatives of the loss by its source, corner, u and v, [3] each
+        gradient   derivatives of the loss by its source, corner, u and v, [4, 3]
         """
-        turn = sum(np.cross(getattr(rays, name)[0], gradient[name]) for name in _NAMES)
-        shift = gradient['corner'] if rays.parallel else gradient['corner'] + gradient['source']
-        g = np.concatenate([turn, shift]) * self.free
+        g = rays.by_motion(gradient[None])[0] * self.free
         b1, b2 = adam.beta1, adam.beta2
         self.steps[view] += 1
         self.first[view] = b1 * self.first[view] + (1 - b1) * g
@@ -127,9 +125,9 @@ def place(view: View, rays: Rays) -> None:
         setattr(view, name, vector)
 
 
-def gathered(view: View) -> dict:
-    """The accumulated derivatives by a view's vectors, [3] each, by name. Waits for the device."""
-    return {name: np.array([float(c[0]) for c in dr.grad(getattr(view, name))]) for name in _NAMES}
+def gathered(view: View) -> np.ndarray:
+    """The accumulated derivatives by a view's source, corner, u and v, [4, 3]. Waits for the device."""
+    return np.array([[float(c[0]) for c in dr.grad(getattr(view, name))] for name in _NAMES])
 
 
 class PoseCorrection(Correction):

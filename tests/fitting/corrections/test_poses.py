@@ -68,7 +68,7 @@ def test_motions_of_all_views_are_the_objects():
     poses, frames = Poses(5), g.normalised_rays()
     for i in range(40):
         view = i % 5
-        by = {k: rng.normal(size=3) for k in ('source', 'corner', 'u', 'v')}
+        by = rng.normal(size=(4, 3))
         poses.step(view, poses.correct(frames[[view]], view), by, 1e-2, MOVING.rates)
     np.testing.assert_allclose(poses.shift.mean(0), 0, atol=1e-12)
     np.testing.assert_allclose(poses.turn.mean(0), 0, atol=1e-4)  # rotations add up to first order
