@@ -24,7 +24,6 @@ from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.ray_gradient import moving
 from lingo_mi.projectors.stack import Block
 from lingo_mi.projectors.upload import uploaded
-from lingo_mi.projectors.usable import require_unfrozen
 
 MODELS = 'joseph', 'exact'
 
@@ -167,7 +166,6 @@ class Projector(LinearMap):
 
     def _with_rays(self, volume: Any, vectors: Any) -> Any:
         """Projections of a tensor [x, y, z] along the rays of a tensor [view, 4, 3], Float [view * v * u]."""
-        require_unfrozen('a projector of other rays')
         poses = on_host(vectors, self.geometry)
         geometry = PosedGeometry(poses=poses, nDetector=self.geometry.nDetector, grid=self.geometry.grid)
         there = Projector(geometry, model=self.model, valid=self.valid)
