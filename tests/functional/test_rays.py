@@ -13,8 +13,8 @@ from helpers.matrices import matrix
 from lingo_mi.common.errors import InputError
 from lingo_mi.functional import Projector, project
 from lingo_mi.geometry import CircularGeometry, Geometry, Grid, PosedGeometry, Rays
-from lingo_mi.studies import oracle
-from lingo_mi.studies.oracle import Pose, random_cloud, relative
+from lingo_mi.validation import oracle
+from lingo_mi.validation.oracle import Pose, random_cloud, relative
 
 EXTENT = 6.0
 GRID = Grid((9, 11, 7), (4.0, 3.0, 5.0), (3.0, -2.0, 1.0))
