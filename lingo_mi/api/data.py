@@ -156,7 +156,7 @@ def load_raw(
     Returns a `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts. Raises InputError where
     something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.
 
-        scan = lm.load_raw('frames/', 'scan.yml', flats='flats/', darks='darks/', binning=2)
+        scan = lm.load_raw('frames/', 'scanner.yml', flats='flats/', darks='darks/', binning=2)
     """
     require_type('frames', frames, (str, PathLike))
     require_type('geometry', geometry, (str, PathLike, Geometry))

@@ -8,9 +8,9 @@ from lingo_mi.common.errors import InputError
 
 EPILOG = """\
 examples:
-  lingo-mi import frames/ --flats flats/ --darks darks/ --geometry scan.yml --out scan.npy
-      folders of images; scan.yml needs DSO, DSD, dDetector and angles or totalAngle
-  lingo-mi import tomo.h5 --geometry scan.yml --binning 2 --out scan.npy
+  lingo-mi import frames/ --flats flats/ --darks darks/ --geometry scanner.yml --out scan.npy
+      folders of images; scanner.yml needs DSO, DSD, dDetector and angles or totalAngle
+  lingo-mi import tomo.h5 --geometry scanner.yml --binning 2 --out scan.npy
       NXtomo or DXchange, with its own flats, darks and angles
   lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
       Nikon, with the air level of every view from a region without object
