@@ -16,7 +16,7 @@ import numpy as np
 
 import lingo_mi as lm
 
-# sphinx_gallery_thumbnail_path = 'figures/readme.png'
+# sphinx_gallery_thumbnail_path = 'figures/chest.png'
 
 chest = lm.phantom('chest', size=64)
 volume = 0.02 * chest.data

@@ -1,0 +1,41 @@
+"""What the pages tell a reader to type or to open: Python that compiles, names and files that are there."""
+
+import ast
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+import lingo_mi as lm
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').rglob('*.md'))]
+FENCED = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
+
+each_page = pytest.mark.parametrize('page', PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+
+
+@each_page
+def test_python_compiles_and_names_what_the_package_has(page):
+    for language, code in FENCED.findall(page.read_text(encoding='utf-8')):
+        if language == 'python':
+            used = re.findall(r'\blm\.(\w+)', code)
+            assert ast.parse(code) and set(used) <= set(lm.__all__), code
+
+
+@each_page
+def test_studies_and_scripts_are_there(page):
+    text = page.read_text(encoding='utf-8')
+    for study in re.findall(r'python -m (studies(?:\.\w+)+)', text):
+        assert study == 'studies.NAME' or importlib.util.find_spec(study), study
+    for script in re.findall(r'\b(?:docs|scripts|examples)/\w+\.py\b', text):
+        assert (ROOT / script).exists(), script
+
+
+@each_page
+def test_links_lead_to_files(page):
+    text = FENCED.sub('', page.read_text(encoding='utf-8'))
+    for target in re.findall(r'\]\(([^)#\s]+)[^)]*\)', text):
+        if '://' not in target and '/gallery/' not in target and not target.startswith('gallery/'):
+            assert (page.parent / target).exists(), target
