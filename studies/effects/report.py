@@ -53,13 +53,12 @@ def make_table(numbers: dict) -> str:
     """The Markdown table of effects.json."""
 
     def cell(kind):
-        return lambda r: f'{r[kind]["psnr_3d"]:.2f} ({r[kind]["psnr_3d_gain"]:.2f})'
+        return lambda r: f'{r[kind]["psnr_3d"]:.2f}'
 
     columns = [
         ('effect', lambda r: r['title']),
         *((f'{title}, dB', cell(kind)) for kind, title in FITS.items()),
-        ('ms a step', lambda r: ', '.join(f'{r[kind]["ms_per_iteration"]:.0f}' for kind in FITS)),
-        ('extra, s', lambda r: f'{round(r["model"]["seconds"] - r["ignore"]["seconds"]):+d}'),
+        ('extra time, s', lambda r: f'{round(r["model"]["seconds"] - r["ignore"]["seconds"]):+d}'),
     ]
     return table(columns, numbers.values())
 
