@@ -7,6 +7,7 @@ import sys
 from importlib.metadata import version
 
 from lingo_mi.cli.common import guard
+from lingo_mi.common.parsing import nearest
 
 # In the order of the help: command -> what it does.
 COMMANDS = {
@@ -45,7 +46,8 @@ def main() -> None:
         print(f'lingo_mi {version("lingo_mi")}')
         return
     if wanted not in COMMANDS:
-        print(f'error: there is no command {wanted!r}: use one of {", ".join(COMMANDS)}', file=sys.stderr)
+        near = nearest(wanted, COMMANDS)
+        print(f'error: there is no command {wanted!r}{near}; use one of {", ".join(COMMANDS)}', file=sys.stderr)
         sys.exit(2)
     sys.argv[:2] = [f'lingo-mi {wanted}']
     run(wanted)

@@ -85,12 +85,14 @@ def advice(scan: Scan, found: Findings) -> list[str]:
     if border is not None:
         if found.air_is_off:
             lines.append(
-                f'air is {border.air:.3g} instead of 0: import again with --air, or subtract it from the projections'
+                f'air is {border.air:.3g} instead of 0: import again with --air, or take it out with lingo-mi calibrate SCAN '
+                '--air --out F.npy'
             )
         if found.air_differs:
             lines.append(
                 f'the air level of the views differs by {border.air_spread:.2g} rms: import again with --air, which scales every '
-                'view by its own air, or fit with -D fit_air=view'
+                'view by its own air, fit with -D fit_air=view, or take out what is smooth in time with lingo-mi calibrate '
+                'SCAN --air --out F.npy'
             )
         for name, _ in _cut(found):
             lines.append(f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object')

@@ -103,6 +103,7 @@ _KEYS = {
 
 
 MOST_LISTED = 1000  # poses in a geometry file
+FRAMES = {'.tif', '.tiff', '.edf', '.his', '.hnd', '.hnc', '.xim', '.h5', '.hdf5', '.hdf', '.nxs', '.nx'}  # raw ones
 VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 
@@ -387,6 +388,9 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
             return partial(r2.read_r2, path)
         if (path / 'geometry.yml').exists():
             return partial(_read_exr_folder, path)
+        with reading(path, folder=True):
+            if any(file.suffix.lower() in FRAMES for file in path.iterdir()):
+                raise _raw_frames(path)
         raise InputError(
             f'{path}: has neither {r2.META} (R2-Gaussian) nor geometry.yml (EXR views); give a folder of a scan'
         )
@@ -398,7 +402,15 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
         return partial(_read_npy, path, geometry_file_of(path, geometry))
     if suffix == '.npz':
         return partial(public_scans.read_public_scan, path, name)
+    if suffix in FRAMES:
+        raise _raw_frames(path)
     raise InputError(f'{path}: is not a known scan format; give .pickle, .npy, .npz, or a folder of a scan')
+
+
+def _raw_frames(path):
+    return InputError(
+        f'{path}: holds raw frames; make a scan of them: lingo-mi import {path} --geometry scanner.yml --out scan.npy'
+    )
 
 
 _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy}

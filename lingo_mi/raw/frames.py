@@ -16,6 +16,7 @@ from lingo_mi.storage.file_access import one_line, optional, reading
 
 RTK = '.his', '.hnd', '.hnc', '.xim'  # of Elekta's and Varian's scanners, one frame a file
 IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'} | dict.fromkeys(RTK, 'itk')
+LINKED = 4  # groups below the root in which frames are looked for: entry, subentry, instrument, detector
 HDF5 = ('.h5', '.hdf5', '.hdf', '.nxs', '.nx')
 
 
@@ -202,6 +203,7 @@ def _hdf5(path):
             raise InputError(f'{path}: {data.name} has the shape {data.shape}; frames are [n, v, u]')
         return Frames(str(path), len(data), data.shape[1:], data.dtype, lambda i: data[i])
 
+    _require_links(path, file)
     if 'exchange/data' in file:  # DXchange
         group = file['exchange']
         flats, darks = (
@@ -235,6 +237,26 @@ def _hdf5(path):
         angles = np.degrees(angles) if _unit(data).startswith('rad') else angles
         angles = angles[key == 0] if len(angles) == len(key) else angles
     return Recording(views, of(1), of(2), angles)
+
+
+def _require_links(path, file):
+    """Raises InputError where data are in another file that is not there: HDF5 says no more than that it cannot open it."""
+    import h5py
+
+    def follow(group, depth):
+        for name in group:
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                target = Path(path).parent / link.filename  # an absolute name stays
+                if not target.exists():
+                    raise InputError(
+                        f'{path}: {group.name.rstrip("/")}/{name} is a link to {link.filename}, which is not there; put that '
+                        f'file beside {Path(path).name}'
+                    )
+            elif depth and isinstance(link, h5py.HardLink) and group.get(name, getclass=True) is h5py.Group:
+                follow(group[name], depth - 1)
+
+    follow(file, LINKED)
 
 
 def _nxtomo(file):

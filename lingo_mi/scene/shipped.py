@@ -8,6 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.parsing import nearest
 
 
 def scenes() -> dict[str, Path]:
@@ -31,4 +32,7 @@ def scene_path(scene: PathLike | str) -> Path:
         return known[str(scene)]
     if os.path.exists(path):
         return path
-    raise InputError(f'{str(scene)[:100]}: there is no such scene; name a file, or one of {", ".join(sorted(known))}')
+    name = str(scene)[:100]
+    raise InputError(
+        f'{name}: there is no such scene{nearest(name, known)}; name a file, or one of {", ".join(sorted(known))}'
+    )

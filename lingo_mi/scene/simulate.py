@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -74,6 +75,12 @@ def take_scan(
     )  # as given: joining may make poses of it
     held_out = everything.subset(slice(len(geometry), None)) if test is not None else None
     true = true_volume(objects, geometry.grid) if truth else None
+    if truth and true is None:
+        warnings.warn(
+            f'{loaded.path}: the volume is not compared with the true one, since the scanner has other voxels (nVoxel, dVoxel) '
+            'than the object, or the object is in a shapegroup; give both the same, where the scene lets you',
+            stacklevel=2,
+        )
     return choose_views(Dataset(train, held_out, true), 0 if test is not None else views)
 
 

@@ -52,6 +52,7 @@ def test_unknown_command(command, wanted):
     code, out, err = command(wanted)
     assert code == 2 and not out and err.startswith(f'error: there is no command {wanted!r}') and err.count('\n') == 1
     assert all(name in err for name in COMMANDS)
+    assert ('did you mean fit?' in err) == (wanted == 'fits')
 
 
 def test_phantom_list(command):

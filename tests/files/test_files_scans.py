@@ -282,6 +282,11 @@ def test_unknown_paths(tmp_path):
     refused(tmp_path / 'none', 'no such file')
     (tmp_path / 'a.xyz').touch()
     refused(tmp_path / 'a.xyz', 'not a known scan format')
+    for name in 'frames.tif', 'scan.nxs', 'folder/0001.EDF':
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+        given = tmp_path / name.partition('/')[0]
+        refused(given, f'lingo-mi import {given} --geometry')
     refused(tmp_path / 'a.xyz', 'carries its own geometry', geometry='g.yml')
 
 

@@ -116,6 +116,12 @@ def test_the_arc_of_views_that_are_given_as_poses(start):
         assert measure(lm.Scan(geometry, p)).orbit.turn == pytest.approx(np.pi)
 
 
+def test_air_of_all_views(foot):
+    """The advice names a command that takes it out, as `test_calibration` measures."""
+    p = foot.projections + np.float32(0.1 * foot.projections.max())
+    assert any('lingo-mi calibrate SCAN --air --out' in line for line in advised(lm.Scan(foot.geometry, p)))
+
+
 def test_air_of_single_views(foot):
     p = foot.projections + np.linspace(-1, 1, len(foot))[:, None, None] * 0.05 * foot.projections.max()
     assert any('-D fit_air=view' in line for line in advised(lm.Scan(foot.geometry, p)))

@@ -12,9 +12,11 @@ import lingo_mi as lm
 from helpers.raw_frames import raw_frames
 from lingo_mi.cli import main
 from lingo_mi.common.errors import InputError
+from lingo_mi.files import scans
 from lingo_mi.files.scans import write_scan
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import rtk
+from lingo_mi.raw import frames
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.importing import import_raw
 from lingo_mi.raw.line_integrals import photons_of_images
@@ -574,3 +576,24 @@ def test_dxchange_with_stacks_of_no_frames(tmp_path, raw, scan_yml, empty, messa
             load(tmp_path / 'a.h5', scan_yml)
     else:
         assert len(load(tmp_path / 'a.h5', scan_yml)) == 6
+
+
+@pytest.mark.parametrize('place', ['entry/instrument/detector/data', 'exchange/data'])
+def test_frames_in_a_file_that_is_not_there(tmp_path, place):
+    h5py = pytest.importorskip('h5py')
+    path = tmp_path / 'scan.nxs'
+    with h5py.File(path, 'w') as file:
+        file.create_group(place.rpartition('/')[0])
+        file[place] = h5py.ExternalLink('frames.h5', '/data')
+    with pytest.raises(
+        InputError, match=f'/{place} is a link to frames.h5, which is not there; put that file beside scan.nxs'
+    ):
+        open_recording(path)
+    with h5py.File(tmp_path / 'frames.h5', 'w') as file:
+        file['data'] = np.ones((4, 5, 6), np.uint16)
+    assert open_recording(path).views.shape == (5, 6)
+
+
+def test_kinds_of_frames_that_a_scan_is_not():
+    """`read_scan`, in a package below, names `import` for what this one opens."""
+    assert scans.FRAMES == {*frames.IMAGES, *frames.HDF5}

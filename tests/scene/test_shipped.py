@@ -32,6 +32,12 @@ def test_a_file_comes_before_a_name_and_a_name_before_a_folder(tmp_path, monkeyp
 
 @pytest.mark.parametrize('name', ['none.xml', 'foot', 'x3d_foot.xml', 'meshes/flange', 'a' * 300])
 def test_what_there_is_not(name):
-    with pytest.raises(InputError, match='there is no such scene; name a file, or one of .*x3d_foot') as error:
+    with pytest.raises(InputError, match='there is no such scene.*; name a file, or one of .*x3d_foot') as error:
         scene_path(name)
     assert str(error.value).startswith(f'{name[:100]}: ') and '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('name', ['x3d_fot', 'x3d_foot.xml', 'foot'])
+def test_the_nearest_scene_is_named(name):
+    with pytest.raises(InputError, match='did you mean x3d_foot?'):
+        scene_path(name)
