@@ -33,6 +33,7 @@ __version__ = '0.2.0.dev0'
 if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.api.calibration import calibrate
     from lingo_mi.api.data import load, load_raw, phantom, simulate
+    from lingo_mi.api.estimate import Estimate, estimate
     from lingo_mi.api.fitting import fit
     from lingo_mi.api.volumes import reconstruct
     from lingo_mi.calibration.calibration import Calibration
@@ -107,6 +108,7 @@ _MODULES = {
     'fitting.field.options': 'Field',
     'fitting.fit': 'Fit load_fit',
     'api.volumes': 'reconstruct',
+    'api.estimate': 'estimate Estimate',
     'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS PenalisedLeastSquares TV Denoiser Prior Refined Best',
     'functional': 'Projector project voxelize',
     'functional.gaussians': 'Gaussians',

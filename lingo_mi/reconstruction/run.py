@@ -112,7 +112,12 @@ def check_room(
     if algorithm is None:
         check_memory(geometry, views=views)
     else:
-        check_memory(fine, views=views, needed=memory_needed(algorithm.name, fine, views) + beside)
+        check_memory(fine, views=views, needed=room_needed(geometry, algorithm, views, beside))
+
+
+def room_needed(geometry: Geometry, algorithm: Algorithm, views: int, beside: float = 0) -> float:
+    """Bytes of peak memory by which `check_room` refuses, whose arguments these are."""
+    return memory_needed(algorithm.name, geometry.on(algorithm.grid(geometry)), views) + beside
 
 
 @contextmanager

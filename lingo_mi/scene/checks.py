@@ -16,19 +16,23 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
     """Raises InputError, before anything is allocated, for a scan that does not fit into this process's memory.
 
     views    of all geometries together (0: the views that they have)
-    needed   peak memory of an algorithm, bytes (0: the least, which is the volume as read, fitted and compared, and the
-             projections as measured and rendered)
+    needed   peak memory of an algorithm, bytes (0: the least, see `least_memory`)
     """
     known = [g for g in geometries if g is not None]
     views = views or sum(map(len, known))
-    voxels, pixels = math.prod(known[0].grid.shape), views * math.prod(known[0].nDetector)
-    needed = needed or 4 * (3 * voxels + 2 * pixels)
+    needed = needed or least_memory(known[0], views)
     if needed > (has := room()):
         size = [' x '.join(map(str, counts)) for counts in (known[0].grid.shape, known[0].nDetector)]
         raise InputError(
             f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2**30:,.1f} GiB of '
             f'memory, but this process may take {has / 2**30:,.1f} GiB: lower nVoxel, nDetector or the views'
         )
+
+
+def least_memory(geometry: Geometry, views: int) -> int:
+    """Bytes of the least that work on a scan needs: the volume as read, fitted and compared, and the projections as measured and
+    rendered."""
+    return 4 * (3 * math.prod(geometry.grid.shape) + 2 * views * math.prod(geometry.nDetector))
 
 
 def thinned(geometry: Geometry, slab: int) -> Geometry:
