@@ -22,7 +22,7 @@ from lingo_mi.common.runtime import use_variant
 from lingo_mi.storage.file_access import require_writable
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--presets', action='store_true', help='the presets alone: their table, no plots')
@@ -32,11 +32,11 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--out', type=Path, default=Path('out/accuracy'), metavar='D', help='folder of the results')
     docs_arguments(p, 'accuracy.md', 'figures')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
-    return p.parse_args()
+    return p
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
     require_writable(args.out, args.out, 'choose another --out')
     document, figures = docs_of(args)
     use_variant(args.variant)

@@ -33,7 +33,7 @@ from lingo_mi.storage.folder_lock import locked
 SHOWN = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'gaussians', 'seconds_fit'
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('list', type=Path, metavar='LIST.csv', help='the scans, see above')
     p.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the results')
@@ -45,11 +45,11 @@ def arguments() -> argparse.Namespace:
     )
     cluster_arguments(p)
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
-    return p.parse_args()
+    return p
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
     from lingo_mi.cohort.listing import BadList, read_list
     from lingo_mi.cohort.run import done_already
     from lingo_mi.cohort.table import CSV

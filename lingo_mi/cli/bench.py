@@ -25,7 +25,7 @@ from lingo_mi.storage.file_access import require_writable, write_text
 MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--gaussians', type=int, default=50_000)
     p.add_argument('--size', type=int, default=512, help='pixels along a side of the square panel')
@@ -35,7 +35,11 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--no-bvh', dest='bvh', action='store_false', help="leave out Mitsuba's tree")
     p.add_argument('--json', type=Path, help='write the numbers there')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
-    args = p.parse_args()
+    return p
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raises InputError for numbers out of their ranges."""
     for name, low, high in (
         ('gaussians', 1, 10_000_000),
         ('size', 8, 8192),
@@ -45,11 +49,11 @@ def arguments() -> argparse.Namespace:
     ):
         if not low <= getattr(args, name) <= high:
             raise InputError(f'--{name} must be from {low} to {high}, not {getattr(args, name):g}')
-    return args
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
+    check(args)
     variant = use_variant(args.variant)
     from lingo_mi.validation.benchmark import TREE, Bench, Work, describe_times, describe_tree
     from lingo_mi.validation.cuda_model import beside

@@ -17,34 +17,38 @@ examples:
   lingo-mi fit calibrated.npy"""
 
 
-def main() -> None:
-    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
+def parser() -> Parser:
+    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument(
         'scan', help='a scan in any format that --projections of fit reads, views in the order of their time'
     )
-    parser.add_argument(
+    p.add_argument(
         '--drift',
         type=int,
         default=0,
         metavar='N',
         help='degree of a polynomial in time for its shifts (default 0: none)',
     )
-    parser.add_argument('--air', action='store_true', help='also an air level, smooth in time')
-    parser.add_argument('--gain', action='store_true', help='also a gain of the views, smooth in time')
-    parser.add_argument(
+    p.add_argument('--air', action='store_true', help='also an air level, smooth in time')
+    p.add_argument('--gain', action='store_true', help='also a gain of the views, smooth in time')
+    p.add_argument(
         '--curve',
         type=int,
         default=0,
         metavar='K',
         help='also a curve of K coefficients from line integral to measured value, as of beam hardening',
     )
-    parser.add_argument('--scatter', action='store_true', help='also scattered light, one smooth image for all views')
-    parser.add_argument(
+    p.add_argument('--scatter', action='store_true', help='also scattered light, one smooth image for all views')
+    p.add_argument(
         '--out', type=Path, metavar='F.npy', help='the scan with the geometry found; F.yml is written beside it'
     )
-    parser.add_argument('--force', action='store_true', help='overwrite existing files')
-    parser.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
-    args = parser.parse_args()
+    p.add_argument('--force', action='store_true', help='overwrite existing files')
+    p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
+    return p
+
+
+def main() -> None:
+    args = parser().parse_args()
     if args.out is not None:
         check_scan_output(args.out, _inputs(Path(args.scan)), args.force)
     use_variant(args.variant)

@@ -16,28 +16,32 @@ examples:
       a fit and a volume of reconstruct, with their differences to the true volume"""
 
 
-def main() -> None:
-    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
+def parser() -> Parser:
+    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument(
         'results',
         nargs='+',
         metavar='RESULT',
         help='a folder that fit wrote, or a volume in any format that --volume reads',
     )
-    parser.add_argument('--truth', type=Path, metavar='F', help='the true volume, to compare with')
-    parser.add_argument(
+    p.add_argument('--truth', type=Path, metavar='F', help='the true volume, to compare with')
+    p.add_argument(
         '--mu-water',
         type=float,
         metavar='MU',
         help='where the truth has Hounsfield units: the attenuation of water, 1/mm, that the results were made with',
     )
-    spacing_argument(parser, '--truth')
-    parser.add_argument(
+    spacing_argument(p, '--truth')
+    p.add_argument(
         '--out', type=Path, default=Path('compare.html'), metavar='F.html', help='the page (default: compare.html)'
     )
-    parser.add_argument('--title', default='', help='of the page')
-    parser.add_argument('--force', action='store_true', help='replace an earlier page')
-    args = parser.parse_args()
+    p.add_argument('--title', default='', help='of the page')
+    p.add_argument('--force', action='store_true', help='replace an earlier page')
+    return p
+
+
+def main() -> None:
+    args = parser().parse_args()
     from lingo_mi.files.volumes import read_volume
     from lingo_mi.results.compare import compare_page, load_result
 

@@ -36,7 +36,7 @@ from lingo_mi.storage.folder_lock import locked
 from lingo_mi.storage.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCENE, VOLUME, result_folder
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument(
@@ -76,11 +76,11 @@ def arguments() -> argparse.Namespace:
         metavar='NAME=VALUE',
         help='any option of the method (see lingo_mi.fitting.methods), or a parameter of the scene file',
     )
-    return p.parse_args()
+    return p
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
     use_variant(args.variant)
     from lingo_mi.scene.load import defaults
 

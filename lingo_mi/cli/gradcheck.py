@@ -13,7 +13,7 @@ from lingo_mi.common.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument(
         'scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray, or the name of a shipped one'
@@ -34,11 +34,11 @@ def arguments() -> argparse.Namespace:
         metavar='COUNT',
         help='Gaussians of every cloud and voxels of every grid to check, drawn at random (default: 4)',
     )
-    return p.parse_args()
+    return p
 
 
 def main() -> int:
-    args = arguments()
+    args = parser().parse_args()
     use_variant(args.variant)
     from lingo_mi.validation.gradient_check import TOLERANCE, check_gradients, gradient_table, load_scene_file
 

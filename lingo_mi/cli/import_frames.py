@@ -17,9 +17,9 @@ examples:
   lingo-mi fit scan.npy"""
 
 
-def arguments() -> argparse.Namespace:
-    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
+def parser() -> Parser:
+    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = p.add_argument
     add(
         'frames',
         help='a folder of .tif, .edf, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, .npy [n, v, u], or .h5 / .nxs',
@@ -60,7 +60,7 @@ def arguments() -> argparse.Namespace:
     add('--angles', metavar='F', help='a file of angles in degrees, one a line (.txt, .ang)')
     add('--pixel', type=float, metavar='MM', help="size of a raw pixel, for RTK's geometry")
     add('--force', action='store_true', help='overwrite existing files')
-    return parser.parse_args()
+    return p
 
 
 def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
@@ -78,7 +78,7 @@ def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
     from lingo_mi.files.scans import named_files, write_scan
     from lingo_mi.raw.importing import import_raw
     from lingo_mi.raw.nikon import read_numbers

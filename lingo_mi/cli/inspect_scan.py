@@ -20,12 +20,16 @@ examples:
   lingo-mi inspect foot_50.pickle --out look.png"""
 
 
+def parser() -> Parser:
+    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument('scan', help='a scan in any format that --projections of fit reads')
+    p.add_argument('--out', type=Path, metavar='F.png', help='where to draw (default: the name of the scan, .png)')
+    p.add_argument('--force', action='store_true', help='replace an earlier picture')
+    return p
+
+
 def main() -> None:
-    parser = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('scan', help='a scan in any format that --projections of fit reads')
-    parser.add_argument('--out', type=Path, metavar='F.png', help='where to draw (default: the name of the scan, .png)')
-    parser.add_argument('--force', action='store_true', help='replace an earlier picture')
-    args = parser.parse_args()
+    args = parser().parse_args()
     out = args.out or Path(Path(args.scan).stem + '.png')
     if out.suffix.lower() != '.png':
         raise InputError(f'{out}: the picture is a PNG; give an --out that ends in .png')

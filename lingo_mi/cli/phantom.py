@@ -42,41 +42,43 @@ SUMMARY = {
 }
 
 
-def arguments() -> tuple[argparse.Namespace, str]:
-    listing = '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
-    parser = Parser(
-        description=__doc__, epilog=EPILOG.format(list=listing), formatter_class=argparse.RawDescriptionHelpFormatter
+def listing() -> str:
+    """The phantoms, a line each."""
+    return '\n'.join(f'  {name:12s} {SUMMARY[name]}' for name in phantoms.names())
+
+
+def parser() -> Parser:
+    p = Parser(
+        description=__doc__, epilog=EPILOG.format(list=listing()), formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('name', nargs='?', metavar='NAME', help='which phantom, see below')
-    parser.add_argument('--list', action='store_true', help='print the names and exit')
-    parser.add_argument('--size', type=int, default=256, metavar='N', help='voxels a side, 8 to 512 (default 256)')
-    parser.add_argument(
+    p.add_argument('name', nargs='?', metavar='NAME', help='which phantom, see below')
+    p.add_argument('--list', action='store_true', help='print the names and exit')
+    p.add_argument('--size', type=int, default=256, metavar='N', help='voxels a side, 8 to 512 (default 256)')
+    p.add_argument(
         '--seed',
         type=int,
         default=0,
         metavar='S',
         help='texture, vessels, random Gaussians and held-out angles (default 0)',
     )
-    parser.add_argument(
+    p.add_argument(
         '--out', type=Path, metavar='F.nii.gz', help='where to write the volume; for mesh and gaussians also F.ply'
     )
-    parser.add_argument(
+    p.add_argument(
         '--projections', type=Path, metavar='PATH', help='where to write a scan: a .pickle file or a new folder'
     )
-    parser.add_argument(
+    p.add_argument(
         '--kind',
         choices=('naf', 'r2', 'exr'),
         default='naf',
         help='format of the scan: naf writes a pickle, r2 and exr a folder (default naf)',
     )
-    parser.add_argument(
+    p.add_argument(
         '--views', type=int, default=50, metavar='N', help='training views, and as many test views (default 50)'
     )
-    parser.add_argument(
-        '--variant', help='Mitsuba variant for foot and chest (default cuda_ad_mono, else llvm_ad_mono)'
-    )
-    parser.add_argument('--force', action='store_true', help='overwrite existing files (never folders)')
-    return parser.parse_args(), listing
+    p.add_argument('--variant', help='Mitsuba variant for foot and chest (default cuda_ad_mono, else llvm_ad_mono)')
+    p.add_argument('--force', action='store_true', help='overwrite existing files (never folders)')
+    return p
 
 
 def check(args: argparse.Namespace) -> None:
@@ -151,9 +153,9 @@ def write_ply(path: Path, phantom: phantoms.Phantom) -> None:
 
 
 def main() -> None:
-    args, listing = arguments()
+    args = parser().parse_args()
     if args.list:
-        print(listing)
+        print(listing())
         return
     check(args)
     phantom = phantoms.make(args.name, args.size, args.seed)

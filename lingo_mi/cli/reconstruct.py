@@ -67,7 +67,7 @@ from lingo_mi.storage.folder_lock import writing_file
 IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'voxelize'  # those that need not hold the whole volume
 
 
-def arguments() -> argparse.Namespace:
+def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     input_arguments(p)
     p.add_argument('--algorithm', choices=(*ALGORITHMS, 'voxelize'), default='fdk', help='(default: fdk)')
@@ -120,7 +120,7 @@ def arguments() -> argparse.Namespace:
         help='a parameter of the algorithm, such as niter, lmbda, tviter or filter (see lingo_mi.reconstruction), or of '
         'the scene file; effects=ignore takes projections for line integrals',
     )
-    return p.parse_args()
+    return p
 
 
 def check_arguments(args: argparse.Namespace) -> None:
@@ -182,7 +182,7 @@ def algorithm_of(args: argparse.Namespace, given: dict[str, str]) -> Algorithm |
 
 
 def main() -> None:
-    args = arguments()
+    args = parser().parse_args()
     use_variant(args.variant)
     check_arguments(args)
     args.scene = scene_path(args.scene)

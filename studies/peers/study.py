@@ -29,7 +29,7 @@ from lingo_mi.common.runtime import cores
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.fitting.loop import run as fit
 from lingo_mi.fitting.methods.fast import Fast
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
@@ -46,7 +46,7 @@ REFERENCE = 'reference'
 ACROSS = 5  # slices side by side in the picture
 
 
-def _cloud(scan: Scan) -> Callable[[Geometry], np.ndarray]:
+def _cloud(scan: Scan) -> Callable[[Grid], np.ndarray]:
     """A function that samples a fitted cloud."""
     return fit(scan, Fast()).volume
 
@@ -120,7 +120,7 @@ METHODS = {
     'asd-pocs': Method('ASD-POCS', lambda scan: run_algorithm(scan, ASDPOCS()).volume),
     'rtk-tv': Method('RTK, total variation', _rtk_tv, 'beta', (1.0, 3.0, 10.0, 30.0)),
     'mbirjax': Method('MBIRJAX', _qggmrf, 'sharpness', (0.0, 1.0, 2.0, 3.0)),
-    'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry)),
+    'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry.grid)),
     'refined': Method('`fast`, then `refined`, `finer=2`', _refined),
     'best': Method('`best`', lambda scan: run_algorithm(scan, Best()).volume),
 }

@@ -28,7 +28,7 @@ from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
-from lingo_mi.reconstruction.best import SPREAD, START, refine
+from lingo_mi.reconstruction.best import SPREAD, START, Chosen, refine
 from lingo_mi.reconstruction.refined import means
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Dataset, Scan
@@ -103,9 +103,9 @@ class Study:
         began, extra = time.process_time(), {}
         if setting in (BEST, BEST_CLOUD):
             found = run_algorithm(dataset.train, Best(cloud=setting == BEST_CLOUD), fit=fit_cloud)
+            assert isinstance(found, Chosen) and found.error is not None
             volume = found.volume
             wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
-            assert found.error is not None
             extra = dict(
                 plan=found.record(), error_map=float(np.asarray(spearmanr(found.error.ravel(), wrong.ravel()))[0])
             )

@@ -1,13 +1,16 @@
 """The console command `lingo-mi`: its help, its commands, the scripts that are the same, and the studies."""
 
+import importlib
+import platform
 import runpy
 import subprocess
 import sys
-from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import lingo_mi
 from lingo_mi import phantoms
 from lingo_mi.cli import COMMANDS, main
 
@@ -39,12 +42,39 @@ def command(monkeypatch, capsys):
 def test_help_lists_the_commands(command, args):
     code, out, err = command(*args)
     assert code == 0 and not err and out.startswith('usage: lingo-mi COMMAND')
-    listed = [line.split()[0] for line in out.splitlines() if line.startswith('  ')]
-    assert listed == list(COMMANDS)
+    lines = [line.split() for line in out.splitlines() if line.startswith('  ')]
+    assert [words[0] for words in lines if words[0] in COMMANDS] == list(COMMANDS) and len(COMMANDS) <= 12
+    assert [words[2] for words in lines if words[:2] == ['$', 'lingo-mi']] == list(COMMANDS)
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_an_example_of_the_help_parses(name):
+    command = COMMANDS[name]
+    importlib.import_module(f'lingo_mi.cli.{command.module}').parser().parse_args(command.example.split())
 
 
 def test_version(command):
-    assert command('--version') == (0, f'lingo_mi {version("lingo_mi")}\n', '')
+    code, out, err = command('--version')
+    found = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert code == 0 and not err and found['lingo_mi'] == lingo_mi.__version__
+    assert found['numpy'] == np.__version__ and found['Python'] == platform.python_version()
+    assert 'llvm_ad_mono' in found['variants'] and found['LLVM'].split('.')[0].isdigit()
+
+
+def test_completion(command):
+    shtab = pytest.importorskip('shtab')
+    for shell in shtab.SUPPORTED_SHELLS:
+        code, out, err = command('--print-completion', shell)
+        assert code == 0 and not err and 'reconstruct' in out and 'asd-pocs' in out, shell
+    for wrong in ((), ('ksh',)):
+        code, out, err = command('--print-completion', *wrong)
+        assert code == 2 and not out and 'bash' in err and err.count('\n') == 1
+
+
+def test_completion_without_its_package(command, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'shtab', None)
+    code, out, err = command('--print-completion', 'bash')
+    assert code == 2 and not out and 'pip install' in err and err.count('\n') == 1
 
 
 @pytest.mark.parametrize('wanted', ['fits', '--verbose', ''])
