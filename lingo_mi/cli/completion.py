@@ -21,7 +21,7 @@ from lingo_mi.common.errors import InputError
 def print_script(arguments: Sequence[str]) -> None:
     """Print the script for the shell that the arguments name. Raises InputError without it or without shtab."""
     try:
-        import shtab
+        import shtab  # pyright: ignore[reportMissingImports] - optional
     except ImportError:
         raise InputError("completion needs the package shtab: pip install 'lingo_mi[completion]'") from None
     shells = shtab.SUPPORTED_SHELLS
