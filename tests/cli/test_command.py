@@ -5,12 +5,12 @@ import platform
 import runpy
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import lingo_mi
 from lingo_mi import phantoms
 from lingo_mi.cli import COMMANDS, main
 
@@ -56,7 +56,7 @@ def test_an_example_of_the_help_parses(name):
 def test_version(command):
     code, out, err = command('--version')
     found = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert code == 0 and not err and found['lingo_mi'] == lingo_mi.__version__
+    assert code == 0 and not err and found['lingo_mi'] == version('lingo_mi')
     assert found['numpy'] == np.__version__ and found['Python'] == platform.python_version()
     assert 'llvm_ad_mono' in found['variants'] and found['LLVM'].split('.')[0].isdigit()
 
