@@ -33,10 +33,11 @@ from lingo_mi.geometry import limits
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.drawing import drawing
 from lingo_mi.geometry.grid import Grid, Voxels, grid_of
-from lingo_mi.geometry.rays import Index, Rays
+from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import Motion
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from typing_extensions import Self, Unpack
 
 
@@ -360,6 +361,40 @@ class Geometry(ABC):
         rays, centre, k = self.rays(), np.array(self.grid.centre), self.grid.scale
         source = rays.source if rays.parallel else (rays.source - centre) * k
         return Rays(source, (rays.corner - centre) * k, rays.u * k, rays.v * k, rays.parallel)
+
+    def show(self, views: Index | None = None) -> Figure:
+        """Draw the scanner to scale: rays, panel and volume, from above and from the side of the first view.
+
+        Parameters
+        ----------
+        views : slice or sequence of int, optional
+            Whose panel and outermost rays are drawn, the first strongest (default: three, evenly spaced). Dots are the sources of
+            all views.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            It shows itself in a notebook; `savefig` writes it to a file.
+
+        Raises
+        ------
+        InputError
+            For views that the scan does not have, and for none.
+
+        Examples
+        --------
+        ::
+
+            geometry.show(views=[0, 10]).savefig('scanner.png')
+        """
+        from lingo_mi.geometry.figure import DRAWN, figure
+
+        count = len(self)
+        spaced = np.unique(np.arange(DRAWN) * count // DRAWN)
+        chosen = spaced if views is None else np.arange(count)[checked_views(views, count)]
+        if len(chosen) == 0:
+            raise InputError('no views are chosen: choose at least one to draw')
+        return figure(self, chosen)
 
     def voxel_matrices(self) -> np.ndarray:
         """Projection matrices [view, 3, 4] from voxel indices (i, j, k, 1) to (x w, y w, w), float64.
