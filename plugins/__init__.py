@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from functools import partial
+from functools import partial, update_wrapper
 from typing import Any
 
 import mitsuba as mi
@@ -61,7 +61,7 @@ def watch_variants() -> None:
     def on_variant(*_):
         if mi.variant() is not None:
             register()
-            mi.render = render
+            mi.render = update_wrapper(render, mi.util.render)  # with its signature and help
 
     mi.detail.add_variant_callback(on_variant)
     on_variant()

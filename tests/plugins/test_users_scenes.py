@@ -1,5 +1,7 @@
 """Scenes as Mitsuba's users write them: films, crops, instances, batches, nested integrators, variants."""
 
+import inspect
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -246,6 +248,11 @@ def test_within_a_frozen_function():
         frozen(mi.Float(2))
     assert isinstance(caught.value.__cause__, InputError) and 'dr.freeze' in str(caught.value.__cause__)
     assert render(scene).any()
+
+
+def test_render_keeps_its_help():
+    assert inspect.signature(mi.render) == inspect.signature(mi.util.render)
+    assert mi.render.__doc__ == mi.util.render.__doc__
 
 
 def test_variant_without_derivatives(variant):
