@@ -17,9 +17,9 @@ from lingo_mi.functional.linear_map import LinearMap
 
 def apply_jax(linear_map: LinearMap, x: Any) -> Any:
     """The map of an array [..., *domain_shape] of real numbers, which is computed as float32."""
-    if jnp.iscomplexobj(x):
+    if x.dtype.kind == 'c':
         raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
-    return _PRIMITIVE.bind(jnp.asarray(x, jnp.float32), map=linear_map)
+    return _PRIMITIVE.bind(x if x.dtype == jnp.float32 else x.astype(jnp.float32), map=linear_map)
 
 
 def _shape(x, linear_map):

@@ -18,6 +18,7 @@ from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.functional.frameworks import framework_of
 from lingo_mi.projectors.upload import uploaded
 
+LARGE = 2**26  # bytes of a result above which it is asked whether they fit: that reads files, half a millisecond
 BASIS, TOLERANCE = 12, 1e-4  # of `norm`: vectors of its Krylov space; its own error is about the square of this
 
 
@@ -32,6 +33,7 @@ class LinearMap(ABC):
 
     domain_shape: tuple[int, ...]
     range_shape: tuple[int, ...]
+    __array_ufunc__ = None  # `A @ array` is an error, not an array of single views
 
     @property
     @abstractmethod
@@ -61,7 +63,8 @@ class LinearMap(ABC):
         if shape[len(shape) - len(self.domain_shape) :] != self.domain_shape:
             raise InputError(f'{self!r} takes arrays [..., {_text(self.domain_shape)}], not [{_text(shape)}]')
         batch = shape[: len(shape) - len(self.domain_shape)]
-        if 4 * math.prod((*batch, *self.range_shape)) > room():
+        needed = 4 * math.prod((*batch, *self.range_shape))
+        if needed > LARGE and needed > room():
             shape = _text((*batch, *self.range_shape))
             raise InputError(f'{self!r}: a result [{shape}] does not fit into memory: take fewer views or voxels')
         if kind == 'NumPy':
@@ -80,7 +83,7 @@ class LinearMap(ABC):
     def on_host(self, x: np.ndarray, checked: bool = True) -> np.ndarray:
         """The map of NumPy's array. checked: whether NaN is an error."""
         if checked and not np.isfinite(x).all():
-            raise InputError(f'{self!r}: the array has NaN or infinity: replace those values first')
+            raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
         batch = x.shape[: x.ndim - len(self.domain_shape)]
         out = np.empty((*batch, *self.range_shape), np.float32)
         with one_at_a_time():
@@ -91,10 +94,12 @@ class LinearMap(ABC):
 
     def _of_drjit(self, x: Any, batch: tuple[int, ...]) -> Any:
         ensure_variant('cuda' if dr.backend_v(x) == dr.JitBackend.CUDA else 'cpu')
+        if not math.prod(batch):
+            return dr.zeros(mi.TensorXf, (*batch, *self.range_shape))
         flat = mi.Float(x.array if dr.is_tensor_v(x) else x)
         dr.make_opaque(flat)
         if not dr.all(dr.isfinite(dr.detach(flat)))[0]:
-            raise InputError(f'{self!r}: the array has NaN or infinity: replace those values first')
+            raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
         n, parts = math.prod(self.domain_shape), []
         for i in range(math.prod(batch)):
             one = (

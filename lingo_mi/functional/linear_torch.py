@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import torch
 
 from lingo_mi.common.errors import InputError
@@ -21,6 +23,8 @@ def apply_torch(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
         raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
     if x.device.type not in ('cpu', 'cuda'):
         raise InputError(f'{linear_map!r} takes tensors on the CPU or on a CUDA device, not on {x.device}')
+    if x.layout is not torch.strided:
+        raise InputError(f'{linear_map!r} takes dense tensors, not {x.layout}: call to_dense() first')
     if x.device.type == 'cpu':
         warn_of_spinning()
     return _Apply.apply(x.as_subclass(torch.Tensor).to(torch.float32), linear_map)
@@ -30,8 +34,10 @@ class _Apply(torch.autograd.Function):
     @staticmethod
     def forward(x: torch.Tensor, linear_map: LinearMap) -> torch.Tensor:
         x = x.detach().contiguous()
-        if not torch.isfinite(x).all():
-            raise InputError(f'{linear_map!r}: the tensor has NaN or infinity: replace those values first')
+        # NumPy is several times as quick to tell.
+        finite = np.isfinite(x.numpy()).all() if x.device.type == 'cpu' else torch.isfinite(x).all()
+        if not finite:
+            raise InputError(f'{linear_map!r}: the tensor has NaN or infinity as float32: replace those values first')
         with one_at_a_time():
             active = ensure_variant(None if x.device.type == 'cpu' else 'cuda')
             if x.device.type == 'cpu' and active.startswith('cuda'):
@@ -40,8 +46,10 @@ class _Apply(torch.autograd.Function):
             if x.device.type == 'cuda':
                 torch.cuda.current_stream(x.device).synchronize()  # Dr.Jit has a stream of its own
             out = [_one(linear_map, part) for part in x.reshape(-1, *linear_map.domain_shape)]
-            found = torch.stack(out).reshape(*batch, *linear_map.range_shape) if batch else out[0]
-        return found
+        if not batch:
+            return out[0]
+        stacked = torch.stack(out) if out else x.new_empty(0)
+        return stacked.reshape(*batch, *linear_map.range_shape)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
@@ -58,6 +66,10 @@ class _Apply(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, x: torch.Tensor, linear_map: LinearMap) -> tuple:
         return _Apply.apply(x.movedim(in_dims[0], 0), linear_map), 0
+
+
+# PyTorch asks for it at every call, and would work it out each time.
+_Apply.forward.__signature__ = inspect.signature(_Apply.forward)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def _one(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +19,7 @@ from lingo_mi.functional.frameworks import Argument, call
 from lingo_mi.functional.linear_map import LinearMap
 from lingo_mi.functional.rays import beams_of, on_host, rays_argument
 from lingo_mi.geometry import Geometry, PosedGeometry
-from lingo_mi.geometry.rays import Index
+from lingo_mi.geometry.rays import Index, checked_views
 from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.ray_gradient import moving
@@ -94,9 +95,9 @@ class Projector(LinearMap):
             raise InputError(f'model is {" or ".join(map(repr, MODELS))}, not {shown(model)}')
         mask = None if valid is None else _mask(valid, (len(geometry), *geometry.nDetector))
         if views is not None:
+            if not np.arange(len(geometry))[checked_views(views, len(geometry))].size:
+                raise InputError('the projector has no views: choose at least one')
             geometry, mask = geometry.subset(views), None if mask is None else mask[views]
-        if len(geometry) == 0:
-            raise InputError('the projector has no views: choose at least one')
         self.geometry, self.valid = geometry, mask
         self._kind = GridPair if model == 'exact' else projector_class(geometry)
         self.model = 'exact' if self._kind is GridPair else 'joseph'
@@ -116,6 +117,10 @@ class Projector(LinearMap):
 
     def __len__(self) -> int:
         return len(self.geometry)
+
+    def __iter__(self) -> Iterator[Projector]:
+        """The projectors of single views."""
+        return (self[i] for i in range(len(self)))
 
     def __repr__(self) -> str:
         return f'Projector({self.model}, {_by(self.domain_shape)} voxels to {_by(self.range_shape)} pixels)'

@@ -27,6 +27,8 @@ def numbers(name: str, value: ArrayLike) -> np.ndarray:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f'{name} must be made of numbers, not {shown(value)}') from None
+    except RuntimeError:  # what PyTorch raises for a tensor that has a gradient
+        raise InputError(f'{name}: a geometry keeps no derivatives: detach the tensor first') from None
 
 
 def lengths(name: str, value: ArrayLike) -> np.ndarray:

@@ -277,6 +277,12 @@ def test_some_views():
     np.testing.assert_allclose(A[0].T(A(x)[:1]) + A[1:].T(A(x)[1:]), A.T(A(x)), atol=1e-3)
 
 
+def test_views_one_by_one():
+    A = Projector(GEOMETRIES['cone'])
+    x, _ = pair(A.domain_shape, A.range_shape)
+    np.testing.assert_array_equal(np.concatenate([one(x) for one in A]), A(x))
+
+
 def test_threads():
     A = Projector(GEOMETRIES['cone'])
     x, _ = pair((8, *A.domain_shape), A.range_shape)
@@ -309,11 +315,14 @@ def test_other_shapes(kind, shape):
         (lambda g: Projector(None), 'geometry must be a Geometry'),
         (lambda g: Projector(g, model='siddon'), "model is 'joseph' or 'exact', not 'siddon'"),
         (lambda g: Projector(g, views=[]), 'no views'),
+        (lambda g: Projector(g)[3:], 'no views'),
+        (lambda g: Projector(g)[np.zeros(3, bool)], 'no views'),
         (lambda g: Projector(g, views=[3]), 'from 0 to 2'),
         (lambda g: Projector(g)[5], 'from 0 to 2'),
         (lambda g: Projector(g, valid=np.ones((3, 4, 4), bool)), 'valid must be true or false'),
         (lambda g: Projector(g, valid=np.ones((17, 21))), 'valid must be true or false'),
         (lambda g: Projector(g)('text'), 'cannot be read as an array'),
+        (lambda g: Projector(g)(None), 'cannot be read as an array'),
         (lambda g: Projector(g)(np.zeros((9, 11, 7), complex)), 'not real numbers'),
         (lambda g: Projector(g)(np.broadcast_to(np.float32(0), (10**10, 9, 11, 7))), 'does not fit into memory'),
     ],
@@ -322,6 +331,49 @@ def test_bad_input(make, message):
     with pytest.raises(InputError) as caught:
         make(GEOMETRIES['cone'])
     assert message in str(caught.value) and '\n' not in str(caught.value) and len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_empty_batches(kind):
+    A = Projector(GEOMETRIES['cone'])
+    x, y = pair((2, 0, *A.domain_shape), (0, *A.range_shape))
+    assert A(array_of(kind, x)).shape == (2, 0, *A.range_shape)
+    assert A.T(array_of(kind, y)).shape == (0, *A.domain_shape)
+
+
+def test_other_types_and_layouts():
+    A = Projector(GEOMETRIES['cone'])
+    x, _ = pair(A.domain_shape, A.range_shape)
+    for other in (np.asfortranarray(x), x[::-1, ::-1][::-1, ::-1], x.astype(float), x.astype('>f4'), x.tolist()):
+        np.testing.assert_array_equal(A(other), A(x))
+    np.testing.assert_allclose(A(x.astype(np.float16)), A(x), rtol=1e-2, atol=0.1)
+    np.testing.assert_array_equal(A(x > 0), A((x > 0).astype(int)))
+
+
+@pytest.mark.filterwarnings('ignore:overflow')
+def test_values_beyond_float32():
+    with pytest.raises(InputError, match='as float32'):
+        Projector(GEOMETRIES['cone'])(np.full((9, 11, 7), 1e300))
+
+
+def test_the_operator_of_matrices():
+    """NumPy would otherwise take A for a list of its views."""
+    with pytest.raises(TypeError, match=r'support ufuncs|unsupported operand'):
+        Projector(GEOMETRIES['cone']) @ np.zeros((9, 11, 7))
+
+
+def test_tensors_that_are_not_dense():
+    torch = framework('torch')
+    with pytest.raises(InputError, match=r'takes dense tensors, not torch.sparse_coo: call to_dense\(\) first'):
+        Projector(GEOMETRIES['cone'])(torch.zeros(9, 11, 7).to_sparse())
+    with pytest.raises(InputError, match='not on meta'):
+        Projector(GEOMETRIES['cone'])(torch.zeros(9, 11, 7, device='meta'))
+
+
+def test_a_geometry_keeps_no_derivatives():
+    torch = framework('torch')
+    with pytest.raises(InputError, match='angles: a geometry keeps no derivatives: detach the tensor first'):
+        scan(n=3, angles=torch.zeros(3, requires_grad=True))
 
 
 @pytest.mark.parametrize('kind', ['torch', 'jax'])
@@ -366,6 +418,41 @@ def test_a_forked_process_goes_on():
     """As a worker of PyTorch's DataLoader does."""
     done = subprocess.run([sys.executable, '-c', FORKED], capture_output=True, text=True, timeout=120)
     assert done.stdout == '0 True\n', done
+
+
+LOADED = """
+import numpy as np
+import torch
+import lingo_mi as lm
+
+class Projections(torch.utils.data.Dataset):
+    def __init__(self, A):
+        self.A = A
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, i):
+        return self.A(torch.full(self.A.domain_shape, float(i + 1)))
+
+if __name__ == '__main__':
+    lm.use_variant('llvm_ad_mono')
+    A = lm.Projector(lm.Geometry.parallel(nDetector=16, dDetector=1, nVoxel=16, dVoxel=1, angles=[0.0, 1.0]))
+    wanted = A(torch.ones(A.domain_shape))
+    for start in 'fork', 'spawn':
+        loader = torch.utils.data.DataLoader(Projections(A), num_workers=1, multiprocessing_context=start)
+        one, two = loader
+        print(start, torch.equal(one[0], wanted), torch.allclose(two[0], 2 * wanted))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, 'fork'), reason='there is no fork here')
+def test_workers_of_a_data_loader(tmp_path):
+    framework('torch')
+    program = tmp_path / 'loaded.py'
+    program.write_text(LOADED)
+    done = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300)
+    assert done.stdout == 'fork True True\nspawn True True\n', done
 
 
 def test_the_doors():
