@@ -59,7 +59,7 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
     from lingo_mi.fitting.start.masks import MaskStart
     from lingo_mi.fitting.start.start import Start, StartingCloud
     from lingo_mi.fitting.start.uniform import CuboidStart, RandomStart
-    from lingo_mi.functional import Projector, project, voxelize
+    from lingo_mi.functional import GaussianProjector, Projector, project, voxelize
     from lingo_mi.functional.gaussians import Gaussians
     from lingo_mi.geometry import Geometry, Grid, circular
     from lingo_mi.reconstruction import (
@@ -110,7 +110,7 @@ _MODULES = {
     'api.volumes': 'reconstruct',
     'api.estimate': 'estimate Estimate',
     'reconstruction': 'Reconstruction FDK SART OSSART SIRT CGLS ASDPOCS PenalisedLeastSquares TV Denoiser Prior Refined Best',
-    'functional': 'Projector project voxelize',
+    'functional': 'Projector GaussianProjector project voxelize',
     'functional.gaussians': 'Gaussians',
     'common.runtime': 'use_variant',
     'common.errors': 'InputError',

@@ -180,10 +180,10 @@ def voxelize(
 def _taken(means, scales, quaternions, density, where, extent) -> tuple[tuple, Any, float]:
     """Four arrays, where they are projected or sampled, and the cut-off, of a call with arrays or with `Gaussians`."""
     if not isinstance(means, Gaussians):
-        return (means, scales, quaternions, density), where, _extent(cutoff.RENDER if extent is None else extent)
+        return (means, scales, quaternions, density), where, checked_extent(cutoff.RENDER if extent is None else extent)
     if quaternions is not None or density is not None or (scales is not None and where is not None):
         raise InputError('Gaussians hold all four arrays: give them and the geometry or grid alone')
-    return tuple(means), scales if where is None else where, _extent(means.extent if extent is None else extent)
+    return tuple(means), scales if where is None else where, checked_extent(means.extent if extent is None else extent)
 
 
 def _arguments(arrays: Sequence) -> list[Argument]:
@@ -222,7 +222,8 @@ def _require_room(shape: tuple[int, ...], name: str):
         )
 
 
-def _extent(extent) -> float:
+def checked_extent(extent: Any) -> float:
+    """A cut-off in standard deviations. Raises InputError for one that is none."""
     if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
         raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
     return float(extent)
