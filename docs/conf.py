@@ -47,7 +47,13 @@ python_maximum_signature_line_length = 100
 Progress._draw = lambda self, now: None  # pages show what examples print, not how far they are
 
 # What examples need besides the package. Where it is missing, they are shown without what they print and draw.
-NEEDS = {'06_spectrum_and_detector': ('spekpy', 'xraylib'), '07_pytorch': ('torch',)}
+NEEDS = {
+    '06_spectrum_and_detector': ('spekpy', 'xraylib'),
+    '07_pytorch': ('torch',),
+    '13_deepinv': ('deepinv',),
+    '14_odl': ('odl',),
+    '15_unrolled': ('torch',),
+}
 skipped = []
 for example, modules in NEEDS.items():
     missing = [name for name in modules if importlib.util.find_spec(name) is None]

@@ -6,12 +6,19 @@ import warnings
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
 
 import lingo_mi as lm
 
 EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('[0-9]*.py'))
-NEEDS = {'06_spectrum_and_detector': ('spekpy', 'xraylib'), '07_pytorch': ('torch',)}
+NEEDS = {
+    '06_spectrum_and_detector': ('spekpy', 'xraylib'),
+    '07_pytorch': ('torch',),
+    '13_deepinv': ('torch', 'deepinv'),
+    '14_odl': ('odl',),
+    '15_unrolled': ('torch',),
+}
 
 
 def is_name(node):
@@ -37,7 +44,7 @@ def test_example(path, variant, monkeypatch, tmp_path):
     monkeypatch.setattr(lm, 'fit', lambda *scan, **settings: fit(*scan, **settings | {'iterations': 20}))
     monkeypatch.chdir(tmp_path)
     pyplot.close('all')
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), np.printoptions():  # which ODL changes for good
         warnings.simplefilter('error', RuntimeWarning)
         names = runpy.run_path(str(path), run_name='__main__')
     lm.use_variant(variant)  # which an example may change
