@@ -32,6 +32,7 @@ SHARE = (
     'fitting/test_loop.py',
     'fitting/test_losses.py',
     'functional/test_functional.py',
+    'functional/test_projector.py',
     'validation/test_gradient_check.py',
     'common/test_memory.py',
 )
