@@ -77,7 +77,9 @@ def estimate(
     Estimate
         `memory` is what `lm.reconstruct` and `lm.fit`, and the commands, refuse by. `seconds` is a range: steps of one kind may
         take 0.7 to 1.5 times what those tried did, and steps whose work changes (fits, in which Gaussians are added and which
-        may stop early, `Best` and `PenalisedLeastSquares`) 0.3 to 4 times. Work that ends within the trial gives the time itself.
+        may stop early, `Best` and `PenalisedLeastSquares`) 0.3 to 4 times. A trial waits for the device after every step, so
+        that steps of a few milliseconds, as in `FDK` of small scans, look slower than they are. Work that ends within the trial
+        gives the time itself.
 
     Raises
     ------
