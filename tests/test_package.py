@@ -63,3 +63,8 @@ def test_import_from_the_folder_that_holds_the_clone(tmp_path):
         [sys.executable, '-c', code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == lingo_mi.__version__
+
+
+def test_the_citation_has_the_package_version():
+    lines = (ROOT / 'CITATION.cff').read_text().splitlines()
+    assert f'version: {lingo_mi.__version__}' in lines
