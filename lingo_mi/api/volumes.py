@@ -17,6 +17,7 @@ from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
+from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.reconstruction import FDK, Algorithm, Best, Reconstruction, Refined
@@ -188,6 +189,7 @@ def _prepared(
     scan: Scan, algorithm: Algorithm, start: Fit | np.ndarray | None, views: int | None
 ) -> tuple[Scan, Algorithm, dict[str, Any]]:
     """The line integrals that the volume is made of, the algorithm, and what else this one needs."""
+    algorithm = algorithm.seeing(effects_of(scan))
     if isinstance(start, Fit) and views is not None:
         scan, inputs = prepare_completed(scan, start, views, algorithm)
         return scan, algorithm, inputs

@@ -13,7 +13,17 @@ from lingo_mi.reconstruction.best import Best
 from lingo_mi.reconstruction.cgls import CGLS
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.penalised import PenalisedLeastSquares
-from lingo_mi.reconstruction.priors import TV, Denoiser, Prior
+from lingo_mi.reconstruction.priors import (
+    TGV,
+    TV,
+    Denoiser,
+    DirectionalTV,
+    Huber,
+    NonLocalMeans,
+    Prior,
+    PriorSum,
+    Wavelets,
+)
 from lingo_mi.reconstruction.refined import Refined
 from lingo_mi.reconstruction.run import progress_bar, run_algorithm
 from lingo_mi.reconstruction.sart import OSSART, SART, SIRT
@@ -31,14 +41,20 @@ __all__ = [
     'OSSART',
     'SART',
     'SIRT',
+    'TGV',
     'TV',
     'Algorithm',
     'Best',
     'Denoiser',
+    'DirectionalTV',
+    'Huber',
+    'NonLocalMeans',
     'PenalisedLeastSquares',
     'Prior',
+    'PriorSum',
     'Reconstruction',
     'Refined',
+    'Wavelets',
     'progress_bar',
     'run_algorithm',
 ]

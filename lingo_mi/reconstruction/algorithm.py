@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import as_numpy, short_repr
+from lingo_mi.effects.forward import Effects
 from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.geometry import Geometry, Grid
@@ -102,6 +103,10 @@ class Algorithm(ABC):
     @abstractmethod
     def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
         """Reconstruct the volume of a scan, without the checks of `run_algorithm`, which describes the arguments."""
+
+    def seeing(self, effects: Effects | None) -> Algorithm:
+        """The algorithm for line integrals of a scan that had these effects, of which it may use what is known of the noise."""
+        return self
 
     @property
     def options(self) -> dict[str, Any]:

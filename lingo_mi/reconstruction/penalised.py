@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import drjit as dr
@@ -13,36 +14,39 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.common.errors import require_type
+from lingo_mi.common.errors import InputError, require_type, shown
+from lingo_mi.effects.forward import Effects
+from lingo_mi.functional.linear_map import LinearMap
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.held_out import Score, split_views
 from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_range
 from lingo_mi.reconstruction.priors import TV, Prior
 from lingo_mi.reconstruction.refined import means
-from lingo_mi.reconstruction.system import System, dot, evaluated, norm, scalar
+from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
 from lingo_mi.scan import Scan
 
-POWER, SAFE = 8, 1.05  # steps of the power method for |A|^2, and the factor that makes up for what they lack
+ACCURACY, SAFE = 1e-2, 1.02  # of the norm of A, and the factor on its square that makes up for what it lacks
 PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5  # strengths that are tried
-TRIED = 40  # iterations for each of them
+TRIED = 18  # iterations for each of them; each goes on from the volume of the one before
 WORSE, SLACK = 1.02, 1.015  # times the least score: the path ends; as good as the best
+WEIGHTS = 'known', 'photons', 'equal'
 
 
 @dataclass(frozen=True)
 class PenalisedLeastSquares(Algorithm):
-    """Least squares with a prior: minimises 1/2 |A x - b|^2 + strength max(A^T b) R(x) over 0 <= x <= `upper`.
+    """Least squares with a prior: minimises 1/2 (A x - b)^T W (A x - b) + strength max(A^T W b) R(x) over 0 <= x <= `upper`.
 
-    A step is one of gradient descent, of length 1 / |A|^2, then the proximal map of the prior; Nesterov's momentum accelerates
-    it (FISTA), and restarts when it points uphill.
+    A step is one of gradient descent, of length 1 / |A^T W A|, then the proximal map of the prior; Nesterov's momentum
+    accelerates it (FISTA), and restarts when it points uphill. A prior's gradient joins that of the data.
 
     Parameters
     ----------
     prior : Prior
-        `TV` (total variation), `Denoiser(function)`, or one of your own.
+        `TV` (total variation), another one of `lingo_mi.reconstruction.priors`, or one of your own.
     strength : float, optional
-        Of the prior, relative to max(A^T b), so that it does not depend on units. None: of `PATH`, the strongest that predicts
-        held-out views nearly as well as the best one (`held_out.Score`); this takes three to four times as long.
+        Of the prior, relative to max(A^T W b), so that it does not depend on units. None: of `PATH`, the strongest that predicts
+        held-out views nearly as well as the best one (`held_out.Score`); this takes up to three times as long.
     niter : int
         Iterations, at least 1; each takes one projection and one backprojection of all views.
     upper : float, optional
@@ -51,11 +55,16 @@ class PenalisedLeastSquares(Algorithm):
         Parts along each side of a voxel, at least 1. The volume is their mean over each voxel. For objects finer than the voxels.
     held_out : int
         One view in so many is held out to choose the strength, at least 2.
+    weights : {'known', 'photons', 'equal'}
+        W: the same for all rays ('equal'), or the share of photons that a ray keeps, exp(-b), to which the variance of a line
+        integral is inverse ('photons'). 'known': 'photons' for a scan whose detector says how many it counts, else 'equal'. The
+        mean of W over the rays is 1.
 
     References
     ----------
     Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm for linear inverse problems", SIAM J. Imaging Sci. 2
-    (2009); O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Found. Comput. Math. 15 (2015).
+    (2009); O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Found. Comput. Math. 15 (2015); for the
+    weights Sauer and Bouman, "A local update strategy for iterative reconstruction from projections", IEEE TSP 41 (1993).
 
     Raises
     ------
@@ -80,6 +89,7 @@ class PenalisedLeastSquares(Algorithm):
     upper: float | None = None
     finer: int = 1
     held_out: int = 5
+    weights: str = 'known'
 
     def __post_init__(self):
         require_type('prior', self.prior, Prior, 'such as lm.TV() or lm.Denoiser(function)')
@@ -89,6 +99,12 @@ class PenalisedLeastSquares(Algorithm):
             check_bound('strength', self.strength)
         if self.upper is not None:
             check_range('upper', self.upper, 0, LARGE)
+        if self.weights not in WEIGHTS:
+            raise InputError(f'weights must be one of {", ".join(WEIGHTS)}, not {shown(self.weights)}')
+
+    def seeing(self, effects: Effects | None) -> PenalisedLeastSquares:
+        counts = effects is not None and effects.detector is not None and effects.detector.photons > 0
+        return replace(self, weights='photons') if counts and self.weights == 'known' else self
 
     def steps(self, scan: Scan) -> int:
         return self.niter + (TRIED * len(PATH) if self.strength is None else 0)
@@ -105,7 +121,7 @@ class PenalisedLeastSquares(Algorithm):
         strength = self.strength
         if strength is None:
             strength, start, done = self._chosen(scan, start, progress)
-        solver = _Solver(System(scan), self.prior, math.inf if self.upper is None else self.upper)
+        solver = self._solver(scan)
         x = solver.system.start(start)
         residuals = [solver.system.residual(x)[1]]
         steps = self.steps(scan)
@@ -120,6 +136,11 @@ class PenalisedLeastSquares(Algorithm):
         volume = means(solver.system.volume(x), self.finer) if self.finer > 1 else solver.system.volume(x)
         return Reconstruction(volume, residuals, time.perf_counter() - began, own)
 
+    def _solver(self, scan: Scan) -> Solver:
+        return Solver(
+            System(scan), self.prior, math.inf if self.upper is None else self.upper, self.weights == 'photons'
+        )
+
     def _chosen(self, scan: Scan, start: ArrayLike | None, progress: Progress | None) -> tuple[float, np.ndarray, int]:
         """The strongest prior that predicts held-out views nearly as well as the best, the last volume, and the steps done.
 
@@ -128,7 +149,7 @@ class PenalisedLeastSquares(Algorithm):
         """
         kept, held_out = split_views(scan, self.held_out)
         score = Score(held_out)
-        solver = _Solver(System(kept), self.prior, math.inf if self.upper is None else self.upper)
+        solver = self._solver(kept)
         x, done = solver.system.start(start), 0
 
         def after_step(_: int) -> None:
@@ -147,42 +168,68 @@ class PenalisedLeastSquares(Algorithm):
         return chosen, solver.system.volume(x), done
 
 
-class _Solver:
+class Solver:
     """Accelerated proximal gradient descent on one scan.
+
+    weighted   whether W is exp(-b)
 
     residual   |A x - b| / |b| where the last step began
     """
 
-    def __init__(self, system: System, prior: Prior, upper: float):
-        self.system, self.prior, self.upper = system, prior, upper
-        A, views = system.A, system.views
-        x = dr.ones(mi.Float, A.voxels)
-        dr.make_opaque(x)
-        value = 0.0
-        for _ in range(POWER):
-            x = evaluated(A.adjoint(evaluated(A.forward(x * scalar(1 / (norm(x) or 1.0)), views)[0]), views))
-            value = norm(x)
-        self.curvature = SAFE * value or 1.0
-        self.scale = float(dr.max(A.adjoint(system.b, views))[0])
+    def __init__(self, system: System, prior: Prior, upper: float, weighted: bool = False):
+        self.system, self.prior, self.upper, self.weights = system, prior, upper, None
+        if weighted:
+            kept = dr.exp(-dr.maximum(system.b, 0))
+            self.weights = evaluated(kept * (len(system.views) * system.A.pixels / dr.sum(kept)))
+        self.curvature = SAFE * _Rooted(self).norm(ACCURACY) ** 2 or 1.0
+        self.scale = float(dr.max(system.A.adjoint(self.weighed(system.b), system.views))[0])
         self.residual = math.nan
+
+    def weighed(self, images: mi.Float) -> mi.Float:
+        return images if self.weights is None else evaluated(self.weights * images)
 
     def minimise(self, x: mi.Float, strength: float, niter: int, after_step: Callable[[int], None]) -> mi.Float:
         """The volume after `niter` steps from x. after_step: called with the number of steps done."""
-        system, size = self.system, self.system.geometry.grid.shape
+        system, prior, size = self.system, self.prior, self.system.geometry.grid.shape
         A, views = system.A, system.views
-        self.prior.begin()
+        strength *= self.scale
+        step = 1 / (self.curvature + strength * prior.curvature)
+        prior.begin()
         y, t = x, 1.0
         for k in range(1, niter + 1):
             r = evaluated(system.b - A.forward(y, views)[0])
             self.residual = system.relative(r)
-            moved = evaluated(dr.fma(scalar(1 / self.curvature), A.adjoint(r, views), y))
-            new = self.prior.prox(moved, strength * self.scale / self.curvature, size, self.upper)
+            down = evaluated(A.adjoint(self.weighed(r), views))
+            if strength and (slope := prior.gradient(y, size)) is not None:
+                down = dr.fma(scalar(-strength), slope, down)
+            new = prior.prox(evaluated(dr.fma(scalar(step), down, y)), strength * step, size, self.upper)
             after = (1 + math.sqrt(1 + 4 * t * t)) / 2
-            step = evaluated(new - x)
-            if dot(evaluated(y - new), step) > 0:  # the momentum points uphill
+            change = evaluated(new - x)
+            if dot(evaluated(y - new), change) > 0:  # the momentum points uphill
                 after, y = 1.0, new
             else:
-                y = evaluated(dr.fma(scalar((t - 1) / after), step, new))
+                y = evaluated(dr.fma(scalar((t - 1) / after), change, new))
             x, t = new, after
             after_step(k)
         return x
+
+
+class _Rooted(LinearMap):
+    """The root of W times A, whose norm squared is |A^T W A|."""
+
+    def __init__(self, solver: Solver, back: bool = False):
+        self.solver, self.back, A = solver, back, solver.system.A
+        self.root = None if solver.weights is None else evaluated(dr.sqrt(solver.weights))
+        shapes = (A.voxels,), (len(solver.system.views) * A.pixels,)
+        self.domain_shape, self.range_shape = shapes[::-1] if back else shapes
+
+    @cached_property
+    def T(self) -> _Rooted:
+        return _Rooted(self.solver, not self.back)
+
+    def on_device(self, x):
+        A, views = self.solver.system.A, self.solver.system.views
+        if self.back:
+            return evaluated(A.adjoint(x if self.root is None else evaluated(self.root * x), views))
+        out = A.forward(x, views)[0]
+        return evaluated(out if self.root is None else self.root * out)

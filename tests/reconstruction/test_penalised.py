@@ -1,94 +1,29 @@
-"""Penalised least squares: proximal maps against their definitions, the minimum, the choice of the strength, bad input."""
+"""Penalised least squares: the minimum, weights and bounds, the choice of the strength, denoisers, bad input."""
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear
 from skimage.restoration import denoise_tv_chambolle
 
 import lingo_mi as lm
 from helpers.balls import BALL, assert_ball, ellipsoids, geometry
 from lingo_mi.common.errors import InputError
+from lingo_mi.effects.detector import Detector
+from lingo_mi.effects.forward import Effects
 from lingo_mi.geometry.trajectories import circular
-from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction.penalised import PATH, PenalisedLeastSquares
-from lingo_mi.reconstruction.priors import TV, Denoiser, _differences, _transposed
+from lingo_mi.reconstruction.priors import TV
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.system import System
-
-SIZE = 6, 5, 4
 
 
 def variation(z):
     """Isotropic total variation, with no difference beyond the last voxel."""
     d = [np.diff(z, axis=a, append=z.take([-1], a)) for a in range(3)]
     return np.sqrt(sum(x**2 for x in d)).sum()
-
-
-def prox(prior, x, strength, upper=np.inf):
-    x = uploaded(x)
-    dr.eval(x)
-    return prior.prox(x, strength, SIZE, upper).numpy().reshape(SIZE)
-
-
-@pytest.fixture
-def noisy():
-    blocks = np.zeros(SIZE)
-    blocks[:3], blocks[3:, :2] = 1.0, 0.4
-    return (blocks + 0.2 * np.random.default_rng(0).normal(size=SIZE)).astype(np.float32)
-
-
-def test_differences_and_their_transpose():
-    rng = np.random.default_rng(0)
-    z, p = rng.normal(size=SIZE).astype(np.float32), rng.normal(size=(3, *SIZE)).astype(np.float32)
-    found = np.array([d.numpy().reshape(SIZE) for d in _differences(uploaded(z), SIZE)])
-    expected = np.array([np.diff(z, axis=a, append=z.take([-1], a)) for a in range(3)])
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    back = _transposed([uploaded(c) for c in p], SIZE).numpy().reshape(SIZE)
-    assert np.vdot(found, p) == pytest.approx(np.vdot(z, back), rel=1e-5)
-
-
-@pytest.mark.parametrize('upper', [np.inf, 0.7])
-@pytest.mark.parametrize('strength', [0.03, 0.3])
-def test_total_variation_is_the_least(noisy, strength, upper):
-    """No better volume is found from there, nor from anywhere else, by a general solver on a smoothed problem."""
-
-    def cost(z):
-        return 0.5 * ((z - noisy) ** 2).sum() + strength * variation(z)
-
-    z = prox(TV(inner=400), noisy, strength, upper)
-    assert z.min() >= 0 and z.max() <= upper + 1e-6
-    rng, least = np.random.default_rng(1), cost(z)
-    for _ in range(200):
-        other = np.clip(z + rng.choice([1e-3, 1e-2]) * rng.normal(size=SIZE), 0, upper)
-        assert cost(other) > least - 1e-6
-
-    def smoothed(flat, epsilon=1e-4):
-        z = flat.reshape(SIZE)
-        d = [np.diff(z, axis=a, append=z.take([-1], a)) for a in range(3)]
-        return 0.5 * ((z - noisy) ** 2).sum() + strength * np.sqrt(sum(x**2 for x in d) + epsilon**2).sum()
-
-    bounds = [(0, None if np.isinf(upper) else upper)] * noisy.size
-    found = minimize(smoothed, np.full(noisy.size, 0.3), bounds=bounds, method='L-BFGS-B', options=dict(maxfun=200_000))
-    assert least < cost(found.x.reshape(SIZE)) + 0.02
-
-
-def test_total_variation_is_that_of_scikit_image(noisy):
-    """Which has the same differences but no bounds: far above zero there are none."""
-    expected = denoise_tv_chambolle(noisy + 5, weight=0.2, eps=1e-9, max_num_iter=3000)
-    np.testing.assert_allclose(prox(TV(inner=500), noisy + 5, 0.2), expected, atol=2e-3)
-
-
-def test_a_call_goes_on_where_the_last_one_ended(noisy):
-    prior, exact = TV(inner=5), prox(TV(inner=500), noisy, 0.2)
-    errors = [np.abs(prox(prior, noisy, 0.2) - exact).max() for _ in range(12)]
-    assert errors[-1] < 0.2 * errors[0]
-    prior.begin()
-    assert np.abs(prox(prior, noisy, 0.2) - exact).max() == pytest.approx(errors[0], rel=1e-3)
-    np.testing.assert_allclose(prox(prior, noisy, 0.0), np.maximum(noisy, 0), atol=1e-7)
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
@@ -144,6 +79,41 @@ def test_the_strength_is_chosen(scan):
     assert 0 < max(fixed, key=fixed.get) < PATH[0]
 
 
+@pytest.mark.parametrize('weights', ['equal', 'photons'])
+def test_gradients_and_weights(weights):
+    """A quadratic prior, bounds and weights: the minimum that SciPy finds of the same matrix."""
+    geo = lm.Geometry.parallel(nDetector=(6, 9), dDetector=1, nVoxel=(5, 5, 4), dVoxel=1, angles=lm.circular(6))
+    A = lm.Projector(geo)
+    b = A(np.random.default_rng(0).random(A.domain_shape)) + np.random.default_rng(1).normal(size=A.range_shape)
+
+    class Small(lm.Prior):
+        curvature = 1.0
+
+        def gradient(self, x, size):
+            return x
+
+    found = run_algorithm(
+        lm.Scan(geo, b.astype(np.float32)),
+        PenalisedLeastSquares(Small(), strength=0.02, niter=250, upper=0.9, weights=weights),
+    )
+    matrix, flat = A.aslinearoperator() @ np.eye(100, dtype=np.float32), b.astype(float).ravel()
+    W = np.exp(-np.maximum(flat, 0)) if weights == 'photons' else np.ones(flat.size)
+    root = np.sqrt(W / W.mean())
+    strength = 0.02 * (matrix.T @ (root**2 * flat)).max()
+    full = np.vstack([root[:, None] * matrix, np.sqrt(strength) * np.eye(100)])
+    expected = lsq_linear(full, np.r_[root * flat, np.zeros(100)], (0, 0.9), tol=1e-12).x
+    np.testing.assert_allclose(found.volume.ravel(), expected, atol=2e-4)
+    assert 0 < (expected < 1e-9).sum() < 100 and (expected > 0.9 - 1e-9).any()
+
+
+def test_the_scan_says_whether_photons_are_counted():
+    effects = Effects(detector=Detector(photons=1e4))
+    assert PenalisedLeastSquares().seeing(effects).weights == 'photons'
+    assert PenalisedLeastSquares(weights='equal').seeing(effects).weights == 'equal'
+    for none in (None, Effects(), Effects(detector=Detector())):
+        assert PenalisedLeastSquares().seeing(none).weights == 'known'
+
+
 def test_bounds_and_finer_voxels(scan):
     scan, truth = scan
     low = lm.reconstruct(
@@ -177,20 +147,13 @@ def test_a_denoiser_is_a_prior(scan):
         (lambda v, s: v[1:], 'returns the shape'),
         (lambda v, s: v * np.nan, 'NaN or infinity'),
         (lambda v, s: None, 'cannot be read as an array'),
+        (lambda v, s: 1 / 0, 'the denoiser fails: ZeroDivisionError: division by zero'),
     ],
 )
 def test_denoisers_that_fail(scan, function, message):
     with pytest.raises(InputError, match=message) as caught:
         lm.reconstruct(scan[0], lm.PenalisedLeastSquares(lm.Denoiser(function), strength=1e-4), progress=False)
     assert '\n' not in str(caught.value)
-
-
-def test_errors_of_a_denoiser_are_its_own(scan):
-    def broken(volume, strength):
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        lm.reconstruct(scan[0], lm.PenalisedLeastSquares(lm.Denoiser(broken), strength=1e-4), progress=False)
 
 
 @pytest.mark.parametrize(
@@ -204,8 +167,7 @@ def test_errors_of_a_denoiser_are_its_own(scan):
         (lambda: PenalisedLeastSquares(upper=0), 'upper must be above 0'),
         (lambda: PenalisedLeastSquares(finer=0.5), 'finer must be an integer'),
         (lambda: PenalisedLeastSquares(held_out=1), 'held_out must be an integer from 2'),
-        (lambda: TV(inner=0), 'inner must be an integer'),
-        (lambda: Denoiser(3), 'cannot be called'),
+        (lambda: PenalisedLeastSquares(weights='noise'), "weights must be one of known, photons, equal, not 'noise'"),
     ],
 )
 def test_bad_options(make, message):
