@@ -27,9 +27,10 @@ from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
 from lingo_mi.scan import Scan
 
 ACCURACY, SAFE = 1e-2, 1.02  # of the norm of A, and the factor on its square that makes up for what it lacks
-PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5  # strengths that are tried
-TRIED = 18  # iterations for each of them; each goes on from the volume of the one before
-WORSE, SLACK = 1.02, 1.015  # times the least score: the path ends; as good as the best
+PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5  # strengths to choose from
+FIRST, MOST = 3, 5  # which of them is tried first; how many at most
+TRIED = 30  # iterations for each of them; each goes on from the volume of its neighbour
+SLACK = 1.015  # times the least score: as good as the best
 WEIGHTS = 'known', 'photons', 'equal'
 
 
@@ -107,7 +108,7 @@ class PenalisedLeastSquares(Algorithm):
         return replace(self, weights='photons') if counts and self.weights == 'known' else self
 
     def steps(self, scan: Scan) -> int:
-        return self.niter + (TRIED * len(PATH) if self.strength is None else 0)
+        return self.niter + (TRIED * MOST if self.strength is None else 0)
 
     def grid(self, geometry: Geometry) -> Grid:
         return geometry.grid.finer(self.finer)
@@ -144,13 +145,14 @@ class PenalisedLeastSquares(Algorithm):
     def _chosen(self, scan: Scan, start: ArrayLike | None, progress: Progress | None) -> tuple[float, np.ndarray, int]:
         """The strongest prior that predicts held-out views nearly as well as the best, the last volume, and the steps done.
 
-        The path goes from strong to weak, each from the volume of the one before. Among those that predict alike the strongest is
-        taken, as in the rule of one standard error (Breiman et al., "Classification and Regression Trees", 1984).
+        The search goes from the middle of the path towards stronger priors while these predict as well, else towards weaker ones
+        while these predict better. Among those that predict alike the strongest is taken, as in the rule of one standard error
+        (Breiman et al., "Classification and Regression Trees", 1984).
         """
         kept, held_out = split_views(scan, self.held_out)
-        score = Score(held_out)
-        solver = self._solver(kept)
-        x, done = solver.system.start(start), 0
+        score, solver = Score(held_out), self._solver(kept)
+        scores: dict[int, float] = {}
+        done = 0
 
         def after_step(_: int) -> None:
             nonlocal done
@@ -158,14 +160,22 @@ class PenalisedLeastSquares(Algorithm):
             if progress is not None:
                 progress(done, self.steps(scan), solver.residual)
 
-        scores: list[float] = []
-        for strength in PATH:
-            x = solver.minimise(x, strength, TRIED, after_step)
-            scores.append(score(x))
-            if scores[-1] > WORSE * min(scores):
+        def tried(i: int, x: mi.Float) -> mi.Float:
+            x = solver.minimise(x, PATH[i], TRIED, after_step)
+            scores[i] = score(x)
+            return x
+
+        x = tried(FIRST, solver.system.start(start))
+        stronger, i, way = tried(FIRST - 1, x), FIRST, 1
+        if scores[FIRST - 1] <= SLACK * scores[FIRST]:
+            x, i, way = stronger, FIRST - 1, -1
+        while 0 <= i + way < len(PATH):
+            i, least = i + way, min(scores.values())
+            x = tried(i, x)
+            if scores[i] > (SLACK if way < 0 else 1) * least:
                 break
-        chosen = next(s for s, found in zip(PATH, scores) if found <= SLACK * min(scores))
-        return chosen, solver.system.volume(x), done
+        chosen = min(i for i, found in scores.items() if found <= SLACK * min(scores.values()))
+        return PATH[chosen], solver.system.volume(x), done
 
 
 class Solver:
