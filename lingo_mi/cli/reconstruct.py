@@ -256,6 +256,8 @@ def show(
     if found.residuals:
         missed = f', |A x - b| / |b| = {found.residuals[-1]:.4g} after {len(found.residuals) - 1} iterations'
     print(f'{args.algorithm} of {of} views: {found.seconds:.1f} s{missed}')
+    if found.grid != scanner.grid:
+        truth = None  # it has other voxels
     numbers = {} if truth is None else found.metrics(truth)
     if numbers:
         print(volume_quality(numbers))

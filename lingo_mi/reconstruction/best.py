@@ -17,19 +17,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.geometry import Geometry, Grid
+from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.held_out import Score, Trial, TrialWatch, split_views
 from lingo_mi.reconstruction.parameters import check_counts
-from lingo_mi.reconstruction.refined import Refined, means, structure
+from lingo_mi.reconstruction.penalised import MOST, TRIED, PenalisedLeastSquares
+from lingo_mi.reconstruction.priors import Prior
+from lingo_mi.reconstruction.refined import Refined, structure
+from lingo_mi.reconstruction.voxel_values import means, values
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 
-START, TRIAL = 50, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
+LONG = 50  # passes of ASD-POCS, at most, where it is given out itself
 AHEAD = 0.9  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LITTLE = 0.95  # times the score after one pass of a refinement: where more passes bring no more, noise limits them
@@ -38,6 +43,7 @@ SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy sca
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
 DOUBTFUL = 0.5  # a score above it says that something is wrong; sound scans of 1000 photons a pixel or more reach 0.36
 PLAIN = 'asd-pocs'
+VOXELS = 'means', 'values', 'finer'
 TICKS = 20  # steps of the progress for a fit
 
 # Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a grid, which gives the
@@ -52,22 +58,27 @@ class Chosen(Reconstruction):
         found = lm.reconstruct(scan, lm.Best())
         print(found.report())
 
-    plan    the settings tried, a `Trial` each, in this order
-    taken   number of the one that was taken
-    error   float32 [x, y, z], density per mm: see `error_map`
+    plan     the settings tried, a `Trial` each, in this order
+    taken    number of the one that was taken
+    error    float32 [x, y, z], density per mm: see `error_map`
+    meaning  of the numbers: 'means' over the voxels' cubes, or 'values' at their centres, see `Best.voxels`
     """
 
     plan: tuple[Trial, ...] = ()
     taken: int = 0
     error: np.ndarray | None = None
+    meaning: str = 'values'
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the scan's own voxels, mm
 
     def report(self) -> str:
         """What was tried, one line each: setting, voxels, passes, and how far the held-out views are off (`Score`)."""
         lines = []
         for i, trial in enumerate(self.plan):
-            size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.grid.spacing)
+            size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.spacing)
             mark = '*' if i == self.taken else ' '
-            lines.append(f'{mark} {trial.name:22} voxels {size} mm, {trial.niter:2} passes: {trial.score:.5f}')
+            how = f'{trial.niter:2} passes' if trial.strength is None else f'strength {trial.strength:g}'
+            given = '' if trial.given is None else f', {trial.given:.5f} as given out'
+            lines.append(f'{mark} {trial.name:22} voxels {size} mm, {how}: {trial.score:.5f}{given}')
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
@@ -76,6 +87,7 @@ class Chosen(Reconstruction):
             volume=values_digest(self.volume),
             score='|A x - b| / |b| of the held-out views, weighted by the root of the frequency, after every pass',
             taken=self.taken,
+            meaning=self.meaning,
             tried=[trial.record for trial in self.plan],
             seconds=self.seconds,
         )
@@ -99,36 +111,59 @@ class Chosen(Reconstruction):
 
 @dataclass(frozen=True)
 class Best(Algorithm):
-    """Refined ASD-POCS whose settings are chosen by measured views that it holds out. It needs no cloud and no truth.
+    """ASD-POCS, its refinements and priors, chosen by measured views that are held out. It needs no cloud and no truth.
 
     1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
        are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
     2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
        over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If passes after the first one
        gain little, noise limits them, and more total variation is tried.
-    3. With `cloud`, a cloud of Gaussians is fitted to the same views, and the best of these steps are tried from its volume.
+    3. With `prior`, `PenalisedLeastSquares` is tried with it, and the same views choose its strength. With `cloud`, a cloud of
+       Gaussians is fitted to them, and the best of these refinements is tried from its volume.
     4. The setting that predicts the views best, with its number of passes, is applied to all views.
 
-    Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks; the result is
-    their mean over each voxel. The scan's own voxels are taken for objects that have no such detail. Streaks lie along the
-    views that were reconstructed from, and other views show little of them: so the scan's own voxels must be better
-    by `MARGIN`.
+    Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks. The scan's own
+    voxels are taken for objects that have no such detail. Streaks lie along the views that were reconstructed from, and other
+    views show little of them: so the scan's own voxels must be better by `MARGIN`.
 
-    niter      passes of a refinement, at most, at least 1
-    finer      parts along each side of a voxel to try, at least 1 (1: the scan's voxels only); memory grows with its cube
-    held_out   one view in so many is held out, at least 2
-    cloud      whether to try the volume of a fitted cloud as a start; it takes two fits, whose worth docs/how_to/best.md shows
-    seed       of the random orders, at least 0
+    Parameters
+    ----------
+    niter : int
+        Passes of a refinement, at most, at least 1.
+    finer : int
+        Parts along each side of a voxel to try, at least 1 (1: the scan's voxels only); memory grows with its cube.
+    held_out : int
+        One view in so many is held out, at least 2.
+    cloud : bool
+        Whether to try the volume of a fitted cloud as a start; it takes two fits.
+    seed : int
+        Of the random orders, at least 0.
+    voxels : {'means', 'values', 'finer'}
+        What a number means where smaller voxels are taken. 'means': the mean over the voxel's cube, for looking, measuring and
+        comparing. 'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`); every
+        setting is then judged by the views that these values predict, ASD-POCS with its full passes among them. 'finer': the
+        smaller voxels themselves. Where the scan's own voxels are taken, numbers are values at the centres.
+    prior : Prior, optional
+        To try beside the rest.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=10, pixels=48).train
-        >>> found = lm.reconstruct(measured, lm.Best(niter=5), progress=False)
-        >>> len(found.plan) >= 3, found.error.shape
-        (True, (24, 24, 24))
+    Raises
+    ------
+    InputError
+        For an option out of its range, and for a scan of fewer than four views.
 
-    Held-out views choose between regularisations as in cross-validation (Golub, Heath and Wahba, Technometrics 21, 1979). Raises
-    InputError for an option out of its range, and for a scan of fewer than four views.
+    References
+    ----------
+    Held-out views choose between regularisations as in cross-validation: Golub, Heath and Wahba, "Generalized cross-validation as
+    a method for choosing a good ridge parameter", Technometrics 21 (1979).
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=10, pixels=48).train
+    >>> found = lm.reconstruct(measured, lm.Best(niter=5), progress=False)
+    >>> len(found.plan) >= 3, found.error.shape
+    (True, (24, 24, 24))
     """
 
     name: ClassVar[str] = 'best'
@@ -141,14 +176,21 @@ class Best(Algorithm):
     held_out: int = 5
     cloud: bool = False
     seed: int = 0
+    voxels: str = 'means'
+    prior: Prior | None = None
 
     def __post_init__(self):
         check_counts(niter=self.niter, finer=self.finer)
         check_counts(least=2, held_out=self.held_out)
         check_counts(least=0, seed=self.seed)
+        if self.voxels not in VOXELS:
+            raise InputError(f'voxels must be one of {", ".join(VOXELS)}, not {shown(self.voxels)}')
+        if self.prior is not None:
+            require_type('prior', self.prior, Prior, 'such as lm.TV()')
 
     def steps(self, scan: Scan) -> int:
-        return 2 * START + 2 * TRIAL + 3 * self.niter + (2 * TICKS + self.niter if self.cloud else 0)
+        more = (2 * TICKS + self.niter if self.cloud else 0) + (TRIED * MOST if self.prior else 0)
+        return 2 * START + 2 * TRIAL + 3 * self.niter + more + (LONG if self.voxels == 'values' else 0)
 
     def grid(self, geometry: Geometry) -> Grid:
         return geometry.grid.finer(self.finer)
@@ -169,56 +211,92 @@ class Best(Algorithm):
         plan = self._plan(kept, held_out, count, fit if self.cloud else None)
         gc.collect()
         dr.flush_malloc_cache()  # two thirds of the memory that the trials took
-        chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
+        chosen = self._judged(plan, kept, held_out, count)
         if chosen.score > DOUBTFUL:
             warnings.warn(
                 f'views that are held out are predicted badly (error {chosen.score:.2g}; 0 is exact, 1 an empty volume): unless '
                 'they are few or very noisy, check geometry, angles and order of the views',
                 stacklevel=3,
             )
-        found = self._apply(scan, plan[0].niter, chosen, count, fit)
+        found = self._apply(scan, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
-        tried = means(chosen.volume, chosen.finer)
-        volume = means(found.volume, chosen.finer)
+        tried, volume = (self._given(v, chosen.finer) for v in (chosen.volume, found.volume))
         if progress is not None:
             progress(self.steps(scan), self.steps(scan), found.residuals[-1])
         for trial in plan:
             trial.volume = None
+        own = scan.geometry.grid
         return Chosen(
             volume,
             found.residuals,
             time.perf_counter() - began,
-            scan.geometry.grid,
+            own.finer(chosen.finer) if self.voxels == 'finer' else own,
             tuple(plan),
             next(i for i, trial in enumerate(plan) if trial is chosen),
             error_map(volume, tried),
+            'means' if self.voxels == 'means' and chosen.finer > 1 else 'values',
+            own.spacing,
         )
 
-    def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
+    def _given(self, volume: np.ndarray, finer: int) -> np.ndarray:
+        """A setting's volume as it is given out."""
+        if finer == 1 or self.voxels == 'finer':
+            return volume
+        return means(volume, finer) if self.voxels == 'means' else values(means(volume, finer))
+
+    def _judged(self, plan: list[Trial], kept: Scan, held_out: Scan, count) -> Trial:
+        """The trial to apply. ASD-POCS itself gets all its passes first, where it may be given out."""
+        chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
+        if self.voxels != 'values' and chosen is not plan[0]:
+            return chosen
+        if len(plan[0].scores) == START:  # it could go on
+            plan[0] = self._plain(kept, held_out, count, LONG)
+        if self.voxels != 'values':
+            return min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
+        score = Score(held_out)
+        for trial in plan:
+            if trial.volume is not None:
+                trial.given = score(uploaded(self._given(trial.volume, trial.finer)))
+        return min((t for t in plan if t.given is not None), key=lambda trial: trial.given)
+
+    def _plain(self, kept: Scan, held_out: Scan, count, niter: int) -> Trial:
         plain = Trial(PLAIN, 1)
-        ASDPOCS(niter=START, seed=self.seed)._run(
+        ASDPOCS(niter=niter, seed=self.seed)._run(
             kept, progress=count, watch=TrialWatch(Score(held_out), plain, slow=True)
         )
-        assert plain.volume is not None  # of its best pass
-        start, plan = plain.volume, [plain]
-        own = self._try(kept, held_out, start, _refined(1), count, by=TRIAL)
+        return plain
+
+    def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
+        plain = self._plain(kept, held_out, count, START)
+        plan = [plain]
+        own = self._try(kept, held_out, plain, _refined(1), count, by=TRIAL)
         plan.append(own)
         if self.finer > 1:
-            plan.append(self._try(kept, held_out, start, _refined(self.finer), count, beat=own.score, by=TRIAL))
+            plan.append(self._try(kept, held_out, plain, _refined(self.finer), count, beat=own.score, by=TRIAL))
         ahead = any(min(trial.scores[:TRIAL]) < AHEAD * own.score for trial in plan[2:])
-        if not ahead and own.niter == TRIAL < self.niter:  # it was cut short
-            plan[1] = self._try(kept, held_out, start, _refined(1), count)
+        if not ahead and own.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
+            plan[0] = self._plain(kept, held_out, count, LONG)
+            plan[1] = self._try(kept, held_out, plan[0], _refined(1), count)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
-            plan.append(self._try(kept, held_out, start, _refined(best.finer, smooth=True), count))
+            from_ = plan[0] if best.finer == 1 else plain
+            smooth = _refined(best.finer, smooth=True)
+            plan.append(self._try(kept, held_out, from_, smooth, count, beat=best.score, by=TRIAL))
             best = _best(plan[1:])
+        if self.prior is not None:
+            strength, volume, scores = self._penalised(None).search(kept, held_out, None, count, TRIED * MOST)
+            plan.append(Trial(f'pls, {type(self.prior).__name__}', 1, scores=scores, volume=volume, strength=strength))
         if fit is not None:
             for trial in plan[1:]:
-                if trial is not best:
+                if trial is not best and trial.strength is None:
                     trial.volume = None  # room for the fit
-            start = self._cloud(kept, best.finer, fit, count)
-            plan.append(self._try(kept, held_out, start, _refined(best.finer, best.smooth, cloud=True), count))
+            cloud = Trial('cloud', best.finer, volume=self._cloud(kept, best.finer, fit, count))
+            plan.append(self._try(kept, held_out, cloud, _refined(best.finer, best.smooth, cloud=True), count))
         return plan
+
+    def _penalised(self, strength: float | None) -> PenalisedLeastSquares:
+        assert self.prior is not None
+        return PenalisedLeastSquares(self.prior, strength)
 
     def _cloud(self, scan: Scan, finer: int, fit: Fit, count) -> np.ndarray:
         """The volume of a cloud that is fitted to a scan."""
@@ -229,19 +307,26 @@ class Best(Algorithm):
 
         return fit(scan, progress)(scan.geometry.grid.finer(finer))
 
-    def _try(self, kept, held_out, start: np.ndarray, trial: Trial, count, beat=None, by=0) -> Trial:
+    def _try(self, kept, held_out, start: Trial, trial: Trial, count, beat=None, by=0) -> Trial:
+        """Refine the volume of another trial."""
+        assert start.volume is not None  # of its best pass
+        trial.before = start.niter if start.name == PLAIN else 0
         score = Score(held_out.on(held_out.geometry.grid.finer(trial.finer)))
         niter = min(by, self.niter) if by and beat is None else self.niter
-        refine(kept, start, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by))
+        refine(
+            kept, start.volume, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by)
+        )
         return trial
 
-    def _apply(self, scan: Scan, start_niter: int, trial: Trial, count, fit: Fit | None) -> Reconstruction:
+    def _apply(self, scan: Scan, trial: Trial, count, fit: Fit | None) -> Reconstruction:
         """The chosen setting on all views, from the start: passes from the trial's volume save time, but lost up to 1.5 dB."""
+        if trial.strength is not None:
+            return self._penalised(trial.strength)._run(scan, start=trial.volume, progress=count)
         if trial.cloud:
             assert fit is not None  # which has made the trial
             start = self._cloud(scan, trial.finer, fit, count)
         else:
-            plain = ASDPOCS(niter=start_niter, seed=self.seed)._run(scan, progress=count)
+            plain = ASDPOCS(niter=trial.before or trial.niter, seed=self.seed)._run(scan, progress=count)
             if trial.name == PLAIN:
                 return plain
             start = plain.volume

@@ -62,8 +62,11 @@ class Trial:
     finer    parts along each side of a voxel
     smooth   whether with more total variation
     cloud    whether from the volume of a cloud
-    scores   `Score` of the held-out views after every pass
+    scores   `Score` of the held-out views after every pass; of a prior, of every strength
     volume   after the pass with the lowest score, on the setting's own voxels
+    given    `Score` of the numbers that would be given out, where these decide, else None
+    strength of a prior, else None
+    before   passes of ASD-POCS that it starts from
     """
 
     name: str
@@ -72,6 +75,9 @@ class Trial:
     cloud: bool = False
     scores: list[float] = field(default_factory=list)
     volume: np.ndarray | None = None
+    given: float | None = None
+    strength: float | None = None
+    before: int = 0
 
     @property
     def niter(self) -> int:
@@ -85,7 +91,16 @@ class Trial:
     @property
     def record(self) -> dict[str, Any]:
         """Everything but the volume, for a file."""
-        return dict(setting=self.name, finer=self.finer, niter=self.niter, score=self.score, scores=self.scores)
+        return dict(
+            setting=self.name,
+            finer=self.finer,
+            niter=self.niter,
+            score=self.score,
+            scores=self.scores,
+            given=self.given,
+            strength=self.strength,
+            before=self.before,
+        )
 
 
 def power(rows: np.ndarray) -> np.ndarray:

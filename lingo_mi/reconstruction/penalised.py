@@ -22,14 +22,16 @@ from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstructio
 from lingo_mi.reconstruction.held_out import Score, split_views
 from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_range
 from lingo_mi.reconstruction.priors import TV, Prior
-from lingo_mi.reconstruction.refined import means
+from lingo_mi.reconstruction.sart import SART
 from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
+from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Scan
 
 ACCURACY, SAFE = 1e-2, 1.02  # of the norm of A, and the factor on its square that makes up for what it lacks
 PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5  # strengths to choose from
 FIRST, MOST = 3, 5  # which of them is tried first; how many at most
 TRIED = 30  # iterations for each of them; each goes on from the volume of its neighbour
+NEAR = 5  # passes of SART before
 SLACK = 1.015  # times the least score: as good as the best
 WEIGHTS = 'known', 'photons', 'equal'
 
@@ -121,7 +123,9 @@ class PenalisedLeastSquares(Algorithm):
         scan, done = scan.on(own.finer(self.finer)), 0
         strength = self.strength
         if strength is None:
-            strength, start, done = self._chosen(scan, start, progress)
+            kept, held_out = split_views(scan, self.held_out)
+            strength, start, scores = self.search(kept, held_out, start, progress, self.steps(scan))
+            done = TRIED * len(scores)
         solver = self._solver(scan)
         x = solver.system.start(start)
         residuals = [solver.system.residual(x)[1]]
@@ -142,30 +146,39 @@ class PenalisedLeastSquares(Algorithm):
             System(scan), self.prior, math.inf if self.upper is None else self.upper, self.weights == 'photons'
         )
 
-    def _chosen(self, scan: Scan, start: ArrayLike | None, progress: Progress | None) -> tuple[float, np.ndarray, int]:
-        """The strongest prior that predicts held-out views nearly as well as the best, the last volume, and the steps done.
+    def search(
+        self, kept: Scan, held_out: Scan, start: ArrayLike | None, progress: Progress | None, steps: int
+    ) -> tuple[float, np.ndarray, list[float]]:
+        """The strongest prior that predicts held-out views nearly as well as the best, the volume of the best, and all scores.
 
         The search goes from the middle of the path towards stronger priors while these predict as well, else towards weaker ones
         while these predict better. Among those that predict alike the strongest is taken, as in the rule of one standard error
         (Breiman et al., "Classification and Regression Trees", 1984).
+
+        steps   for `progress`
         """
-        kept, held_out = split_views(scan, self.held_out)
+        if start is None:  # so that the first strength is as near to its minimum as those that go on from there
+            start = SART(niter=NEAR)._run(kept).volume
         score, solver = Score(held_out), self._solver(kept)
         scores: dict[int, float] = {}
-        done = 0
+        best, done = solver.system.start(start), 0
 
         def after_step(_: int) -> None:
             nonlocal done
             done += 1
             if progress is not None:
-                progress(done, self.steps(scan), solver.residual)
+                progress(done, steps, solver.residual)
 
         def tried(i: int, x: mi.Float) -> mi.Float:
+            nonlocal best
             x = solver.minimise(x, PATH[i], TRIED, after_step)
-            scores[i] = score(x)
+            found = score(x)
+            if found < min(scores.values(), default=math.inf):
+                best = x
+            scores[i] = found
             return x
 
-        x = tried(FIRST, solver.system.start(start))
+        x = tried(FIRST, best)
         stronger, i, way = tried(FIRST - 1, x), FIRST, 1
         if scores[FIRST - 1] <= SLACK * scores[FIRST]:
             x, i, way = stronger, FIRST - 1, -1
@@ -175,7 +188,7 @@ class PenalisedLeastSquares(Algorithm):
             if scores[i] > (SLACK if way < 0 else 1) * least:
                 break
         chosen = min(i for i, found in scores.items() if found <= SLACK * min(scores.values()))
-        return PATH[chosen], solver.system.volume(x), done
+        return PATH[chosen], solver.system.volume(best), list(scores.values())
 
 
 class Solver:

@@ -18,6 +18,7 @@ from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.parameters import check_counts
 from lingo_mi.reconstruction.sart import passes, sweep
 from lingo_mi.reconstruction.system import System, on_voxels
+from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan
 
@@ -182,8 +183,3 @@ def structure(volume: np.ndarray) -> np.ndarray:
     ndimage.gaussian_filter(square, SPREAD, output=square)
     mean = square.mean(dtype=np.float64)
     return np.sqrt(np.maximum(square, FLOOR**2 * mean, out=square)) if mean > 0 else np.ones_like(volume)
-
-
-def means(volume: np.ndarray, finer: int) -> np.ndarray:
-    """The means over `finer` voxels along each side."""
-    return volume.reshape([n for count in volume.shape for n in (count // finer, finer)]).mean((1, 3, 5))

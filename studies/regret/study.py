@@ -29,8 +29,8 @@ from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
 from lingo_mi.reconstruction.best import SPREAD, START, Chosen, refine
-from lingo_mi.reconstruction.refined import means
 from lingo_mi.reconstruction.run import run_algorithm
+from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path

@@ -5,7 +5,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 import lingo_mi as lm
 from helpers.grids import scan as small
@@ -20,6 +20,7 @@ from lingo_mi.reconstruction.best import Trial, _best, error_map
 from lingo_mi.reconstruction.held_out import Score, TrialWatch, split_views
 from lingo_mi.reconstruction.run import check_room, run_algorithm
 from lingo_mi.reconstruction.system import System
+from lingo_mi.reconstruction.voxel_values import cube_means, means, values
 from lingo_mi.scan import Scan
 
 
@@ -182,6 +183,63 @@ def test_the_map_of_errors():
     found = error_map(volume, other)
     assert found.dtype == np.float32 and found.argmax() == np.ravel_multi_index((4, 4, 4), found.shape)
     assert abs((found**2).sum() - 1) < 1e-3 and not error_map(volume, volume).any()
+
+
+@pytest.fixture(scope='module')
+def finer_scan():
+    """A foot of finer detail than its voxels, views between those that are reconstructed from, and the truth."""
+    scan, truth = scanned(2)
+    return scan.subset(np.arange(0, 20, 2)), scan.subset(np.arange(1, 20, 2)), truth
+
+
+def test_values_predict_views_and_means_the_truth(finer_scan):
+    """The numbers cannot be good at both: see docs/how_to/best.md."""
+    scan, rest, truth = finer_scan
+    found = {kind: run_algorithm(scan, Best(niter=4, voxels=kind)) for kind in ('means', 'values', 'finer')}
+    pocs = run_algorithm(scan, ASDPOCS(niter=50)).volume
+
+    def missed(volume, grid):
+        return np.sqrt(np.mean((project_volume(volume, rest.geometry.on(grid)) - rest.projections) ** 2))
+
+    wrong = {kind: missed(one.volume, one.grid) for kind, one in found.items()}
+    assert found['means'].meaning == 'means' and found['values'].meaning == 'values'
+    assert found['finer'].grid == scan.geometry.grid.finer(2) and found['finer'].error.shape == (48, 48, 48)
+    assert wrong['finer'] < wrong['values'] < min(wrong['means'], missed(pocs, scan.geometry.grid))
+    assert psnr_3d(found['means'].volume, truth) > psnr_3d(found['values'].volume, truth)
+    assert all(trial.given is not None for trial in found['values'].plan)
+    np.testing.assert_allclose(means(found['finer'].volume, 2), found['means'].volume, rtol=1e-5, atol=1e-7)
+
+
+def test_means_over_the_cubes_of_an_interpolation():
+    """By trilinear interpolation at many points, far from the border; `values` undoes most of it."""
+    volume = gaussian_filter(np.random.default_rng(0).normal(size=(9, 9, 9)), 1.0)
+    points = (np.arange(20) + 0.5) / 20 - 0.5
+    around = np.stack(np.meshgrid(*[4 + points] * 3, indexing='ij'))
+    expected = map_coordinates(volume, around.reshape(3, -1), order=1).mean()
+    assert cube_means(volume)[4, 4, 4] == pytest.approx(expected, rel=1e-3)
+    mean = cube_means(volume)
+    left = np.linalg.norm((values(mean) - volume)[2:-2, 2:-2, 2:-2])
+    assert left < 0.25 * np.linalg.norm((mean - volume)[2:-2, 2:-2, 2:-2])
+
+
+def test_a_prior_is_a_candidate():
+    scan, _ = scanned(1, 300.0)
+    found = run_algorithm(scan, Best(niter=2, finer=1, prior=lm.TV()))
+    trial = found.plan[-1]
+    assert trial.name == 'pls, TV' and 0 < trial.strength <= 1e-2 and 'strength' in found.report()
+    assert found.taken == len(found.plan) - 1  # noise, and an object of uniform parts
+
+
+@pytest.mark.parametrize(
+    'make, message',
+    [
+        (lambda: Best(voxels='half'), "voxels must be one of means, values, finer, not 'half'"),
+        (lambda: Best(prior='tv'), 'prior must be a Prior'),
+    ],
+)
+def test_bad_options(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
 
 
 @pytest.mark.parametrize('sizes, what', [(dict(nVoxel=1700), 'voxels'), (dict(nDetector=2048), 'pixels in all views')])
