@@ -257,7 +257,7 @@ class Best(Algorithm):
         for trial in plan:
             if trial.volume is not None:
                 trial.given = score(uploaded(self._given(trial.volume, trial.finer)))
-        return min((t for t in plan if t.given is not None), key=lambda trial: trial.given)
+        return min(plan, key=lambda trial: np.inf if trial.given is None else trial.given)
 
     def _plain(self, kept: Scan, held_out: Scan, count, niter: int) -> Trial:
         plain = Trial(PLAIN, 1)
@@ -284,7 +284,7 @@ class Best(Algorithm):
             plan.append(self._try(kept, held_out, from_, smooth, count, beat=best.score, by=TRIAL))
             best = _best(plan[1:])
         if self.prior is not None:
-            strength, volume, scores = self._penalised(None).search(kept, held_out, None, count, TRIED * MOST)
+            strength, volume, scores, _ = self._penalised(None).search(kept, held_out, None, count, TRIED * MOST)
             plan.append(Trial(f'pls, {type(self.prior).__name__}', 1, scores=scores, volume=volume, strength=strength))
         if fit is not None:
             for trial in plan[1:]:

@@ -22,16 +22,14 @@ from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstructio
 from lingo_mi.reconstruction.held_out import Score, split_views
 from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_range
 from lingo_mi.reconstruction.priors import TV, Prior
-from lingo_mi.reconstruction.sart import SART
 from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
 from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Scan
 
 ACCURACY, SAFE = 1e-2, 1.02  # of the norm of A, and the factor on its square that makes up for what it lacks
-PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5  # strengths to choose from
-FIRST, MOST = 3, 5  # which of them is tried first; how many at most
-TRIED = 30  # iterations for each of them; each goes on from the volume of its neighbour
-NEAR = 5  # passes of SART before
+PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5  # strengths to choose from
+FIRST, MOST = 2, 5  # which of them is tried first; how many trials at most
+TRIED = 30  # iterations for each of them; each goes on from the volume of the one before
 SLACK = 1.015  # times the least score: as good as the best
 WEIGHTS = 'known', 'photons', 'equal'
 
@@ -124,8 +122,7 @@ class PenalisedLeastSquares(Algorithm):
         strength = self.strength
         if strength is None:
             kept, held_out = split_views(scan, self.held_out)
-            strength, start, scores = self.search(kept, held_out, start, progress, self.steps(scan))
-            done = TRIED * len(scores)
+            strength, start, _, done = self.search(kept, held_out, start, progress, self.steps(scan))
         solver = self._solver(scan)
         x = solver.system.start(start)
         residuals = [solver.system.residual(x)[1]]
@@ -148,17 +145,16 @@ class PenalisedLeastSquares(Algorithm):
 
     def search(
         self, kept: Scan, held_out: Scan, start: ArrayLike | None, progress: Progress | None, steps: int
-    ) -> tuple[float, np.ndarray, list[float]]:
-        """The strongest prior that predicts held-out views nearly as well as the best, the volume of the best, and all scores.
+    ) -> tuple[float, np.ndarray, list[float], int]:
+        """The strongest prior that predicts held-out views nearly as well as the best, the volume of the best, all scores, and
+        the steps done.
 
-        The search goes from the middle of the path towards stronger priors while these predict as well, else towards weaker ones
-        while these predict better. Among those that predict alike the strongest is taken, as in the rule of one standard error
-        (Breiman et al., "Classification and Regression Trees", 1984).
+        The search goes towards weaker priors while these predict clearly better, then back towards stronger ones while these
+        predict as well: by then the volume is near its minimum, and scores can be compared. Among those that predict alike the
+        strongest is taken, as in the rule of one standard error (Breiman et al., "Classification and Regression Trees", 1984).
 
         steps   for `progress`
         """
-        if start is None:  # so that the first strength is as near to its minimum as those that go on from there
-            start = SART(niter=NEAR)._run(kept).volume
         score, solver = Score(held_out), self._solver(kept)
         scores: dict[int, float] = {}
         best, done = solver.system.start(start), 0
@@ -178,17 +174,18 @@ class PenalisedLeastSquares(Algorithm):
             scores[i] = found
             return x
 
-        x = tried(FIRST, best)
-        stronger, i, way = tried(FIRST - 1, x), FIRST, 1
-        if scores[FIRST - 1] <= SLACK * scores[FIRST]:
-            x, i, way = stronger, FIRST - 1, -1
-        while 0 <= i + way < len(PATH):
-            i, least = i + way, min(scores.values())
-            x = tried(i, x)
-            if scores[i] > (SLACK if way < 0 else 1) * least:
+        x, i, trials = tried(FIRST, best), FIRST, 1
+        while trials < MOST - 1 and i + 1 < len(PATH):
+            weaker, trials = tried(i + 1, x), trials + 1
+            if scores[i + 1] * SLACK > scores[i]:
+                break
+            x, i = weaker, i + 1
+        while trials < MOST and i > 0:
+            x, i, trials = tried(i - 1, x), i - 1, trials + 1
+            if scores[i] > SLACK * min(scores.values()):
                 break
         chosen = min(i for i, found in scores.items() if found <= SLACK * min(scores.values()))
-        return PATH[chosen], solver.system.volume(best), list(scores.values())
+        return PATH[chosen], solver.system.volume(best), list(scores.values()), done
 
 
 class Solver:

@@ -62,10 +62,12 @@ class TGV(Prior):
     def prox(self, x, strength, size, upper=inf):
         if strength <= 0:
             return super().prox(x, strength, size, upper)
-        if self._kept is None or dr.width(self._kept[0][0]) != dr.width(x):
-            self._kept = tuple([dr.zeros(mi.Float, dr.width(x)) for _ in range(n)] for n in (3, 3, 6))  # type: ignore[assignment]
+        kept = self._kept
+        if kept is None or dr.width(kept[0][0]) != dr.width(x):
+            kept = [dr.zeros(mi.Float, dr.width(x)) for _ in range(12)]
+            kept = kept[:3], kept[3:6], kept[6:]
         first, second = (dr.opaque(mi.Float, w) for w in (strength, strength * self.second))
-        v, p, q = self._kept
+        v, p, q = kept
         z = x_bar = clipped(x - transposed(p, size), upper)
         v_bar = v
         dr.eval(z)

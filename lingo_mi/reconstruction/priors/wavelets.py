@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -77,7 +78,7 @@ class Wavelets(Prior):
         return z
 
 
-def _pywt():
+def _pywt() -> Any:
     try:
         import pywt  # imported here, since it may be missing
     except ImportError as error:
