@@ -28,7 +28,7 @@ from lingo_mi.fitting.methods.fast import Fast
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.reconstruction import ASDPOCS, FDK, Best, Refined
-from lingo_mi.reconstruction.best import SPREAD, START, Chosen, refine
+from lingo_mi.reconstruction.best import LONG, SPREAD, Chosen, refine
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Dataset, Scan
@@ -122,7 +122,7 @@ class Study:
             return run_algorithm(scan, ASDPOCS()).volume
         if setting in VOXELS:
             finer = 2 if setting == 'refined_finer' else 1
-            start = run_algorithm(scan, ASDPOCS(niter=START)).volume
+            start = run_algorithm(scan, ASDPOCS(niter=LONG)).volume
             return means(refine(scan, start, Best.niter, finer).volume, finer)
         cloud = self._cloud(case)[0]
         if setting == 'cloud':
