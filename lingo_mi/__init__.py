@@ -69,18 +69,20 @@ if TYPE_CHECKING:  # editors read these in the place of the table below
         OSSART,
         SART,
         SIRT,
+        Best,
+        PenalisedLeastSquares,
+        Reconstruction,
+        Refined,
+    )
+    from lingo_mi.reconstruction.priors import (
         TGV,
         TV,
-        Best,
         Denoiser,
         DirectionalTV,
         Huber,
         NonLocalMeans,
-        PenalisedLeastSquares,
         Prior,
         PriorSum,
-        Reconstruction,
-        Refined,
         Wavelets,
     )
     from lingo_mi.scan import Dataset, Scan

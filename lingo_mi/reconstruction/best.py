@@ -281,7 +281,7 @@ class Best(Algorithm):
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
             smooth = _refined(best.finer, smooth=True)
-            plan.append(self._try(kept, held_out, from_, smooth, count, beat=best.score, by=TRIAL))
+            plan.append(self._try(kept, held_out, from_, smooth, count))
             best = _best(plan[1:])
         if self.prior is not None:
             strength, volume, scores, _ = self._penalised(None).search(kept, held_out, None, count, TRIED * MOST)
