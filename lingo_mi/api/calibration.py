@@ -12,10 +12,16 @@ from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.inspection.air import air_of, steady
+from lingo_mi.inspection.measure import INTENSITIES, looks_like_intensities
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Dataset, Scan
 
 MOST_DEGREE, MOST_CURVE = 8, 3
+NO_AIR = (
+    'no edge of the panel shows air in all views, so a drift of the beam may have been taken for geometry: compare with what '
+    '--air (air=True) finds'
+)
 
 
 @one_at_a_time()
@@ -34,7 +40,7 @@ def calibrate(
 
     scan       at least 8 views, in the order in which they were taken; of a `Dataset` its `train`
     drift      degree of a polynomial in time for the shifts along u and v; 0: the panel does not drift
-    air        whether to seek an air level, a cubic polynomial in time
+    air        whether to seek an air level, a cubic polynomial in time, instead of reading it beside the object
     gain       whether to seek a gain of the views, likewise, about 1
     curve      coefficients, 0 to 3, of the curve from line integral to measured value, as of beam hardening
     scatter    whether to seek scattered light, the same smooth image in all views
@@ -42,7 +48,8 @@ def calibrate(
 
     Views are predicted from quick reconstructions of other views, on few voxels, and are to agree with them (see
     `lingo_mi.calibration.search`). Takes some 30 such reconstructions, and 6 for each further number. A constant shift along v
-    can hardly be told from an object that lies higher, and is not sought.
+    can hardly be told from an object that lies higher, and is not sought. A beam that drifts looks like a panel that moves: where
+    an edge of the panel shows air in all views, its level is taken out of each view first.
 
     Returns a `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less
     than three standard errors from zero is left as it was, as is scattered light that would be negative in places. Warns where
@@ -63,7 +70,12 @@ def calibrate(
     for name, value in dict(air=air, gain=gain, scatter=scatter).items():
         require_type(name, value, bool)
     train = scan.train if isinstance(scan, Dataset) else scan
-    measured = line_integrals(train)
+    if looks_like_intensities(train):
+        warnings.warn(INTENSITIES, stacklevel=2)
+    measured, level, notes = line_integrals(train), None, ()
+    if not air:
+        notes = (NO_AIR,) if air_of(measured) is None else ()
+        measured, level = steady(measured)
     with Progress('Calibrate', 1, shown=progress) as bar:
 
         def report(done, total):
@@ -78,7 +90,7 @@ def calibrate(
             scatter='one' if scatter else 'off',
             highest=max(float(measured.projections.max()), 1e-6),
         )
-        calibration = Calibration(train.geometry, search(measured, drift, response, report))
-    for fault in order_faults(calibration.corrected(measured)):
+        calibration = Calibration(train.geometry, search(measured, drift, response, report), level, notes)
+    for fault in order_faults(calibration.corrected(train)):
         warnings.warn(fault, stacklevel=2)
     return calibration

@@ -11,6 +11,7 @@ from lingo_mi.calibration.response.response import Response
 from lingo_mi.calibration.search import Found
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.inspection.air import Air, steady
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Dataset, Scan
 
@@ -28,16 +29,21 @@ class Calibration:
 
     geometry    of the scan that was given
     found       numbers, their standard errors, and how well views predict each other before and after
+    air         the air level that was read beside the object and taken out first; None if none was
+    notes       sentences on what the scan does not tell
     """
 
     geometry: Geometry
     found: Found
+    air: Air | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def needed(self) -> bool:
         """Whether anything was found that is taken."""
         drift = self.found.drift
-        return any(drift.u) or any(drift.v) or bool(drift.yaw) or self._response is not None
+        moved = any(drift.u) or any(drift.v) or bool(drift.yaw)
+        return moved or self._response is not None or self.air is not None
 
     @property
     def _response(self) -> Response | None:
@@ -53,7 +59,8 @@ class Calibration:
 
     def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
         """The same views with the panel where it was found. Views that were held out get what was found for their time, which
-        their angles tell: the scan's views must be in the order in which they were taken.
+        their angles tell: the scan's views must be in the order in which they were taken. An air level that was read beside the
+        object is read there again, in each view for itself.
 
         Raises InputError for a scan by another scanner.
         """
@@ -69,6 +76,8 @@ class Calibration:
         if not self.needed:
             return scan
         response = self._response
+        if self.air is not None:
+            scan, _ = steady(line_integrals(scan))
         if response is not None:
             scan = line_integrals(scan)  # which the response was fitted to
             scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
@@ -78,6 +87,11 @@ class Calibration:
         """What was found, in sentences."""
         f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
         lines = []
+        if self.air is not None:
+            lines.append(
+                f'air beside the object: {self.air.levels[:, 0].mean():+.3g} on average, and drifts by {self.air.drift:.2g} rms; '
+                'taken out of every view'
+            )
         for name, value in f.measured.items():
             error, why = f.errors[name], f.refused.get(name)
             if name == 'yaw':
@@ -92,4 +106,4 @@ class Calibration:
         lines.append(
             f'views predict each other to {f.after:.4g} rms instead of {f.before:.4g} (line integrals, smoothed)'
         )
-        return lines
+        return [*lines, *self.notes]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -16,6 +16,7 @@ from lingo_mi.scan import Scan
 PASSES = 4  # over the views: fewer leave edges and peaks too low, which a curve of the detector would seem to explain
 RELAXATION = 1.0
 SMOOTH = 0.8  # pixels, standard deviation: leaves nothing that a shift by part of a pixel would smooth further
+BEYOND = 4  # pixels of a row or a column that smoothing adds to either end
 EDGE = 0.15  # of the highest value: an object there goes on beyond the panel
 WIDER, MARGIN = 1.5, 1.15  # how much larger the volume then is, and otherwise: a panel that moves, moves the object
 
@@ -53,31 +54,50 @@ def _binned(scan: Scan, factor: int) -> Scan:
 
 
 def _smoothed(scan):
-    """The projections, each pixel a weighted mean of valid ones."""
+    """The projections, each pixel a weighted mean of valid ones.
+
+    A slope goes on beyond the panel's edge: where the object reaches over it, anything else would be taken for a shift.
+    """
     valid = np.ones(scan.projections.shape, np.float32) if scan.valid is None else scan.valid.astype(np.float32)
     by = [0.0, *(SMOOTH if n > 2 else 0.0 for n in scan.geometry.nDetector)]
-    values, weights = (ndimage.gaussian_filter(x, by, mode='nearest') for x in (scan.projections * valid, valid))
+    beyond = [(0, 0), *((min(BEYOND, n - 1) if n > 2 else 0,) * 2 for n in scan.geometry.nDetector)]
+    inside = tuple(slice(k, k + n) for (k, _), n in zip(beyond, scan.projections.shape))
+    known = np.pad(valid, beyond, 'reflect')
+    wider = np.pad(scan.projections, beyond, 'reflect', reflect_type='odd') * known
+    values, weights = (ndimage.gaussian_filter(x, by, mode='nearest')[inside] for x in (wider, known))
     return values / np.maximum(weights, 1e-3)
 
 
-def folds_of(geometry: Geometry) -> list[np.ndarray]:
-    """View numbers in turns around the circle: two groups of many views, three of few."""
-    order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind='stable')
-    groups = 2 if len(geometry) >= 48 else 3
-    return [np.sort(order[k::groups]) for k in range(groups)]
+@dataclass(frozen=True)
+class Fold:
+    """Views that are predicted from all others, and the blocks in which a reconstruction takes those. View numbers."""
+
+    predicted: np.ndarray
+    blocks: list[np.ndarray]
 
 
-def cross_predicted(scan: Scan, folds: Sequence[np.ndarray]) -> np.ndarray:
-    """Line integrals [view, v, u] of every view, from a reconstruction of the views outside its fold."""
-    system, n = System(scan), len(scan)
-    out = np.empty((n, *scan.geometry.nDetector[::-1]), np.float32)
-    for fold in folds:
+def folds_of(geometry: Geometry) -> list[Fold]:
+    """Views in turns around the circle: two groups of many views, three of few."""
+    angles, n = geometry.angles, len(geometry)
+    order = np.argsort(np.mod(angles, 2 * np.pi), kind='stable')
+    groups = 2 if n >= 48 else 3
+    folds = []
+    for k in range(groups):
+        fold = np.sort(order[k::groups])
         others = np.setdiff1d(np.arange(n), fold)
-        turns = blocks(
-            scan.geometry.angles[others], max(1, len(others) // 20), 'angularDistance', np.random.default_rng(0)
-        )
+        turns = blocks(angles[others], max(1, len(others) // 20), 'angularDistance', np.random.default_rng(0))
+        folds.append(Fold(fold, [others[turn] for turn in turns]))
+    return folds
+
+
+def cross_predicted(scan: Scan, folds: Sequence[Fold]) -> np.ndarray:
+    """Line integrals [view, v, u] of every view, from a reconstruction of the views outside its fold."""
+    system = System(scan)
+    out = np.empty((len(scan), *scan.geometry.nDetector[::-1]), np.float32)
+    for fold in folds:
         x = system.start(None)
         for _ in range(PASSES):
-            x = sweep(system, x, RELAXATION, [others[turn] for turn in turns], True)
-        out[fold] = system.A.forward(x, fold)[0].numpy().reshape(len(fold), *out.shape[1:])
+            x = sweep(system, x, RELAXATION, fold.blocks, True)
+        views = fold.predicted
+        out[views] = system.A.forward(x, views)[0].numpy().reshape(len(views), *out.shape[1:])
     return out.transpose(0, 2, 1)

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from lingo_mi.geometry import CircularGeometry, Geometry
-from lingo_mi.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -43,25 +41,3 @@ class Panel:
         u, v = step_u * (c * along - s * down), step_v * (s * along + c * down)
         turned = replace(rays, corner=centre - nu / 2 * u - nv / 2 * v, u=u, v=v)
         return Geometry.from_poses(turned, geometry.nDetector, grid=geometry.grid)
-
-    def resampled(self, scan: Scan) -> Scan:
-        """What the panel of the scan's geometry would have seen, had it been where that says: by cubic splines.
-
-        Pixels beyond the real panel's edge are not valid. The projections should hold no detail of single pixels, which
-        interpolation would smooth.
-        """
-        geometry = scan.geometry
-        (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
-        y, x = np.meshgrid((np.arange(nv) - (nv - 1) / 2) * dv, (np.arange(nu) - (nu - 1) / 2) * du, indexing='ij')
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        p, valid = np.empty_like(scan.projections), np.empty(scan.projections.shape, bool)
-        for i, (v, u) in enumerate(zip(*(np.broadcast_to(k, len(scan)) for k in (self.v, self.u)))):
-            # Where the named pixels are on the real panel, in its steps; y points down, against v.
-            down, across = y + v, x - u
-            rows, columns = (s * across + c * down) / dv + (nv - 1) / 2, (c * across - s * down) / du + (nu - 1) / 2
-            place = np.stack([rows, columns])
-            p[i] = ndimage.map_coordinates(scan.projections[i], place, order=3, mode='nearest')
-            valid[i] = (rows > -0.5) & (rows < nv - 0.5) & (columns > -0.5) & (columns < nu - 0.5)
-            if scan.valid is not None:
-                valid[i] &= ndimage.map_coordinates(scan.valid[i].astype(float), place, order=1, mode='nearest') > 0.99
-        return replace(scan, projections=p, valid=valid)

@@ -3,12 +3,18 @@
 Every view is predicted from a quick reconstruction of other views (`cross_prediction`). With r the differences to what was
 measured, as a function of the numbers sought, and D the derivatives of r by differences (of the whole chain, each with two
 reconstructions of its own), a step is that of Gauss and Newton, -(D D^T)^-1 D r. The shift along u is first looked for on
-a grid of trials. Views are independent, so the standard errors are those of clustered observations,
+a grid of trials, a wide one where no minimum is clear.
 
-    (D D^T)^-1  (sum over views of g g^T)  (D D^T)^-1,   g = D r of a view
+The panel moves, and the images stay as they were measured. So all pixels count in all trials: if images were moved instead, those
+of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would be that of the fewest.
 
-(Liang and Zeger, Biometrika 73, 1986). A constant shift along v is not sought: the image moves by it almost as if the object had
-moved along the axis.
+Standard errors are those of clustered observations,
+
+    K / (K - 1)  (D D^T)^-1  (sum over K clusters of g g^T)  (D D^T)^-1,   g = D r of a cluster
+
+(Liang and Zeger, Biometrika 73, 1986). Clusters are single views, which noise makes differ; the halves that predict each other;
+and spans of the scan's time, which differ where the scanner changes. The largest counts. A constant shift along v is not sought:
+the image moves by it almost as if the object had moved along the axis.
 """
 
 from __future__ import annotations
@@ -28,9 +34,14 @@ from lingo_mi.scan import Scan
 
 FIRST, FINE = 32, (32, 48)  # columns of the binned panel: for trials, and for one step each
 MOST_VIEWS = 60
-REACH = 0.06  # of the panel's width: how far off an axis is looked for
+REACH, FARTHEST = 0.06, 0.5  # of the panel's width: how far off an axis is looked for at first, and at most
+TRIAL = 0.6 / FIRST  # of the panel's width: between trials
+CLEAR = 0.5  # of the largest sum of squares among the trials: a smallest one above it is no minimum
 SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
 LONGEST = 4.0  # steps for differences that a number may change by at a time
+AGAIN = 3  # steps more, at most, with the derivatives of the last: until they are within the standard errors
+SPANS = 6  # of the scan's time, for standard errors
+FLOOR = 0.02  # of a step for differences: no standard error is smaller, since voxels are no object
 
 
 @dataclass(frozen=True)
@@ -67,23 +78,19 @@ class _Level:
 
     def differences(self, numbers: dict[str, float]) -> np.ndarray:
         """Measured less predicted, [view, v, u], zero where it does not count."""
-        scan = self.scan
         places = {name: value for name, value in numbers.items() if name[0] in 'uvy'}
-        moved = Drift.of(scan.geometry, places).panel(scan.geometry).resampled(scan)
-        inside = np.ones(moved.projections.shape, bool) if moved.valid is None else moved.valid
-        if scan.valid is None:  # the panel's edge is no fault of a pixel, and plain scans are reconstructed faster
-            moved = replace(moved, valid=None)
-        measured = moved.projections
+        given = self.scan.geometry
+        scan = replace(self.scan, geometry=Drift.of(given, places).panel(given).moved(given))
+        measured = scan.projections
         if self.response is None:
-            expected = cross_predicted(moved, self.folds)
+            expected = cross_predicted(scan, self.folds)
         else:
             response = self.response.changed(numbers)
-            line_integrals = response.undone(measured, moved.geometry)
-            expected = cross_predicted(replace(moved, projections=line_integrals), self.folds)
-            expected = response.applied(expected, moved.geometry)
-        r = np.where(inside, measured - expected, 0)
+            expected = cross_predicted(replace(scan, projections=response.undone(measured, given)), self.folds)
+            expected = response.applied(expected, given)
         self.count()
-        return r.astype(float)
+        r = (measured - expected).astype(float)
+        return r if scan.valid is None else np.where(scan.valid, r, 0)
 
     def derivatives(self, here: dict[str, float]) -> np.ndarray:
         """Of the differences, by central differences, of half a pixel for what moves: [number, view, v, u]."""
@@ -125,8 +132,7 @@ def search(
         scan = scan.subset(np.unique(np.round(np.linspace(0, len(scan) - 1, MOST_VIEWS)).astype(int)))
     names = [*_determined(scan, degree), *(response.names() if response else ())]
     zero = dict.fromkeys(names, 0.0)
-    trials = np.arange(-REACH, REACH + 1e-9, 0.6 / FIRST) * scan.geometry.sDetector[1]
-    total, done = len(trials) + len(FINE) * (2 + 2 * len(names)) + 2, 0
+    total, done = round(2 * REACH / TRIAL) + 1 + len(FINE) * (2 + 2 * len(names)) + 3, 0
 
     def count():
         nonlocal done
@@ -135,17 +141,28 @@ def search(
             progress(min(done, total), total)
 
     first = _Level(scan, FIRST, names, response, count)
-    costs = [np.square(first.differences(zero | {'u': float(u)})).sum() for u in trials]
-    here = zero | {'u': float(trials[int(np.argmin(costs))])}
+    start, between = _axis(first, zero)
+    here = zero | {'u': start}
     for pixels in FINE:
         level = _Level(scan, pixels, names, response, count)
         r = level.differences(here)
         D = level.derivatives(here)
         here, r = level.stepped(here, r, D)
-    errors = dict(zip(names, map(float, _standard_errors(r, D))))
+    for _ in range(AGAIN):
+        errors, left = _standard_errors(r, D, level), _step(r, D)
+        if (np.abs(left) <= errors).all():
+            break
+        before, (here, r) = here, level.stepped(here, r, D)
+        if here is before:
+            break
+    errors = dict(zip(names, map(float, np.maximum(_standard_errors(r, D, level), np.abs(_step(r, D))))))
     given = level.differences(zero)
     small = [name for name in names if not abs(here[name]) > SURE * errors[name]]
     refused = dict.fromkeys(small, 'it is less than three standard errors')
+    if not between:
+        refused |= dict.fromkeys(
+            names, 'the axis lies beyond where it was looked for: check offDetector and the angles'
+        )
     chosen, best = here, r
     while True:
         sure = [name for name in names if name not in refused]
@@ -185,10 +202,37 @@ def _step(r, D):
     return -np.linalg.pinv(flat @ flat.T, rcond=SINGULAR, hermitian=True) @ (flat @ r.ravel())
 
 
-def _standard_errors(r, D):
-    flat = D.reshape(len(D), -1)
+def _standard_errors(r, D, level):
+    """The largest of those by single views, by folds and by spans of time; not below `FLOOR`."""
+    flat, n = D.reshape(len(D), -1), r.shape[0]
     matrix = flat @ flat.T
     inverse = np.linalg.pinv(matrix, rcond=SINGULAR, hermitian=True)
     g = np.einsum('knvu,nvu->nk', D, r)
-    errors = np.sqrt(np.diag(inverse @ (g.T @ g) @ inverse))
+    spans = [np.arange(n)[part] for part in np.array_split(np.arange(n), SPANS)]
+    errors = np.array([FLOOR * level.steps[name] for name in level.names])
+    for clusters in (np.arange(n)[:, None], [fold.predicted for fold in level.folds], spans):
+        sums = np.array([g[views].sum(0) for views in clusters])
+        K = len(sums)
+        variances = np.diag(inverse @ (sums.T @ sums) @ inverse) * K / (K - 1)
+        errors = np.maximum(errors, np.sqrt(variances))
     return np.where(np.diag(matrix @ inverse) > 0.5, errors, np.inf)  # a number without effect is not known
+
+
+def _axis(level, zero):
+    """The shift along u with the smallest differences, mm, and whether trials on both sides of it have larger ones."""
+    width, costs = level.scan.geometry.sDetector[1], {}
+
+    def cost(k):
+        if k not in costs:
+            try:
+                r = level.differences(zero | {'u': k * TRIAL * width})
+            except InputError:  # no ray meets the volume, so nothing is predicted
+                r = level.scan.projections
+            costs[k] = np.square(r, dtype=float).sum()
+        return costs[k]
+
+    reach, farthest = round(REACH / TRIAL), round(FARTHEST / TRIAL)
+    best = min(range(-reach, reach + 1), key=cost)
+    if abs(best) == reach or costs[best] > CLEAR * max(costs.values()):
+        best = min(range(-farthest, farthest + 1), key=cost)
+    return best * TRIAL * width, abs(best) < farthest

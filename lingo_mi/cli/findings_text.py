@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.inspection.measure import Findings
+from lingo_mi.inspection.measure import INTENSITIES, Findings
 from lingo_mi.scan import Scan
 
 CALIBRATE = '; lingo-mi calibrate finds an axis off centre all the same'
@@ -27,13 +27,15 @@ def facts(scan: Scan, found: Findings) -> list[str]:
         f'{len(scan)} views of {nv} x {nu} pixels of {dv:.4g} x {du:.4g} mm, {geometry.mode} beam{lengths}; '
         f'{found.invalid:.2%} of the pixels are left out'
     ]
+    if found.intensities:
+        return lines
     if (border := found.border) is not None:
         if border.air is None:
             lines.append('air: none beside the object, which fills the panel')
         else:
             lines.append(f'air: {border.air:.4g} beside the object (line integral; 0 without error)')
-        if border.air_spread is not None:
-            lines.append(f'air of the views: differs by {border.air_spread:.2g} rms')
+        if (spread := _air_spread(found)) is not None:
+            lines.append(f'air of the views: differs by {spread:.2g} rms')
         for name, views in _cut(found):
             lines.append(f'truncation: the object reaches over the {name} edge of the panel in {views} views')
     if found.photons is None:
@@ -77,6 +79,8 @@ def _orbit(scan, found):
 def advice(scan: Scan, found: Findings) -> list[str]:
     """Sentences that say what to correct, and how; none for a sound scan."""
     border, lines = found.border, []
+    if found.intensities:
+        return [INTENSITIES]
     if found.negative:
         lines.append(
             'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
@@ -90,12 +94,13 @@ def advice(scan: Scan, found: Findings) -> list[str]:
             )
         if found.air_differs:
             lines.append(
-                f'the air level of the views differs by {border.air_spread:.2g} rms: import again with --air, which scales every '
-                'view by its own air, fit with -D fit_air=view, or take out what is smooth in time with lingo-mi calibrate '
-                'SCAN --air --out F.npy'
+                f'the air level of the views differs by {_air_spread(found):.2g} rms: import again with --air, which scales '
+                f'every view by its own air, fit with -D fit_air=view, or {_calibrated(found)}'
             )
         for name, _ in _cut(found):
-            lines.append(f'{name} edge: fit with -D outside=ignore, and make the volume (nVoxel) hold the object')
+            lines.append(
+                f'{name} edge: make the volume (nVoxel) hold the object; fit --method lingo also needs -D outside=ignore'
+            )
     if found.clipped is not None:
         lines.append('pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)')
     if found.black:
@@ -146,6 +151,18 @@ def _placement(scan, found):
             f'the axis is off: add {orbit.shift:+.3g} mm to the second number of offDetector, or run lingo-mi calibrate'
         )
     return lines
+
+
+def _air_spread(found):
+    """Standard deviation of the air levels of the views; None if it is not known."""
+    return found.air.drift if found.air is not None else found.border.air_spread
+
+
+def _calibrated(found):
+    """How `calibrate` takes out a drift of the air level."""
+    if found.air is not None:
+        return 'take it out with lingo-mi calibrate SCAN --out F.npy'
+    return 'take out what is smooth in time with lingo-mi calibrate SCAN --air --out F.npy'
 
 
 def _cut(found):

@@ -22,7 +22,7 @@ def circle_or_poses(mode: str, scan: dict[str, Any], pitch: float = 0.0) -> Geom
     """The circle of the numbers `scan`, or what its motion makes of it if any of that is not zero."""
     motion = _taken(scan, ('rotDetector', 'COR', 'height', 'tilt'))
     circle = CircularGeometry(mode=mode, grid=grid_of(_taken(scan, Voxels.__annotations__)), **scan)
-    _warn_of_degrees(circle.angles)
+    _warn_of_degrees(circle.angles, helical=bool(pitch) or 'height' in motion)
     if pitch:
         climb, height = helix(circle.angles, pitch), limits.lengths('height', motion.get('height', 0.0))
         if height.shape not in ((), climb.shape):
@@ -73,11 +73,15 @@ def _taken(numbers: dict[str, Any], names) -> dict[str, Any]:
     return {name: numbers.pop(name) for name in names if name in numbers}
 
 
-def _warn_of_degrees(angles: np.ndarray) -> None:
-    """Warn, in the name of the caller's caller's caller, if angles in radians look like degrees."""
-    if np.ptp(angles) > 8 * np.pi and not np.any(angles % 1):
+def _warn_of_degrees(angles: np.ndarray, helical: bool) -> None:
+    """Warn, in the name of the caller's caller's caller, if angles in radians look like degrees: they make more than four turns.
+
+    A helix may, so its angles must be whole numbers for a warning.
+    """
+    turns = np.ptp(angles) / (2 * np.pi)
+    if turns > 4 and not (helical and np.any(angles % 1)):
         warnings.warn(
-            f'angles are radians, but these are whole numbers from {angles.min():g} to {angles.max():g}: '
+            f'angles are radians, and these make {turns:.3g} turns, from {angles.min():g} to {angles.max():g}: '
             'if they are degrees, give numpy.radians(angles)',
             stacklevel=4,
         )

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from lingo_mi.geometry.circle import CircularGeometry
+from lingo_mi.inspection.air import Air, steady
 from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.raw.line_integrals import photons_of_images
@@ -19,6 +20,13 @@ CLEAR = 0.01  # a disagreement that is more than discretisation
 UNSTEADY = 0.5  # pixels of jitter that blur a volume
 AIR_OFF = 0.01  # relative to the highest line integral
 UNEQUAL_AIR = 0.01  # relative to the highest line integral
+UNSTEADY_AIR = 0.002  # likewise, where air is clear of the object in all views
+BRIGHT, FLAT = 0.85, 0.25  # air in intensities: this part of the highest, and within this part of the contrast
+DARK = 0.7  # of the air in intensities: the object lies below
+INTENSITIES = (
+    'these look like intensities, not line integrals: values are highest, and alike, at the edges; import the frames with '
+    'lingo-mi import, or give -numpy.log(I / I0), with I0 the intensity beside the object'
+)
 HALF_TURN = 175  # degrees: views of less do not tell the axis
 WIDE = 2  # half a panel over its distance from the source, which no panel has
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
@@ -104,8 +112,12 @@ class Findings:
         99.5th percentile and maximum of the line integrals.
     negative : bool
         Whether the line integrals look like ln(I / I0) instead of ln(I0 / I).
+    intensities : bool
+        Whether they look like intensities: see `looks_like_intensities`.
     border : Border or None
         None if no pixel at the left or right edge is valid.
+    air : Air or None
+        The air level of the views, if it can be read and is not 0; what follows is measured without it.
     photons : float or None
         Photons of a pixel in air, from the noise; None without noise.
     clipped : float or None
@@ -128,7 +140,9 @@ class Findings:
     high: float
     highest: float
     negative: bool
+    intensities: bool
     border: Border | None
+    air: Air | None
     photons: float | None
     clipped: float | None
     mass: np.ndarray
@@ -157,7 +171,9 @@ class Findings:
 
     @property
     def air_differs(self) -> bool:
-        """Whether the views have different air levels."""
+        """Whether the views have different air levels, or air that slopes differently."""
+        if self.air is not None and self.air.levels.std(0).max() > UNSTEADY_AIR * self.high:
+            return True
         spread = self.border and self.border.air_spread
         return spread is not None and spread > UNEQUAL_AIR * self.high
 
@@ -193,9 +209,10 @@ def measure(scan: Scan) -> Findings:
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     high, highest = float(np.percentile(p[valid], 99.5)), float(p[valid].max())
     border = _border(p, valid, high)
-    air = (border and border.air) or 0.0
+    given, (scan, level) = scan, steady(scan)
+    p, air = scan.projections, 0.0 if level else (border and border.air) or 0.0
     photons = photons_of_images(p, scan.valid)
-    clipped = float((p[valid] == highest).mean())
+    clipped = float((given.projections[valid] == highest).mean())
     many = clipped > 1e-3 and clipped * valid.sum() > 2 * len(scan) and highest > 0
     mass = np.array([(view[known].mean() - air) if known.any() else 0.0 for view, known in zip(p, valid)])
     black, doubled = _black_and_doubled(p - air, valid, mass)
@@ -205,8 +222,10 @@ def measure(scan: Scan) -> Findings:
         invalid=float(1 - valid.mean()),
         high=high,
         highest=highest,
-        negative=bool(-np.percentile(p[valid], 0.5) > 2 * max(high, 0)),
+        negative=bool(-np.percentile(given.projections[valid], 0.5) > 2 * max(high, 0)),
+        intensities=looks_like_intensities(given),
         border=border,
+        air=level,
         photons=photons if np.isfinite(photons) and photons < 1e8 else None,
         clipped=clipped if many else None,
         mass=mass,
@@ -216,6 +235,20 @@ def measure(scan: Scan) -> Findings:
         jitter=(np.nan, np.nan) if suspects else _jitter(scan, air),
         wide=_too_wide(scan),
         orbit=_orbit(scan, air, suspects),
+    )
+
+
+def looks_like_intensities(scan: Scan) -> bool:
+    """Whether projections are highest, and alike, at the left and right edge of the panel, as intensities of air are."""
+    p, edge = scan.projections, max(1, scan.geometry.nDetector[1] // 64)
+    valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
+    sides = np.concatenate([p[:, :, part][valid[:, :, part]] for part in (slice(0, edge), slice(-edge, None))])
+    if not sides.size:
+        return False
+    low, high = np.percentile(p[valid], [1, 99])
+    air, spread = np.median(sides), np.ptp(np.percentile(sides, [5, 95]))
+    return bool(
+        air > 0 and low > -0.05 * air and low < DARK * air and air > BRIGHT * high and spread < FLAT * (air - low)
     )
 
 

@@ -55,22 +55,6 @@ def test_moves_are_those_of_tigre(true):
         np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    'true', [Panel(v=4.0), Panel(u=-4.0), Panel(yaw=0.06), Panel(np.array([1.0, -2, 3]), 2.0, -0.05)]
-)
-def test_resampled_views_are_those_of_the_named_panel(true):
-    """Of a smooth object; to a hundredth of its highest value."""
-    geometry, _ = scanner(3)
-    x = np.linspace(-1, 1, SIZE)
-    ball = np.exp(-6 * sum(np.square(np.meshgrid(x - 0.2, x, x + 0.1, indexing='ij')))).astype(np.float32)
-    named = grid.project_volume(ball, geometry)
-    back = true.resampled(scanned(geometry, ball, true))
-    valid = np.ones(named.shape, bool) if back.valid is None else back.valid
-    assert valid.mean() > 0.8
-    assert np.abs(back.projections - named)[valid].max() < 0.01 * named.max()
-    assert np.abs(scanned(geometry, ball, true).projections - named).max() > 0.02 * named.max()
-
-
 def test_axis_and_turn_of_the_panel():
     """To a twentieth of a pixel and four hundredths of a degree."""
     geometry, data = scanner()
