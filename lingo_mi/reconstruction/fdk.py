@@ -23,10 +23,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.arcs import gaps
+from lingo_mi.reconstruction.fill import filled as with_every_pixel
 from lingo_mi.reconstruction.preconditions import require_circle
 from lingo_mi.reconstruction.rectify import rectified, rectified_geometry
 from lingo_mi.scan import Scan
@@ -202,6 +203,8 @@ class FDK(Algorithm):
 
     filter   apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth;
              TIGRE's 'ram_lak' and 'shepp_logan' are known too
+    fill     whether pixels that are not valid are interpolated along their rows and over views, with a warning; without, a scan
+             that has such pixels is refused
 
     Short scans (Parker) and offset panels (Wang) are weighted, see `ray_weights`. Projections of a turned or tilted panel are
     first resampled to an upright one (`rectified`). The views together must cover the whole width of the object; truncated
@@ -226,9 +229,11 @@ class FDK(Algorithm):
     )
 
     filter: str = 'ram-lak'
+    fill: bool = True
 
     def __post_init__(self):
         window_of(self.filter)
+        require_type('fill', self.fill, bool)
 
     def steps(self, scan: Scan) -> int:
         return len(scan)
@@ -237,10 +242,10 @@ class FDK(Algorithm):
         """Reconstruct the volume of a scan, see `run_algorithm`. `progress` counts views; there are no residuals.
 
         Raises InputError for a source that is not on a circle about z, for a panel that moves relative to the source, and for
-        invalid pixels.
+        invalid pixels without `fill`.
         """
         began = time.perf_counter()
-        projections, geometry = _weighted(scan)
+        projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
 
         def images(first):
             return filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
@@ -261,7 +266,7 @@ class FDK(Algorithm):
         """
         parts = scan.geometry.grid.slabs(thickness)
         check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))
-        projections, geometry = _weighted(scan)
+        projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
         n = len(geometry)
         found = np.empty((n, *geometry.nDetector[::-1]), np.float32)  # filtered once, for all slabs
         for first in range(0, n, BATCH):

@@ -222,7 +222,7 @@ class Study:
             return self.dataset.volume
         path = self.folder / f'{REFERENCE}.nii.gz'
         if not path.exists():
-            run_algorithm(self.dataset.train, FDK()).save(path)
+            run_algorithm(self.dataset.train, FDK(fill=False)).save(path)  # a reference is measured everywhere
         return read_volume(path).data
 
     def _compute(self, chosen: Dataset, method: str) -> dict:

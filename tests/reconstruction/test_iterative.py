@@ -414,7 +414,7 @@ def test_no_kernel_is_compiled_after_the_first_iterations(system):
 
 
 @pytest.mark.parametrize(
-    'algorithm', [lambda scan: run_algorithm(scan, FDK()), lambda scan: complete_views(scan, None, 9)]
+    'algorithm', [lambda scan: run_algorithm(scan, FDK(fill=False)), lambda scan: complete_views(scan, None, 9)]
 )
 def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
     geo = small(n=5)
