@@ -73,7 +73,7 @@ def calibrate(
     if looks_like_intensities(train):
         warnings.warn(INTENSITIES, stacklevel=2)
     measured, level, notes = line_integrals(train), None, ()
-    if not air:
+    if not (air or scatter):  # scattered light shows beside the object, too
         notes = (NO_AIR,) if air_of(measured) is None else ()
         measured, level = steady(measured)
     with Progress('Calibrate', 1, shown=progress) as bar:

@@ -211,7 +211,8 @@ def measure(scan: Scan) -> Findings:
     border = _border(p, valid, high)
     given, (scan, level) = scan, steady(scan)
     p, air = scan.projections, 0.0 if level else (border and border.air) or 0.0
-    photons = photons_of_images(p, scan.valid)
+    intensities = looks_like_intensities(given)
+    photons = np.inf if intensities else photons_of_images(p, scan.valid)
     clipped = float((given.projections[valid] == highest).mean())
     many = clipped > 1e-3 and clipped * valid.sum() > 2 * len(scan) and highest > 0
     mass = np.array([(view[known].mean() - air) if known.any() else 0.0 for view, known in zip(p, valid)])
@@ -223,7 +224,7 @@ def measure(scan: Scan) -> Findings:
         high=high,
         highest=highest,
         negative=bool(-np.percentile(given.projections[valid], 0.5) > 2 * max(high, 0)),
-        intensities=looks_like_intensities(given),
+        intensities=intensities,
         border=border,
         air=level,
         photons=photons if np.isfinite(photons) and photons < 1e8 else None,

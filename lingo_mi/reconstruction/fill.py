@@ -41,7 +41,7 @@ def filled(scan: Scan) -> Scan:
         alone[:, row] = ~known & (a + b == 0)
         p[:, row] = np.where(known, values, (a * along + b * over) / np.maximum(a + b, 1e-12))
     if alone.any():  # no valid pixel in the row, nor in other views: the nearest
-        nearest = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
+        nearest = np.asarray(ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True))
         p[alone] = scan.projections[tuple(nearest)][alone]
     count = int((~valid).sum())
     warnings.warn(

@@ -85,6 +85,73 @@ def test_noisy_and_truncated():
     assert in_pixels(found, 'u') == pytest.approx(1.7, abs=0.1)
 
 
+def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
+    """One row of the foot; the panel's width is that many sides of the object at the axis. Places in columns from the foot of the
+    axis."""
+    phantom = lm.phantom('foot', SIZE)
+    side = max(phantom.spacing) * SIZE
+    data = phantom.data[:, :, SIZE // 2 : SIZE // 2 + 1]
+    pixel = side * width / columns * (1.5 if mode == 'cone' else 1)
+    sizes = dict(
+        nDetector=(1, columns),
+        dDetector=pixel,
+        nVoxel=(SIZE, SIZE, 1),
+        dVoxel=phantom.spacing,
+        angles=circular(views, total),
+        offDetector=(0, told * pixel),
+    )
+    sizes |= dict(DSO=4 * side, DSD=6 * side) if mode == 'cone' else {}
+    geometry = getattr(lm.Geometry, mode)(**sizes)
+    return scanned(geometry, data, Panel(u=(true - told) * pixel))
+
+
+@pytest.mark.parametrize(
+    ('mode', 'width', 'told', 'true'),
+    [
+        ('parallel', 0.63, -20, -22),  # half a fan
+        ('cone', 0.84, -20, -22),
+        ('cone', 0.56, 0, 0),  # a region of interest
+        ('cone', 0.56, 0, -2),
+        ('parallel', 3.6, 0, 22),  # far off
+    ],
+)
+def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, told, true):
+    """To a twentieth of a pixel, and to three standard errors."""
+    scan = row_scan(mode, 180, 360, 64, told, true, width)
+    found = lm.calibrate(scan, progress=False)
+    right, pixel = true - told, scan.geometry.dDetector[1]
+    assert in_pixels(found, 'u') == pytest.approx(right, abs=0.05)
+    assert abs(in_pixels(found, 'u') - right) < 3 * found.found.errors['u'] / pixel
+    taken = found.found.drift.u[0] / pixel
+    assert taken == (pytest.approx(right, abs=0.05) if right else 0)
+
+
+def test_an_object_that_is_cut_turns_no_panel():
+    """On both sides, of a cone beam: neither shift nor turn, whose errors are told."""
+    geometry, data = scanner(24, rows=40)
+    geometry = replace(geometry, nDetector=(32, 32))
+    found = lm.calibrate(scanned(geometry, data, Panel()), progress=False)
+    assert not found.needed and abs(in_pixels(found, 'u')) < 0.05
+    assert any('no edge of the panel shows air' in line for line in found.lines())
+
+
+@pytest.mark.parametrize('tilt', [0.0, 0.03])
+def test_a_drift_of_the_beam_is_no_geometry(tilt):
+    """A level that drifts by 4 % of the exposure, uniform or sloping across the panel: read beside the object and taken out."""
+    geometry, data = scanner(24, rows=40)
+    geometry = replace(geometry, dDetector=(geometry.dDetector[0] * 2, geometry.dDetector[1] * 2), nDetector=(40, 36))
+    ideal = scanned(geometry, data, Panel())
+    p = ideal.projections / ideal.projections.max()
+    slope = 0.02 + tilt * np.linspace(-1, 1, 40)[:, None] + tilt * np.linspace(-1, 1, 36)
+    scan = lm.Scan(geometry, p + np.linspace(-1, 1, 24)[:, None, None] * slope)
+    found = lm.calibrate(scan, progress=False)
+    drift = found.found.drift
+    assert (drift.u[0], drift.yaw) == (0, 0) and abs(np.degrees(found.found.measured['yaw'])) < 0.03
+    assert found.lines()[0].startswith('air beside the object: ') and found.needed
+    np.testing.assert_allclose(found.corrected(scan).projections, p, atol=0.002)
+    np.testing.assert_allclose(found.corrected(scan.subset([3, 9])).projections, p[[3, 9]], atol=0.002)
+
+
 def test_drift_is_found_and_held_out_views_get_theirs():
     """A drift of 1.2 pixels from the first to the last view: to a tenth of a pixel in every view."""
     geometry, data = scanner(40)

@@ -54,6 +54,33 @@ def test_radians_for_degrees(foot):
     assert 'check the angles' in fault
 
 
+@pytest.mark.parametrize('level', [0.02, -0.02])
+@pytest.mark.parametrize('sense', [1, -1])
+def test_a_drift_of_the_beam_hides_no_sense(level, sense):
+    """2 % of the exposure over 60 views, of line integrals up to 1."""
+    scan = scanned('foot', views=60)
+    p = scan.projections / scan.projections.max() + np.linspace(-level, level, 60)[:, None, None]
+    faults = order_faults(lm.Scan(replace(scan.geometry, angles=sense * scan.geometry.angles), p))
+    assert len(faults) == (sense < 0) and all('with reversed angles' in fault for fault in faults)
+
+
+def test_a_parallel_beam_tells_no_sense():
+    scan = scanned('foot', 'parallel', 40, 180)
+    assert order_faults(replace(scan, geometry=replace(scan.geometry, angles=-scan.geometry.angles))) == []
+
+
+@pytest.mark.parametrize(('mode', 'total'), [('parallel', 180), ('cone', 200)])
+def test_an_axis_off_centre_damages_no_view(mode, total):
+    scan = scanned('foot', mode, 50, total)
+    assert order_faults(lm.Scan(scan.geometry, np.roll(scan.projections, 1, 2))) == []
+
+
+def test_a_first_view_out_of_place():
+    scan = scanned('foot', views=60)
+    (fault,) = order_faults(placed(scan, np.array([20, *range(1, 60)])))
+    assert fault.startswith('view 0: ')
+
+
 def test_a_calibration_warns(foot):
     with pytest.warns(UserWarning, match='with reversed angles'):
         lm.calibrate(placed(foot, np.arange(24)[::-1]), progress=False)

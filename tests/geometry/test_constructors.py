@@ -1,5 +1,6 @@
 """The constructors of `Geometry`: against `scanner_rays`, numbers by hand, and other packages' own formulas."""
 
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -54,6 +55,18 @@ def test_circles(make):
     assert isinstance(g, CircularGeometry) and g.mode == ('parallel' if parallel else 'cone')
     assert (g.grid.centre, g.offDetector) == ((1, -2, 3), (4, -5))
     same_rays(g.rays(), scanner(parallel, offDetector=(4.0, -5.0)), 0)
+
+
+@pytest.mark.parametrize('angles', [np.arange(25) * 14.4, np.arange(36) * 10, np.arange(720) / 2])
+def test_angles_in_degrees(angles):
+    """Whole numbers or not; a helix may make many turns, and four turns are no degrees."""
+    numbers = CONE | dict(angles=angles)
+    with pytest.warns(UserWarning, match=r'turns.* give numpy.radians\(angles\)'):
+        Geometry.cone(**numbers)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        Geometry.cone(**numbers | dict(angles=np.radians(angles)))
+        Geometry.helix(**numbers | dict(angles=np.linspace(0, 60, 500)), pitch=1.0)
 
 
 def test_one_number_stands_for_all():

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 import lingo_mi as lm
-from helpers.object_scan import scanned
+from helpers.object_scan import PIXELS, scanned
 from lingo_mi.cli.findings_text import advice, facts
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import measure
@@ -75,7 +75,7 @@ def test_air_and_truncation(foot):
     assert found.border.air == pytest.approx(3, abs=0.1)
     cut = lm.Scan(replace(foot.geometry, nDetector=(110, 40)), foot.projections[:, :, 28:68])
     assert measure(cut).border.cut_sides > len(cut) / 2
-    assert any('left or right edge' in line and '-D outside=ignore' in line for line in advised(cut))
+    assert any('left or right edge' in line and '--method lingo also needs -D' in line for line in advised(cut))
 
 
 def test_pixels_that_are_not_valid_disagree_with_nothing(foot):
@@ -125,6 +125,43 @@ def test_air_of_all_views(foot):
 def test_air_of_single_views(foot):
     p = foot.projections + np.linspace(-1, 1, len(foot))[:, None, None] * 0.05 * foot.projections.max()
     assert any('-D fit_air=view' in line for line in advised(lm.Scan(foot.geometry, p)))
+
+
+def test_a_small_drift_of_air_names_calibrate(foot):
+    """1 % of the highest line integral, up and down; nothing else is wrong."""
+    p = foot.projections + np.linspace(-0.01, 0.01, len(foot))[:, None, None] * foot.projections.max()
+    found = only(lm.Scan(foot.geometry, p.astype(np.float32)), 'take it out with lingo-mi calibrate')
+    assert found.orbit.disagreement == pytest.approx(measure(foot).orbit.disagreement, abs=0.001)
+
+
+@pytest.mark.parametrize('level', [0.02, -0.02])
+def test_a_drift_of_air_does_not_change_the_sense(level):
+    scan = scanned('foot', views=60)
+    p = scan.projections / scan.projections.max() + np.linspace(-level, level, 60)[:, None, None]
+    for sense in (1, -1):
+        found = measure(lm.Scan(replace(scan.geometry, angles=sense * scan.geometry.angles), p))
+        assert (found.orbit.reversed is not None) == (sense < 0)
+
+
+@pytest.mark.parametrize('counts', [1.0, 4e4])
+def test_intensities(foot, counts):
+    """As fractions and as counts; with 2 % of noise and a beam that is a tenth darker at the edges. Nothing else is advised."""
+    light = np.random.default_rng(0).normal(1, 0.02, foot.projections.shape)
+    light = light * np.exp(-foot.projections / foot.projections.max() * 2)
+    light = light * (1 - 0.1 * np.linspace(-1, 1, PIXELS) ** 2) * counts
+    for p in (light, -np.log(light / light.max())):
+        found = measure(lm.Scan(foot.geometry, p))
+        assert found.intensities == (p is light)
+    only(lm.Scan(foot.geometry, light), 'these look like intensities')
+
+
+def test_regions_of_interest_are_no_intensities():
+    for name in ('foot', 'chest', 'shepp_logan', 'gaussians'):
+        scan = scanned(name)
+        for half in (8, 16, 24):
+            middle = slice(PIXELS // 2 - half, PIXELS // 2 + half)
+            cut = lm.Scan(replace(scan.geometry, nDetector=(110, 2 * half)), scan.projections[:, :, middle])
+            assert not measure(cut).intensities
 
 
 def test_noise(foot):
