@@ -41,7 +41,7 @@ SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
 LONGEST = 4.0  # steps for differences that a number may change by at a time
 AGAIN = 3  # steps more, at most, with the derivatives of the last: until they are within the standard errors
 SPANS = 6  # of the scan's time, for standard errors
-FLOOR = 0.02  # of a step for differences: no standard error is smaller, since voxels are no object
+FLOOR = 0.03  # of a step for differences: no standard error is smaller, since voxels are no object
 
 
 @dataclass(frozen=True)
