@@ -11,7 +11,7 @@ from lingo_mi.calibration.response.response import Response
 from lingo_mi.calibration.search import Found
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.inspection.air import Air, steady
+from lingo_mi.inspection.air import Air, without_air
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Dataset, Scan
 
@@ -77,7 +77,7 @@ class Calibration:
             return scan
         response = self._response
         if self.air is not None:
-            scan, _ = steady(line_integrals(scan))
+            scan = without_air(line_integrals(scan))
         if response is not None:
             scan = line_integrals(scan)  # which the response was fitted to
             scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))

@@ -65,10 +65,11 @@ def air_of(scan: Scan) -> Air | None:
     strips = [(strip, x) for strip, x in strips if np.isfinite(strip).any((1, 2)).all()]
     if not strips:
         return None
-    low = min(float(np.nanpercentile(strip, 5)) for strip, _ in strips)
-    limit = low + NEAR * (high - low)
-    strips = [(strip, x) for strip, x in strips if np.mean(strip[np.isfinite(strip)] <= limit) > ALL]
-    if not strips or low > LOW * high:
+    low = np.min([np.nanpercentile(strip, 5, (1, 2)) for strip, _ in strips], 0)[:, None, None]  # of each view
+    typical = float(np.median(low))
+    near = low + NEAR * (high - typical)
+    strips = [(strip, x) for strip, x in strips if np.mean((strip <= near)[np.isfinite(strip)]) > ALL]
+    if not strips or typical > LOW * high:
         return None
     values, rows = [], np.array_split(np.arange(nv), min(BLOCKS, nv))
     columns = []
@@ -89,12 +90,18 @@ def air_of(scan: Scan) -> Air | None:
     return Air(levels, float(levels[:, 0].std()), _matters(levels, high))
 
 
+def without_air(scan: Scan) -> Scan:
+    """The scan without its air level, if that can be read."""
+    air = air_of(scan)
+    return scan if air is None else replace(scan, projections=scan.projections - air.image(scan.geometry.nDetector))
+
+
 def steady(scan: Scan) -> tuple[Scan, Air | None]:
     """The scan without its air level, if that matters, and the level that was taken out."""
     air = air_of(scan)
     if air is None or not air.matters:
         return scan, None
-    return replace(scan, projections=scan.projections - air.image(scan.geometry.nDetector)), air
+    return without_air(scan), air
 
 
 def _edges(nu, width):

@@ -135,9 +135,9 @@ def test_an_object_that_is_cut_turns_no_panel():
     assert any('no edge of the panel shows air' in line for line in found.lines())
 
 
-@pytest.mark.parametrize('tilt', [0.0, 0.03])
+@pytest.mark.parametrize('tilt', [0.0, 0.01])
 def test_a_drift_of_the_beam_is_no_geometry(tilt):
-    """A level that drifts by 4 % of the exposure, uniform or sloping across the panel: read beside the object and taken out."""
+    """A level that drifts by 4 % of the exposure, uniform or with slopes across the panel: read beside the object, taken out."""
     geometry, data = scanner(24, rows=40)
     geometry = replace(geometry, dDetector=(geometry.dDetector[0] * 2, geometry.dDetector[1] * 2), nDetector=(40, 36))
     ideal = scanned(geometry, data, Panel())
