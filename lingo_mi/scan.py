@@ -31,17 +31,29 @@ class PixelEffects(Protocol):
 class Scan:
     """Measured or simulated projections.
 
-    geometry      in mm
-    projections   float32 [view, v, u]: line integrals ln(I0 / I), density times mm
-    valid         bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are
-                  valid. What the projections hold in the others, NaN included, is forgotten: they become 0
-    effects       what a detector saw besides line integrals (`effects.forward.Effects`); None: nothing. The projections are
-                  then -ln of its signal, and densities attenuation at the tube's reference energy
+    Projections and masks may be arrays of any library that has `__array__` or `__dlpack__`.
 
-    Projections and masks may be arrays of any library that has `__array__` or `__dlpack__`. Raises InputError where their
-    shapes are not the geometry's, where a valid pixel is not finite, and where no pixel is valid.
+    Parameters
+    ----------
+    geometry : Geometry
+        In mm.
+    projections : float32 [view, v, u]
+        Line integrals ln(I0 / I), density times mm.
+    valid : ndarray or None
+        Bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are valid. What the
+        projections hold in the others, NaN included, is forgotten: they become 0.
+    effects : PixelEffects or None
+        What a detector saw besides line integrals (`effects.forward.Effects`); None: nothing. The projections are then -ln of its
+        signal, and densities attenuation at the tube's reference energy.
 
-        scan = Scan(Geometry.parallel(nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0, 1.5]), np.zeros((2, 8, 8)))
+    Raises
+    ------
+    InputError
+        If their shapes are not the geometry's, where a valid pixel is not finite, and where no pixel is valid.
+
+    Examples
+    --------
+    >>> scan = Scan(Geometry.parallel(nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0, 1.5]), np.zeros((2, 8, 8)))
     """
 
     geometry: Geometry
@@ -89,7 +101,13 @@ class Scan:
         return len(self.geometry)
 
     def subset(self, index: Index) -> Scan:
-        """The views `index` only: a slice, or integers [m]. Raises InputError for views that the scan does not have."""
+        """The views `index` only: a slice, or integers [m].
+
+        Raises
+        ------
+        InputError
+            For views that the scan does not have.
+        """
         index = checked_views(index, len(self))
         return replace(
             self,
@@ -155,7 +173,9 @@ class Dataset:
 
     The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError where it is none.
 
-        Dataset(train=scan.subset(slice(0, None, 2)), test=scan.subset(slice(1, None, 2)))
+    Examples
+    --------
+    >>> Dataset(train=scan.subset(slice(0, None, 2)), test=scan.subset(slice(1, None, 2)))
     """
 
     train: Scan

@@ -30,7 +30,10 @@ from studies.command import run_study
 def with_boxes(dataset: Dataset, cut: int = 2) -> Dataset:
     """The same views of the true volume, with each voxel cut into `cut` pieces a side of its own density.
 
-    Raises InputError for a data set without a true volume.
+    Raises
+    ------
+    InputError
+        For a data set without a true volume.
     """
     if dataset.volume is None:
         raise InputError('the true volume of this scan is not known: take a scene whose object is a volume')

@@ -16,9 +16,14 @@ def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tupl
     """A cone-beam scan over a full turn of one of `tables.objects`: geometry, line integrals [view, v, u] up to LARGEST, and true
     volume.
 
-    size     voxels along the longest side
-    pixels   along the sides of the panel, which is twice as wide as the object
-    finer    how many times as many voxels are scanned along each side
+    Parameters
+    ----------
+    size : int
+        Voxels along the longest side.
+    pixels : int
+        Along the sides of the panel, which is twice as wide as the object.
+    finer : int
+        How many times as many voxels are scanned along each side.
     """
     thing = load_object(name, size * finer)
     truth = averaged(thing, size)

@@ -38,26 +38,44 @@ def calibrate(
     """Find where the panel really is: its shift along u, as of an axis of rotation off centre; its turn in its own plane; and its
     drift over the scan. If asked for, also what the detector makes of line integrals.
 
-    scan       at least 8 views, in the order in which they were taken; of a `Dataset` its `train`
-    drift      degree of a polynomial in time for the shifts along u and v; 0: the panel does not drift
-    air        whether to seek an air level, a cubic polynomial in time, instead of reading it beside the object
-    gain       whether to seek a gain of the views, likewise, about 1
-    curve      coefficients, 0 to 3, of the curve from line integral to measured value, as of beam hardening
-    scatter    whether to seek scattered light, the same smooth image in all views
-    progress   whether to show a progress bar on standard error
-
     Views are predicted from quick reconstructions of other views, on few voxels, and are to agree with them (see
     `lingo_mi.calibration.search`). Takes some 30 such reconstructions, and 6 for each further number. A constant shift along v
     can hardly be told from an object that lies higher, and is not sought. A beam that drifts looks like a panel that moves: where
     an edge of the panel shows air in all views, its level is taken out of each view first.
 
-    Returns a `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less
-    than three standard errors from zero is left as it was, as is scattered light that would be negative in places. Warns where
-    the views contradict their angles or their order: what is found then means nothing. Raises InputError for fewer than 8 views,
-    and a scan without signal.
+    Parameters
+    ----------
+    scan : Scan or Dataset
+        At least 8 views, in the order in which they were taken; of a `Dataset` its `train`.
+    drift : int
+        Degree of a polynomial in time for the shifts along u and v; 0: the panel does not drift.
+    air : bool
+        Whether to seek an air level, a cubic polynomial in time, instead of reading it beside the object.
+    gain : bool
+        Whether to seek a gain of the views, likewise, about 1.
+    curve : int
+        Coefficients, 0 to 3, of the curve from line integral to measured value, as of beam hardening.
+    scatter : bool
+        Whether to seek scattered light, the same smooth image in all views.
+    progress : bool
+        Whether to show a progress bar on standard error.
 
-        calibration = lm.calibrate(data, drift=3)
-        data = calibration.corrected(data)
+    Returns
+    -------
+    Calibration
+        A `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less than
+        three standard errors from zero is left as it was, as is scattered light that would be negative in places. Warns where the
+        views contradict their angles or their order: what is found then means nothing.
+
+    Raises
+    ------
+    InputError
+        For fewer than 8 views, and a scan without signal.
+
+    Examples
+    --------
+    >>> calibration = lm.calibrate(data, drift=3)
+    >>> data = calibration.corrected(data)
     """
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))

@@ -44,26 +44,43 @@ def simulate(
 ) -> Dataset:
     """Simulate a scan: exact line integrals of an object, as the scanner would see it.
 
-    source      a Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a
-                `phantom`, or a volume [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`)
-    geometry    for a phantom or a volume: the scanner. A volume must have `geometry.grid.shape` voxels. Without it, a phantom
-                is scanned as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out. On a grid
-                other than its own, a phantom is its voxels
-    views       how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
-                has views of its own for that. Of a phantom without a geometry: how many to scan
-    held_out    with `geometry`: further views, to measure new views on
-    seed        of random angles and of the noise of a scene's detector
-    parameters  values for the `<default>` names of a scene file
-    progress    whether to show a progress bar on standard error; scenes always do
+    Parameters
+    ----------
+    source : path-like or Phantom or ndarray
+        A Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a `phantom`, or a volume
+        [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`).
+    geometry : Geometry or None
+        For a phantom or a volume: the scanner. A volume must have `geometry.grid.shape` voxels. Without it, a phantom is scanned
+        as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out. On a grid other than its own, a
+        phantom is its voxels.
+    views : int or None
+        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out` has
+        views of its own for that. Of a phantom without a geometry: how many to scan.
+    held_out : Geometry or None
+        With `geometry`: further views, to measure new views on.
+    seed : int
+        Of random angles and of the noise of a scene's detector.
+    parameters : dict or None
+        Values for the `<default>` names of a scene file.
+    progress : bool
+        Whether to show a progress bar on standard error; scenes always do.
 
-    Returns a `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume`
-    [x, y, z] is the true density, where it is known.
+    Returns
+    -------
+    Dataset
+        A `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume` [x, y, z] is
+        the true density, where it is known.
 
-    Raises InputError where the source is unknown, does not fit the geometry, needs more memory than there is, or is a volume
-    whose negative values look like Hounsfield units (`docs/how_to/own_volume.md` says how to convert them).
+    Raises
+    ------
+    InputError
+        If the source is unknown, does not fit the geometry, needs more memory than there is, or is a volume whose negative values
+        look like Hounsfield units (`docs/how_to/own_volume.md` says how to convert them).
 
-        data = lm.simulate('x3d_foot', views=25)
-        data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
+    Examples
+    --------
+    >>> data = lm.simulate('x3d_foot', views=25)
+    >>> data = lm.simulate(lm.phantom('foot', size=96), geometry, views=25)
     """
     ensure_variant()
     seed = parsing.seed(seed)
@@ -118,16 +135,30 @@ def simulate(
 def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views: int | None = None) -> Dataset:
     """Read a measured or stored scan.
 
-    path       a pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images,
-               `scan.npy` [view, v, u] with `scan.yml` beside it, or the .npz of a public scan
-    geometry   the geometry file of an .npy, where it is another than that of the same stem
-    views      how many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has views of
-               its own for that
+    Parameters
+    ----------
+    path : path-like
+        A pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images, `scan.npy` [view,
+        v, u] with `scan.yml` beside it, or the .npz of a public scan.
+    geometry : path-like or None
+        The geometry file of an .npy, where it is another than that of the same stem.
+    views : int or None
+        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has views of its own
+        for that.
 
-    Returns a `Dataset` of line integrals ln(I0 / I) [view, v, u]. Raises InputError where the file is missing, damaged, or
-    contradicts its geometry.
+    Returns
+    -------
+    Dataset
+        A `Dataset` of line integrals ln(I0 / I) [view, v, u].
 
-        data = lm.load('foot_50.pickle', views=25)
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, or contradicts its geometry.
+
+    Examples
+    --------
+    >>> data = lm.load('foot_50.pickle', views=25)
     """
     if geometry is not None and not isinstance(geometry, (str, PathLike)):
         raise InputError(
@@ -145,18 +176,33 @@ def load_raw(
 ) -> Scan:
     """Read a scanner's raw frames and turn them into line integrals, one frame at a time.
 
-    frames     a folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as
-               NXtomo or DXchange
-    geometry   of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml
-    progress   whether to show a progress bar on standard error
-    options    flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
-               saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file;
-               pixel, mm. `lingo_mi.raw.options.Options` describes them, and `lingo-mi import` writes a file
+    Parameters
+    ----------
+    frames : path-like
+        A folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as NXtomo or
+        DXchange.
+    geometry : path-like or Geometry
+        Of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml.
+    progress : bool
+        Whether to show a progress bar on standard error.
+    options
+        Flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
+        saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file; pixel, mm.
+        `lingo_mi.raw.options.Options` describes them, and `lingo-mi import` writes a file.
 
-    Returns a `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts. Raises InputError where
-    something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.
+    Returns
+    -------
+    Scan
+        A `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts.
 
-        scan = lm.load_raw('frames/', 'scanner.yml', flats='flats/', darks='darks/', binning=2)
+    Raises
+    ------
+    InputError
+        If something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.
+
+    Examples
+    --------
+    >>> scan = lm.load_raw('frames/', 'scanner.yml', flats='flats/', darks='darks/', binning=2)
     """
     require_type('frames', frames, (str, PathLike))
     require_type('geometry', geometry, (str, PathLike, Geometry))
@@ -169,12 +215,22 @@ def load_raw(
 def phantom(name: str, size: int = 256, seed: int = 0) -> Phantom:
     """A test object made by formula: 'foot', 'chest', 'shepp_logan', 'gaussians' or 'mesh', on size^3 voxels.
 
-    size   voxels a side, 8 to 512
-    seed   of textures, vessels and random Gaussians
+    `phantom.data` is float32 [x, y, z] in [0, 1], `phantom.spacing` the voxel size in mm.
 
-    `phantom.data` is float32 [x, y, z] in [0, 1], `phantom.spacing` the voxel size in mm. Raises InputError for an unknown
-    name, a size out of range or a negative seed.
+    Parameters
+    ----------
+    size : int
+        Voxels a side, 8 to 512.
+    seed : int
+        Of textures, vessels and random Gaussians.
 
-        foot = lm.phantom('foot', size=96)
+    Raises
+    ------
+    InputError
+        For an unknown name, a size out of range or a negative seed.
+
+    Examples
+    --------
+    >>> foot = lm.phantom('foot', size=96)
     """
     return make(name, size, seed)

@@ -27,10 +27,16 @@ _TERMS = dict(
 class Calibration:
     """What `lm.calibrate` has found; `corrected` is the scan with it.
 
-    geometry    of the scan that was given
-    found       numbers, their standard errors, and how well views predict each other before and after
-    air         the air level that was read beside the object and taken out first; None if none was
-    notes       sentences on what the scan does not tell
+    Parameters
+    ----------
+    geometry : Geometry
+        Of the scan that was given.
+    found : Found
+        Numbers, their standard errors, and how well views predict each other before and after.
+    air : Air or None
+        The air level that was read beside the object and taken out first; None if none was.
+    notes : tuple[str, ...]
+        Sentences on what the scan does not tell.
     """
 
     geometry: Geometry
@@ -62,7 +68,10 @@ class Calibration:
         their angles tell: the scan's views must be in the order in which they were taken. An air level that was read beside the
         object is read there again, in each view for itself.
 
-        Raises InputError for a scan by another scanner.
+        Raises
+        ------
+        InputError
+            For a scan by another scanner.
         """
         require_type('scan', scan, (Scan, Dataset))
         if isinstance(scan, Dataset):

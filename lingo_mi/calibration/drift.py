@@ -56,9 +56,14 @@ def _in_order(angles: np.ndarray) -> bool:
 class Drift:
     """The panel's place over a scan, v(t) = sum of v[k] P_k(t) with Legendre's polynomials P_k, u(t) likewise, and its yaw.
 
-    scan   the geometry whose views define the time t, -1 for the first view and 1 for the last
-    v, u   [degree + 1] mm each: the constants first
-    yaw    radians
+    Parameters
+    ----------
+    scan : Geometry
+        The geometry whose views define the time t, -1 for the first view and 1 for the last.
+    v, u : tuple[float, ...]
+        [degree + 1] mm each: the constants first.
+    yaw : float
+        Radians.
     """
 
     scan: Geometry

@@ -31,10 +31,16 @@ NEIGHBOURS = 5  # views, in the order of the scan
 def order_faults(scan: Scan) -> list[str]:
     """What contradicts the angles and the order of the views, in sentences; none for a sound scan or one of few views.
 
-    Of many views, evenly spaced ones are compared. Takes four quick reconstructions. Raises InputError for a scan without signal,
-    and where the source lies within the volume.
+    Of many views, evenly spaced ones are compared. Takes four quick reconstructions.
 
-        order_faults(scan)  # ['the views predict each other hardly better than in a random order: ...']
+    Raises
+    ------
+    InputError
+        For a scan without signal, and where the source lies within the volume.
+
+    Examples
+    --------
+    >>> order_faults(scan)  # ['the views predict each other hardly better than in a random order: ...']
     """
     require_signal(scan, 'compare')
     require_rays(scan.geometry)

@@ -14,12 +14,16 @@ from lingo_mi.geometry import CircularGeometry, Geometry
 class Panel:
     """How the real panel lies relative to the one that a geometry names.
 
-    v, u   mm, shifts along z and along the columns' direction, as in TIGRE's `offDetector`: one number, or one a view [n]
-    yaw    radians, the turn in the panel's plane about its centre, as in TIGRE's `rotDetector`
-
     A shift along u is an axis of rotation off centre, and a yaw an axis that is not parallel to the columns.
 
         Panel(u=0.5).moved(scan.geometry).offDetector   # 0.5 mm more along u
+
+    Parameters
+    ----------
+    v, u : array_like
+        Mm, shifts along z and along the columns' direction, as in TIGRE's `offDetector`: one number, or one a view [n].
+    yaw : float
+        Radians, the turn in the panel's plane about its centre, as in TIGRE's `rotDetector`.
     """
 
     v: ArrayLike = 0.0

@@ -48,12 +48,20 @@ FLOOR = 0.03  # of a step for differences: no standard error is smaller, since v
 class Found:
     """What the search has found.
 
-    drift       the panel's place over the scan; a number that is not taken is 0 in it
-    response    of the detector, likewise; None if none was sought
-    measured    all numbers as measured, by name, as `Drift.of` (mm, radians) and `Response.changed` have them
-    errors      their standard errors
-    refused     why a number is not taken, by name
-    before, after   root mean square difference between predicted and measured views, as given and with `drift`
+    Parameters
+    ----------
+    drift : Drift
+        The panel's place over the scan; a number that is not taken is 0 in it.
+    response : Response or None
+        Of the detector, likewise; None if none was sought.
+    measured : dict[str, float]
+        All numbers as measured, by name, as `Drift.of` (mm, radians) and `Response.changed` have them.
+    errors : dict[str, float]
+        Their standard errors.
+    refused : dict[str, str]
+        Why a number is not taken, by name.
+    before, after : float
+        Root mean square difference between predicted and measured views, as given and with `drift`.
     """
 
     drift: Drift
@@ -118,11 +126,19 @@ def search(
 ) -> Found:
     """The panel's place, its drift over the scan, and a response of the detector.
 
-    degree     of the drift's polynomial in time; 0: no drift
-    response   of the scan's geometry, with the parts that are sought; None: projections are line integrals
-    progress   called as progress(trials done, trials) after every quick reconstruction
+    Parameters
+    ----------
+    degree : int
+        Of the drift's polynomial in time; 0: no drift.
+    response : Response or None
+        Of the scan's geometry, with the parts that are sought; None: projections are line integrals.
+    progress : callable or None
+        Called as progress(trials done, trials) after every quick reconstruction.
 
-    Raises InputError for a scan of fewer than 8 views or without signal.
+    Raises
+    ------
+    InputError
+        For a scan of fewer than 8 views or without signal.
     """
     require_signal(scan, 'calibrate')
     if len(scan) < 8:

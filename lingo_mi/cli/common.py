@@ -209,10 +209,16 @@ def check_seed(seed: int, flag: str = '--seed') -> None:
 def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: int = 0, slab: int = 0) -> Any:
     """The `Dataset` that the arguments name: a file of projections, a volume scanned, or the scene's objects scanned.
 
-    scene   the `LoadedScene` of args.scene
-    views   how many evenly spaced views to use (None: all)
-    seed    of the noise, where the scene's detector has any
-    slab    slices of the volume that are in memory at once (0: all; else there is no true volume)
+    Parameters
+    ----------
+    scene
+        The `LoadedScene` of args.scene.
+    views : int or None
+        How many evenly spaced views to use (None: all).
+    seed : int
+        Of the noise, where the scene's detector has any.
+    slab : int
+        Slices of the volume that are in memory at once (0: all; else there is no true volume).
     """
     from lingo_mi.files.scans import read_scan
     from lingo_mi.files.volumes import read_volume
@@ -231,7 +237,10 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
 def check_scan_output(out: Path, inputs: Iterable[PathLike | str | None], force: bool) -> None:
     """Raises InputError unless a scan can be written to `out`, an .npy, and beside it, over none of the files that are read.
 
-    force   whether other files may be overwritten
+    Parameters
+    ----------
+    force : bool
+        Whether other files may be overwritten.
     """
     from lingo_mi.files.scans import written_files
 
@@ -275,9 +284,15 @@ def check_threads(args: argparse.Namespace) -> None:
 def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
     """What runs jobs, by the arguments that `cluster_arguments` added: this process, or a cluster, which is open in the block.
 
-    folder   that all workers must see; it exists
+    Parameters
+    ----------
+    folder : Path
+        That all workers must see; it exists.
 
-    Raises InputError where --cluster leads nowhere.
+    Raises
+    ------
+    InputError
+        If --cluster leads nowhere.
     """
     from lingo_mi.jobs.in_process import InProcess
 
@@ -295,7 +310,10 @@ def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
 def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str) -> None:
     """Add the arguments that say which documentation to renew: --docs, --document, --figures; see `docs_of`.
 
-    document, figures   where in the folder --docs the Markdown page and the folder of the pictures are, unless named
+    Parameters
+    ----------
+    document, figures : str
+        Where in the folder --docs the Markdown page and the folder of the pictures are, unless named.
     """
     parser.add_argument(
         '--docs', type=Path, metavar='DIR', help='renew the documentation in DIR (default: nothing outside --out)'
@@ -316,7 +334,10 @@ def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str)
 def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
     """The page to renew, if any, and the folder of the pictures, of the arguments that `docs_arguments` added.
 
-    Raises InputError where --docs is no folder, or where the results in --out might overwrite the page.
+    Raises
+    ------
+    InputError
+        If --docs is no folder, or where the results in --out might overwrite the page.
     """
     document, figures = args.document, args.figures or args.out
     if args.docs is not None:

@@ -113,7 +113,10 @@ def method_of_arguments(args: argparse.Namespace, given: dict[str, str], of_scen
 def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters: dict[str, str]) -> None:
     """Fit, write the result into the folder, and print what it is worth.
 
-    parameters   of the scene file
+    Parameters
+    ----------
+    parameters : dict[str, str]
+        Of the scene file.
     """
     from lingo_mi.api.fitting import fit
     from lingo_mi.fitting.measure import summary

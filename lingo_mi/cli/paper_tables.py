@@ -86,12 +86,21 @@ def make_tables(
 ) -> None:
     """Compute the cells of some tables that are not stored yet, and write these tables, in a folder of their own.
 
-    args      as `table_arguments` added them, checked
-    tables    names of `report.TITLES`
-    name      of the scale
-    objects   names of objects, or of the scans in scale.data
+    Parameters
+    ----------
+    args : argparse.Namespace
+        As `table_arguments` added them, checked.
+    tables : Sequence[str]
+        Names of `report.TITLES`.
+    name : str
+        Of the scale.
+    objects : Sequence[str]
+        Names of objects, or of the scans in scale.data.
 
-    Raises InputError after everything else is done where cells could not be computed.
+    Raises
+    ------
+    InputError
+        After everything else is done where cells could not be computed.
     """
     from lingo_mi.validation.tables.cells import SCANNED, Cells
     from lingo_mi.validation.tables.record import Record
@@ -128,7 +137,10 @@ def _make(
 ) -> list[tuple[Any, Any, int]]:
     """Make one table in a folder that no other process writes to.
 
-    Returns the cells that failed, each with its error and the number of cells of the table.
+    Returns
+    -------
+    list[tuple[Any, Any, int]]
+        The cells that failed, each with its error and the number of cells of the table.
     """
     from lingo_mi.validation.tables.report import plan, write
     from lingo_mi.validation.tables.series import compute_missing

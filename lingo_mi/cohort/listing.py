@@ -39,14 +39,19 @@ class BadList(InputError):
 def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
     """The rows of a list: CSV in UTF-8, with a byte-order mark or without, separated by commas, semicolons or tabs.
 
-    method   of rows that name none
+       The first line names the columns (`row.COLUMNS`, options of methods, parameters of scenes). An empty cell is the default.
+       Relative paths begin from the list's folder.
 
-    The first line names the columns (`row.COLUMNS`, options of methods, parameters of scenes). An empty cell is the default.
-    Relative paths begin from the list's folder.
+       Raises InputError where the file is no such list, and `BadList` for rows that cannot be used.
 
-    Raises InputError where the file is no such list, and `BadList` for rows that cannot be used.
+           rows = read_list('cohort.csv')   # file,views
+    foot.pickle,25
+    hand.pickle,10
 
-        rows = read_list('cohort.csv')   # file,views\n foot.pickle,25\n hand.pickle,10
+    Parameters
+    ----------
+    method : str
+        Of rows that name none.
     """
     path = Path(path)
     header, records = _records(path)

@@ -29,17 +29,30 @@ SYSTEM = '.DS_Store', 'Thumbs.db', 'desktop.ini'  # what desktops leave in folde
 class Row:
     """One scan of a list.
 
-    name        of the folder of its result
-    line        of the list
-    folder      of the list, which relative paths begin from
-    file        projections; with a scene for the geometry, a CT volume for its scanner, or '' for its own objects
-    geometry    '', a geometry file, or a scene: its file, or the name of a shipped one
-    method      of the fit: `name` or `name:option=value,...`
-    views       evenly spaced ones to fit; None: all
-    seed        of every random choice
-    mu_water    of a CT volume in Hounsfield units, in 1/mm
-    settings    options that differ from the method's, as text
-    parameters  of the scene, as text
+    Parameters
+    ----------
+    name : str
+        Of the folder of its result.
+    line : int
+        Of the list.
+    folder : str
+        Of the list, which relative paths begin from.
+    file : str
+        Projections; with a scene for the geometry, a CT volume for its scanner, or '' for its own objects.
+    geometry : str
+        '', a geometry file, or a scene: its file, or the name of a shipped one.
+    method : str
+        Of the fit: `name` or `name:option=value,...`.
+    views : int or None
+        Evenly spaced ones to fit; None: all.
+    seed : int
+        Of every random choice.
+    mu_water : float or None
+        Of a CT volume in Hounsfield units, in 1/mm.
+    settings : dict[str, str]
+        Options that differ from the method's, as text.
+    parameters : dict[str, str]
+        Of the scene, as text.
     """
 
     name: str
@@ -61,11 +74,23 @@ class Row:
 
     @property
     def scene(self) -> Path | None:
-        """The file of the scene; None where the geometry is none. Raises InputError where there is no such scene."""
+        """The file of the scene; None where the geometry is none.
+
+        Raises
+        ------
+        InputError
+            If there is no such scene.
+        """
         return scene_of(Path(self.folder), self.geometry)
 
     def fit_method(self) -> Method:
-        """The method with the row's options. Raises InputError for an unknown option, or a value out of its range."""
+        """The method with the row's options.
+
+        Raises
+        ------
+        InputError
+            For an unknown option, or a value out of its range.
+        """
         return method_of(self.method, **self.settings)
 
     def request(self) -> dict:
@@ -94,7 +119,10 @@ class Row:
 def scene_of(folder: Path, geometry: str) -> Path | None:
     """The file of the scene that a column `geometry` names; None for a geometry file, and for ''.
 
-    Raises InputError where it names neither.
+    Raises
+    ------
+    InputError
+        If it names neither.
     """
     if geometry.endswith('.xml'):
         return scene_path(folder / geometry)
@@ -141,7 +169,10 @@ def _asked(method):
 def stored(out: Path, row: Row) -> dict | None:
     """The metrics of a row's whole result in the folder `out`; None where it has not been completed.
 
-    Raises InputError where the row's folder holds something else: another row's result, or files that are not ours.
+    Raises
+    ------
+    InputError
+        If the row's folder holds something else: another row's result, or files that are not ours.
     """
     folder = out / row.name
     if folder.is_symlink() or folder.exists() and not folder.is_dir():

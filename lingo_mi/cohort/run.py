@@ -44,9 +44,12 @@ def done_already(rows: Sequence[Row], out: Path) -> dict[str, dict]:
 def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, dict]) -> Outcome:
     """Fit the scans that are not done, in a folder that no other batch writes to.
 
-    done   as of `done_already`
-
     A scan that fails is tried once more after all others. After KeyboardInterrupt, or a kill, the same call goes on.
+
+    Parameters
+    ----------
+    done : dict[str, dict]
+        As of `done_already`.
     """
     for leftover, target in leftovers(out):
         if target in (CSV, PARQUET):  # the lock is ours

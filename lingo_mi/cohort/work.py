@@ -24,9 +24,17 @@ PATIENCE = 60.0  # seconds: a worker that has lost its scheduler stops after its
 def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
     """Fit a row's scan into the folder `out`/NAME: from its checkpoint, if there is one. Returns the metrics of the result.
 
-    report   called between steps; after its KeyboardInterrupt, and after a kill, the same call goes on
+    What is there already is not done again.
 
-    What is there already is not done again. Raises InputError where the scan cannot be fitted.
+    Parameters
+    ----------
+    report : callable
+        Called between steps; after its KeyboardInterrupt, and after a kill, the same call goes on.
+
+    Raises
+    ------
+    InputError
+        If the scan cannot be fitted.
     """
     folder, scan = Path(out) / row.name, read_row(row)
     _wait_for_lock(folder, report)

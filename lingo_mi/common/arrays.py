@@ -14,14 +14,24 @@ from lingo_mi.common.errors import InputError
 def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarray:
     """`values` as an array, without a copy where that is possible.
 
-    values   numbers, nested lists of them, or an array of any library that has `__array__` or `__dlpack__`: NumPy, PyTorch,
-             Dr.Jit, JAX, ...
-    name     what they are, for messages
-    dtype    of the result; default: their own
+    Parameters
+    ----------
+    values
+        Numbers, nested lists of them, or an array of any library that has `__array__` or `__dlpack__`: NumPy, PyTorch, Dr.Jit,
+        JAX, ...
+    name : str
+        What they are, for messages.
+    dtype : DTypeLike or None
+        Of the result; default: their own.
 
-    Raises InputError where they are no array of real numbers, or one that NumPy cannot reach, such as a PyTorch tensor on a GPU.
+    Raises
+    ------
+    InputError
+        If they are no array of real numbers, or one that NumPy cannot reach, such as a PyTorch tensor on a GPU.
 
-        as_numpy(torch.zeros(3), 'the projections', np.float32)
+    Examples
+    --------
+    >>> as_numpy(torch.zeros(3), 'the projections', np.float32)
     """
     try:
         if hasattr(values, '__dlpack__') and not hasattr(values, '__array__'):

@@ -51,10 +51,16 @@ class AccuracyWarning(UserWarning):
 def require_type(name: str, value: object, kinds: type | tuple[type, ...], mend: str = '') -> None:
     """Raises InputError unless `value` is of one of `kinds`.
 
-    name   of the argument, for the message
-    mend   what to do, for the message
+    Parameters
+    ----------
+    name : str
+        Of the argument, for the message.
+    mend : str
+        What to do, for the message.
 
-        require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
+    Examples
+    --------
+    >>> require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     """
     if not isinstance(value, kinds):
         wanted = ' or '.join(f'a {kind.__name__}' for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))

@@ -22,13 +22,22 @@ _CLOCK, _MEMORY_CLOCK, _BUS = 13, 36, 37  # kHz, kHz, bits
 class GPU:
     """A graphics card.
 
-    name             as its driver gives it
-    memory           bytes
-    multiprocessors  their number
-    warps            that one of them holds at once, at most
-    capability       compute capability times ten: 86, 90
-    clock            of the multiprocessors, Hz; 0 where the driver does not say, as the next
-    bandwidth        of the memory, bytes a second
+    Parameters
+    ----------
+    name : str
+        As its driver gives it.
+    memory : int
+        Bytes.
+    multiprocessors : int
+        Their number.
+    warps : int
+        That one of them holds at once, at most.
+    capability : int
+        Compute capability times ten: 86, 90.
+    clock : float
+        Of the multiprocessors, Hz; 0 where the driver does not say, as the next.
+    bandwidth : float
+        Of the memory, bytes a second.
     """
 
     name: str
@@ -42,7 +51,13 @@ class GPU:
 
 @cache
 def gpu() -> GPU:
-    """The GPU in use. Raises OSError where there is no CUDA driver, or no device."""
+    """The GPU in use.
+
+    Raises
+    ------
+    OSError
+        If there is no CUDA driver, or no device.
+    """
     driver = ctypes.CDLL(_driver())
 
     def ask(name, *arguments):

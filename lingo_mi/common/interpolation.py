@@ -10,8 +10,11 @@ from scipy import ndimage
 def trilinear(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> np.ndarray:
     """Trilinear interpolation of a volume at points, [N]; constant beyond the outermost voxel centres.
 
-    volume  [x, y, z]
-    points  [N, 3] and half, [3], half the volume's sides: both in the normalised frame
+    Parameters
+    ----------
+    volume : ndarray [x, y, z]
+    points : ndarray
+        [N, 3] and half, [3], half the volume's sides: both in the normalised frame.
     """
     place = (np.asarray(points, float) / half + 1) / 2 * volume.shape - 0.5
     return ndimage.map_coordinates(volume, place.T, order=1, mode='nearest')

@@ -28,12 +28,20 @@ def frames(
 ) -> str:
     """Images [n, row, column], first row at the top, as a figure with a slider.
 
-    labels   of the images, n
-    title    of the figure
-    start    the image that is seen first (default: the one in the middle)
-    window   what is black and what is white (default: as `window_of` says)
+    Parameters
+    ----------
+    labels : Sequence[str]
+        Of the images, n.
+    title : str
+        Of the figure.
+    start : int or None
+        The image that is seen first (default: the one in the middle).
+    window : tuple[float, float] or None
+        What is black and what is white (default: as `window_of` says).
 
-        frames(scan.projections, ['0°', '7.2°'], 'projections')
+    Examples
+    --------
+    >>> frames(scan.projections, ['0°', '7.2°'], 'projections')
     """
     from PIL import Image
 

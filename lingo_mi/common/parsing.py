@@ -21,7 +21,10 @@ def parse(name: str, text: str, like: Any) -> Any:
     """The value that `text` says, of the kind of `like`: text, true or false, a whole number, a number, or two numbers, of
     which one stands for both.
 
-    Raises InputError, in the name of `name`.
+    Raises
+    ------
+    InputError
+        In the name of `name`.
     """
     try:
         if isinstance(like, tuple):
@@ -52,9 +55,14 @@ def checked(name: str, value: Any, like: Any) -> Any:
     """A value given in Python, after a check that it is of the kind of `like`: text, True or False, a whole number, a number, or
     two numbers. NumPy's scalars and arrays become Python's.
 
-    Raises InputError, in the name of `name`.
+    Raises
+    ------
+    InputError
+        In the name of `name`.
 
-        checked('rate_centre', np.array([1e-3, 1e-4]), (1.0, 1.0))   # (0.001, 0.0001)
+    Examples
+    --------
+    >>> checked('rate_centre', np.array([1e-3, 1e-4]), (1.0, 1.0))   # (0.001, 0.0001)
     """
     if isinstance(like, tuple):
         pair = value.tolist() if isinstance(value, np.ndarray) else value
@@ -98,9 +106,14 @@ def require_ranges(part: Any, **ranges: tuple[float, float]) -> None:
     """Raises InputError unless the fields of a dataclass that have a default are of its kind, and every number in its range.
     Fields that are dataclasses check themselves.
 
-    ranges   (least, most), both of them allowed, of every such field that holds a number or two
+    Parameters
+    ----------
+    ranges : tuple[float, float]
+        (least, most), both of them allowed, of every such field that holds a number or two.
 
-        require_ranges(self, iterations=(1, 1e9), rate=(0, 1))
+    Examples
+    --------
+    >>> require_ranges(self, iterations=(1, 1e9), rate=(0, 1))
     """
     for f in (f for f in fields(part) if not (f.default is MISSING or is_dataclass(f.default))):
         value = checked(f.name, getattr(part, f.name), f.default)

@@ -27,12 +27,14 @@ LINE = 10.0  # seconds between two plain lines, where 10 % takes longer
 class Progress:
     """Progress through `total` steps.
 
-        with Progress('Fit', 30_000) as progress:
-            for i in range(30_000):
-                ...
-                progress.update(i + 1, loss=lambda: float(loss), gaussians=n)
-
     `update` may be called at every step: it returns at once unless there is something to draw.
+
+    Examples
+    --------
+    >>> with Progress('Fit', 30_000) as progress:
+    ...     for i in range(30_000):
+    ...         ...
+    ...         progress.update(i + 1, loss=lambda: float(loss), gaussians=n)
     """
 
     def __init__(self, description: str, total: int, start: int = 0, shown: bool = True):
@@ -63,9 +65,12 @@ class Progress:
     def update(self, iteration: int, **fields: Any) -> None:
         """Say that `iteration` steps are done.
 
-        fields : what to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or
-                 functions without arguments that give one. A function is called only when its value is drawn,
-                 so that reading a number back from the device does not slow the loop. None is not shown.
+        Parameters
+        ----------
+        fields
+            What to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or functions without
+            arguments that give one. A function is called only when its value is drawn, so that reading a number back from the
+            device does not slow the loop. None is not shown.
         """
         self._done = iteration
         if self._quiet:

@@ -143,7 +143,10 @@ _SHUTDOWN, _INIT, _WHOS = '_Z12jit_shutdowni', '_Z8jit_initj', '_Z12jit_var_whos
 def use_variant(name: str | None = None) -> str:
     """Activate a Mitsuba variant and return its name: `name`, else cuda_ad_mono, else llvm_ad_mono.
 
-    Raises InputError where none can run, saying what to install.
+    Raises
+    ------
+    InputError
+        If none can run, saying what to install.
     """
     import mitsuba as mi
 
@@ -171,9 +174,15 @@ def use_variant(name: str | None = None) -> str:
 def ensure_variant(device: str | None = None) -> str:
     """The name of the active Mitsuba variant, with derivatives; chooses one (`use_variant`) where none is active yet.
 
-    device   'cpu' or 'cuda', where the caller's arrays lie; None: anywhere
+    Parameters
+    ----------
+    device : str or None
+        'cpu' or 'cuda', where the caller's arrays lie; None: anywhere.
 
-    Raises InputError where no such variant can run, or where the active one works on another device.
+    Raises
+    ------
+    InputError
+        If no such variant can run, or where the active one works on another device.
     """
     import mitsuba as mi
 

@@ -22,7 +22,10 @@ from lingo_mi.scan import Scan
 def fit_cloud(scan: Scan, progress: Callable[[int, int], None]) -> Callable[[Grid], np.ndarray]:
     """Fit a cloud to line integrals by `Fast`, and return the function that samples its volume; the `fit` of `Best`.
 
-    progress   called as progress(iterations done, iterations)
+    Parameters
+    ----------
+    progress : callable
+        Called as progress(iterations done, iterations).
     """
     method = Fast()
     return run(replace(scan, effects=None), method, progress=lambda done, **_: progress(done, method.iterations)).volume
@@ -31,14 +34,24 @@ def fit_cloud(scan: Scan, progress: Callable[[int, int], None]) -> Callable[[Gri
 def prepare_completed(scan: Scan, fit: Fit, views: int, algorithm: Algorithm) -> tuple[Scan, dict[str, Any]]:
     """The views that a fit has seen, and views between them, rendered from it: `views` in all.
 
-        completed, inputs = prepare_completed(scan, fit, 100, algorithm)
-        found = run_algorithm(completed, algorithm, **inputs)
+    `Refined` gets the measured views and, in addition, the completed ones and the fit's densities. Any other algorithm gets the
+    completed views.
 
-    scan   holds the views that the fit has seen
+    Parameters
+    ----------
+    scan : Scan
+        Holds the views that the fit has seen.
 
-    `Refined` gets the measured views and, in addition, the completed ones and the fit's densities. Any other algorithm gets
-    the completed views. Raises InputError as `fitted_views`, `require_rays` and `complete_views` do, and for FDK if the fit has
-    corrected the poses. Whether there is memory for the algorithm is not checked.
+    Raises
+    ------
+    InputError
+        As `fitted_views`, `require_rays` and `complete_views` do, and for FDK if the fit has corrected the poses. Whether there
+        is memory for the algorithm is not checked.
+
+    Examples
+    --------
+    >>> completed, inputs = prepare_completed(scan, fit, 100, algorithm)
+    >>> found = run_algorithm(completed, algorithm, **inputs)
     """
     if isinstance(algorithm, Refined):
         require_volume(fit)
@@ -59,13 +72,22 @@ def prepare_completed(scan: Scan, fit: Fit, views: int, algorithm: Algorithm) ->
 def prepare_start(scan: Scan, fit: Fit, algorithm: Algorithm) -> tuple[Scan, dict[str, Any]]:
     """The views that a fit has seen, with its volume as the start.
 
-        views, inputs = prepare_start(scan, fit, algorithm)
-        found = run_algorithm(views, algorithm, **inputs)
+    `Refined` gets a function that samples the fit's densities; its completed_niter must be 0.
 
-    scan   holds the views that the fit has seen
+    Parameters
+    ----------
+    scan : Scan
+        Holds the views that the fit has seen.
 
-    `Refined` gets a function that samples the fit's densities; its completed_niter must be 0. Raises InputError as
-    `fitted_views` does, and for a fit without a volume.
+    Raises
+    ------
+    InputError
+        As `fitted_views` does, and for a fit without a volume.
+
+    Examples
+    --------
+    >>> views, inputs = prepare_start(scan, fit, algorithm)
+    >>> found = run_algorithm(views, algorithm, **inputs)
     """
     require_volume(fit)
     views = without_effects(as_corrected(fitted_views(scan, fit.nominal_geometry), fit), fit)

@@ -24,7 +24,12 @@ def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
     """The measured views of a scan that match the views of `geometry` to a hundredth of a pixel, in its order.
 
     Views are matched by geometry, not by angle: a helix repeats angles at other heights. Among equal views, those that
-    `geometry.trajectories.spread` chooses are preferred, then the first unused. Raises InputError if a view is missing.
+    `geometry.trajectories.spread` chooses are preferred, then the first unused.
+
+    Raises
+    ------
+    InputError
+        If a view is missing.
     """
     reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()
     there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
@@ -94,8 +99,10 @@ def complete_views(scan: Scan, fit: Fit, views: int) -> Scan:
     """A scan of `views` views: the measured ones (`as_corrected` and `without_effects`), and views between them, rendered from
     the fit.
 
-    Raises InputError for fewer views than were measured, for more than a scan may have, and for a scan that is not a circle
-    about z.
+    Raises
+    ------
+    InputError
+        For fewer views than were measured, for more than a scan may have, and for a scan that is not a circle about z.
     """
     require_circle(scan, 'the completion of a scan')
     if views > MOST_VIEWS:
@@ -109,9 +116,15 @@ def insert_views(
 ) -> Scan:
     """A scan of `views` views: the given ones, and views between them from `render(geometry)`.
 
-    circle   nominal geometry of the views, if a fit has corrected the poses (default: the scan's own)
+    Parameters
+    ----------
+    circle : Geometry or None
+        Nominal geometry of the views, if a fit has corrected the poses (default: the scan's own).
 
-    Raises InputError for fewer views than are given, and for invalid pixels.
+    Raises
+    ------
+    InputError
+        For fewer views than are given, and for invalid pixels.
     """
     require_pixels(scan, 'the completion of a scan')
     geometry = circle or scan.geometry

@@ -32,9 +32,14 @@ MOST_STEPS = 1000  # of the search; the remaining error is `Bands.error`
 class Bands:
     """A spectrum for a given choice of materials.
 
-    weights   [K] shares of the signal; they sum to 1
-    ratios    [M, K] attenuation relative to that at the reference energy
-    error     largest error of h, against the full spectrum, over the range that the bands are for
+    Parameters
+    ----------
+    weights : ndarray
+        [K] shares of the signal; they sum to 1.
+    ratios : ndarray
+        [M, K] attenuation relative to that at the reference energy.
+    error : float
+        Largest error of h, against the full spectrum, over the range that the bands are for.
     """
 
     weights: np.ndarray
@@ -48,9 +53,12 @@ class Bands:
     def precorrected(self, measured: ArrayLike) -> np.ndarray:
         """The inverse of h: line integrals at the reference energy from `measured`, float64 (water precorrection, M = 1).
 
-        measured   an array of any shape; h is continued linearly to negative values, which occur with noise
-
         h rises and is concave, so Newton's method converges from any start.
+
+        Parameters
+        ----------
+        measured : array_like
+            An array of any shape; h is continued linearly to negative values, which occur with noise.
         """
         if len(self.ratios) != 1:
             raise InputError(f'precorrection is for one material, not {len(self.ratios)}')
@@ -72,12 +80,21 @@ class Bands:
 def band(signal: ArrayLike, ratios: ArrayLike, count: int, largest: float) -> Bands:
     """The `count` bands that fit a spectrum best.
 
-    signal    [E] shares of the detected signal; they sum to 1
-    ratios    [M, E] attenuation of every material, relative to that at the reference energy
-    count     bands, 1 to 6
-    largest   h up to which they are fitted: of each material alone, and of mixtures of such amounts
+    Parameters
+    ----------
+    signal : array_like
+        [E] shares of the detected signal; they sum to 1.
+    ratios : array_like
+        [M, E] attenuation of every material, relative to that at the reference energy.
+    count : int
+        Bands, 1 to 6.
+    largest : float
+        h up to which they are fitted: of each material alone, and of mixtures of such amounts.
 
-    Raises InputError for a count out of range.
+    Raises
+    ------
+    InputError
+        For a count out of range.
     """
     if not 1 <= count <= MOST_BANDS:
         raise InputError(f'bands must be from 1 to {MOST_BANDS}, not {count}')

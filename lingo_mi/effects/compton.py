@@ -31,9 +31,13 @@ _HC = 12.398420  # keV Angstrom
 def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> np.ndarray:
     """d sigma / d Omega of a free electron, divided by r_e^2, 1/sr, float64. cosine: of the scattering angle, any shape.
 
-    energy     keV
-    response   'energy' weights a photon by the share P of its energy that it keeps (the energy-scattering cross-section of
-               Evans, "The Atomic Nucleus", 1955, ch. 23); 'count' weights it by 1
+    Parameters
+    ----------
+    energy : float
+        keV.
+    response : str
+        'energy' weights a photon by the share P of its energy that it keeps (the energy-scattering cross-section of Evans, "The
+        Atomic Nucleus", 1955, ch. 23); 'count' weights it by 1.
     """
     cosine = np.asarray(cosine, float)
     kept = 1 / (1 + energy / ELECTRON * (1 - cosine))
@@ -44,13 +48,22 @@ def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> 
 def scattering(energy: float, material: str = '', response: str = 'count') -> tuple[np.ndarray, float]:
     """A table of d mu / d Omega, and its integral over all directions.
 
-    energy     keV, 1 to 800
-    material   as for `spectrum.attenuation`: bound electrons with coherent scattering, in 1/mm. '': a free electron,
-               divided by r_e^2
-    response   as for `klein_nishina`, for the incoherent part; coherent scattering keeps the energy
-
     The table is float64 [CELLS + 1], at equal steps of cos theta from -1 to 1 (forward). For a material, its values are means
-    over the cells around the nodes. Raises InputError for an energy out of range, and as `spectrum.attenuation` does.
+    over the cells around the nodes.
+
+    Parameters
+    ----------
+    energy : float
+        keV, 1 to 800.
+    material : str
+        As for `spectrum.attenuation`: bound electrons with coherent scattering, in 1/mm. '': a free electron, divided by r_e^2.
+    response : str
+        As for `klein_nishina`, for the incoherent part; coherent scattering keeps the energy.
+
+    Raises
+    ------
+    InputError
+        For an energy out of range, and as `spectrum.attenuation` does.
     """
     if not LEAST_ENERGY <= energy <= MOST_ENERGY:
         raise InputError(f'energy must be from {LEAST_ENERGY:g} to {MOST_ENERGY:g} keV, not {energy:g}')

@@ -132,8 +132,12 @@ class Detector:
     def signal(self, transmission: ArrayLike, view: int, seed: int = 0) -> np.ndarray:
         """The signal of a view, in units of the open beam's, float64 [v, u], without correction of gains and dead pixels.
 
-        transmission   expected I / I0, [v, u], finite and not negative
-        view, seed     key of the noise, whole numbers from 0
+        Parameters
+        ----------
+        transmission : array_like
+            Expected I / I0, [v, u], finite and not negative.
+        view, seed : int
+            Key of the noise, whole numbers from 0.
         """
         light = np.asarray(transmission, float)
         gains, dead = self.maps(light.shape)
@@ -170,7 +174,10 @@ class Detector:
     def deviation(self, transmission: ArrayLike) -> np.ndarray:
         """Standard deviation of a line integral -ln(N / I0) from counting noise and rounding to `bits`, to first order.
 
-        transmission   any shape; values below the floor count as the floor
+        Parameters
+        ----------
+        transmission : array_like
+            Any shape; values below the floor count as the floor.
         """
         light = np.maximum(transmission, self.floor)
         variance = self._step**2 / 12

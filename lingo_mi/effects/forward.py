@@ -24,9 +24,14 @@ from lingo_mi.scan import Scan
 class Effects:
     """The effects of a scene; None for elements that it does not have.
 
-    tube, spot, scatter   spectrum, focal spot and scattered photons of its `xray_tube`
-    detector              of the sensor's `ct_detector`
-    index                 the sensor's view: with the seeds, the key of its noise
+    Parameters
+    ----------
+    tube, spot, scatter
+        Spectrum, focal spot and scattered photons of its `xray_tube`.
+    detector : Detector or None
+        Of the sensor's `ct_detector`.
+    index : int
+        The sensor's view: with the seeds, the key of its noise.
     """
 
     tube: Tube | None = None
@@ -62,7 +67,13 @@ class Effects:
         return self.tube is not None and (self.tube.hardens or self.scatter is not None)
 
     def of_cloud(self) -> Effects:
-        """The same for a fitted cloud, or a volume, that stands for all shapes. Raises InputError as `Tube.fitted`."""
+        """The same for a fitted cloud, or a volume, that stands for all shapes.
+
+        Raises
+        ------
+        InputError
+            As `Tube.fitted`.
+        """
         return replace(self, tube=self.tube.of_cloud()) if self.tube and self.needs_materials else self
 
     @property
@@ -82,9 +93,13 @@ class Effects:
     def line_integrals(self, objects: list, view: View, options: RenderOptions) -> Any:
         """The expected -ln(I / I0) of every pixel, Float [height * width]; differentiable.
 
-        objects   of `projectors.objects.find_objects`
-        options   its n x n rays per pixel are averaged as intensities; a detector with an `aperture` has points of its own in
-                  every pixel
+        Parameters
+        ----------
+        objects : list
+            Of `projectors.objects.find_objects`.
+        options : RenderOptions
+            Its n x n rays per pixel are averaged as intensities; a detector with an `aperture` has points of its own in every
+            pixel.
         """
         options = self._rays(options)
         groups, bands = {'': objects}, None
@@ -113,8 +128,12 @@ class Effects:
     def averaged(self, along: Callable[[View], Any], view: View, options: RenderOptions, scattered: Any = None) -> Any:
         """-ln of the mean intensity of all rays of a pixel, after the detector's blur.
 
-        along       function of a View: -ln of the intensity along its rays, Float
-        scattered   scattered intensity to add, relative to the open beam's, Float [height * width]
+        Parameters
+        ----------
+        along : callable
+            Function of a View: -ln of the intensity along its rays, Float.
+        scattered
+            Scattered intensity to add, relative to the open beam's, Float [height * width].
         """
         views = self.views(view)
         blurring = self.detector if self.detector and self.detector.psf else None
@@ -189,7 +208,13 @@ def require_whole(film: Any, where: str) -> None:
 
 
 def find_effects(scene: Any, sensor: Any) -> Effects | None:
-    """The effects of a scene with a sensor; None without any. Raises InputError for impossible ones."""
+    """The effects of a scene with a sensor; None without any.
+
+    Raises
+    ------
+    InputError
+        For impossible ones.
+    """
     tubes = [e for e in scene.emitters() if hasattr(e, 'tube')]
     detector = getattr(sensor, 'detector', None) or getattr(sensor.film(), 'detector', None)
     if not tubes and detector is None:

@@ -27,7 +27,10 @@ LARGEST = 10.0  # measured line integral up to which bands are fitted; 5e-5 of t
 class TubeParameters:
     """The parameters of `xray_tube` that concern its spectrum, as a scene gives them; see its documentation.
 
-    materials   those of single shapes, by name: the parameters material_NAME
+    Parameters
+    ----------
+    materials : dict[str, str]
+        Those of single shapes, by name: the parameters material_NAME.
     """
 
     energy: float | None = None
@@ -50,12 +53,20 @@ class TubeParameters:
 class Tube:
     """A spectrum, and the materials of the objects it passes.
 
-    reference   energy at which densities are attenuation in 1/mm, keV
-    material    names of one or two materials, as for `spectrum.attenuation`; empty if a scene does not name any
-    materials   the same for single shapes, by name
-    split       densities between which a grid of two materials changes from the first to the second, 1/mm
-    bands       number of terms for the spectrum
-    given       the parameters of `of`, by name; those of shapes as material_NAME
+    Parameters
+    ----------
+    reference : float
+        Energy at which densities are attenuation in 1/mm, keV.
+    material : tuple[str, ...]
+        Names of one or two materials, as for `spectrum.attenuation`; empty if a scene does not name any.
+    materials : dict[str, tuple[str, ...]]
+        The same for single shapes, by name.
+    split : tuple[float, float] or None
+        Densities between which a grid of two materials changes from the first to the second, 1/mm.
+    bands : int
+        Number of terms for the spectrum.
+    given : dict
+        The parameters of `of`, by name; those of shapes as material_NAME.
     """
 
     spectrum: Spectrum
@@ -111,7 +122,13 @@ class Tube:
         return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
 
     def made_of(self, name: str) -> tuple[str, ...]:
-        """The materials of a shape. Raises InputError if the scene does not name them."""
+        """The materials of a shape.
+
+        Raises
+        ------
+        InputError
+            If the scene does not name them.
+        """
         names = self.materials.get(name, self.material)
         if not names:
             raise InputError(
@@ -143,7 +160,13 @@ class Tube:
         return names
 
     def of_cloud(self) -> Tube:
-        """The tube of a fitted cloud, which stands for all shapes. Raises InputError as `fitted`."""
+        """The tube of a fitted cloud, which stands for all shapes.
+
+        Raises
+        ------
+        InputError
+            As `fitted`.
+        """
         return replace(self, material=self.fitted(), materials={})
 
     def signal(self, names: Iterable[str], response: str = 'energy') -> energy_bands.Bands:

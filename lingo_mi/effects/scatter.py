@@ -87,7 +87,13 @@ class Scatter:
         )
 
     def within(self, geometry: Geometry) -> Scatter:
-        """The same, but nothing scatters outside a geometry's volume. Raises InputError where the two boxes do not meet."""
+        """The same, but nothing scatters outside a geometry's volume.
+
+        Raises
+        ------
+        InputError
+            If the two boxes do not meet.
+        """
         low, high = geometry.grid.low, geometry.grid.high
         if self.box is not None:
             low, high = np.maximum(low, self.box[0]), np.minimum(high, self.box[1])
@@ -114,12 +120,21 @@ class Scatter:
     def light(self, objects: list, tube: Tube, response: str, view: View, index: int) -> Any:
         """Scattered signal, relative to the open beam's, at a view's pixel centres, Float [height * width]. Not differentiable.
 
-        objects    of `projectors.objects.find_objects`
-        tube       `hardening.Tube` with the objects' materials
-        response   'energy' or 'count'
-        index      key of the random numbers, together with `seed`
+        Parameters
+        ----------
+        objects : list
+            Of `projectors.objects.find_objects`.
+        tube : Tube
+            `hardening.Tube` with the objects' materials.
+        response : str
+            'energy' or 'count'.
+        index : int
+            Key of the random numbers, together with `seed`.
 
-        Raises InputError if an object has no material or reaches the panel.
+        Raises
+        ------
+        InputError
+            If an object has no material or reaches the panel.
         """
         means, errors = self.estimate(objects, tube, response, view, index)
         return mi.Float(smoothed(means, errors, view.height, view.width).astype(np.float32).ravel())
@@ -168,8 +183,11 @@ def _corners(text):
 def smoothed(means: np.ndarray, errors: np.ndarray, height: int, width: int) -> np.ndarray:
     """A bicubic smoothing spline at the pixel centres, [height, width], not negative.
 
-    means, errors   [rows, columns], at equal steps from edge to edge of the panel; the spline's squared residuals sum to
-                    the squared errors (Dierckx, "Curve and Surface Fitting with Splines", 1993, ch. 5)
+    Parameters
+    ----------
+    means, errors : ndarray [rows, columns]
+        At equal steps from edge to edge of the panel; the spline's squared residuals sum to the squared errors (Dierckx, "Curve
+        and Surface Fitting with Splines", 1993, ch. 5).
     """
     rows, columns = (np.linspace(0, size, n) for n, size in zip(means.shape, (height, width)))
     residual: Any = float((errors**2).sum())  # SciPy declares a whole number

@@ -37,8 +37,12 @@ NAMES = {
 class Spectrum:
     """Photons by energy.
 
-    energies   [E] keV, ascending: the middles of the bins
-    photons    [E] their shares of all photons; they sum to 1
+    Parameters
+    ----------
+    energies : ndarray
+        [E] keV, ascending: the middles of the bins.
+    photons : ndarray
+        [E] their shares of all photons; they sum to 1.
     """
 
     energies: np.ndarray
@@ -58,7 +62,13 @@ class Spectrum:
 
 
 def monochromatic(energy: float) -> Spectrum:
-    """Photons of one energy, keV. Raises InputError unless it is positive and finite."""
+    """Photons of one energy, keV.
+
+    Raises
+    ------
+    InputError
+        Unless it is positive and finite.
+    """
     if not (np.isfinite(energy) and energy > 0):
         raise InputError(f'energy must be positive, in keV, not {energy:g}')
     return Spectrum(np.array([float(energy)]), np.ones(1))
@@ -67,11 +77,19 @@ def monochromatic(energy: float) -> Spectrum:
 def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -> Spectrum:
     """The spectrum of a tube with a tungsten anode, from spekpy (Poludniowski et al., Med. Phys. 48, 2021).
 
-    kvp          peak voltage, kV, 20 to 300
-    angle        of the anode, degrees, above 0 and below 90
-    filtration   'Al 2.5, Cu 0.1': materials and thicknesses in mm; may be empty
+    Parameters
+    ----------
+    kvp : float
+        Peak voltage, kV, 20 to 300.
+    angle : float
+        Of the anode, degrees, above 0 and below 90.
+    filtration : str
+        'Al 2.5, Cu 0.1': materials and thicknesses in mm; may be empty.
 
-    Raises InputError if a parameter is out of range, spekpy does not know a material, or it is not installed.
+    Raises
+    ------
+    InputError
+        If a parameter is out of range, spekpy does not know a material, or it is not installed.
     """
     if not LEAST_KVP <= kvp <= MOST_KVP:
         raise InputError(f'kvp must be from {LEAST_KVP:g} to {MOST_KVP:g} kV, not {kvp:g}')
@@ -104,10 +122,16 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
 def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
     """Linear attenuation coefficients, 1/mm, at energies in keV, with coherent scattering (xraylib).
 
-    material   a short name of `NAMES`, a compound of the NIST database as xraylib spells it, an element's symbol, or a
-               chemical formula with its density in g/cm3: 'CsI @ 4.51'
+    Parameters
+    ----------
+    material : str
+        A short name of `NAMES`, a compound of the NIST database as xraylib spells it, an element's symbol, or a chemical formula
+        with its density in g/cm3: 'CsI @ 4.51'.
 
-    Raises InputError for an unknown material, for energies that xraylib does not know, or if it is not installed.
+    Raises
+    ------
+    InputError
+        For an unknown material, for energies that xraylib does not know, or if it is not installed.
     """
     xraylib = library('xraylib')
     formula, density = compound(material)
@@ -120,7 +144,13 @@ def attenuation(material: str, energies: ArrayLike) -> np.ndarray:
 
 
 def compound(material: str) -> tuple[str, float]:
-    """A material's name in xraylib, and its density in g/cm3. Raises InputError as `attenuation` does."""
+    """A material's name in xraylib, and its density in g/cm3.
+
+    Raises
+    ------
+    InputError
+        As `attenuation` does.
+    """
     xraylib = library('xraylib')
     formula, at, density = (part.strip() for part in material.partition('@'))
     formula = NAMES.get(formula.lower(), formula)
@@ -160,7 +190,13 @@ def _filters(text: str) -> list[tuple[str, float]]:
 
 
 def library(name: str) -> Any:
-    """The module spekpy or xraylib. Raises InputError if it is not installed."""
+    """The module spekpy or xraylib.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
+    """
     try:
         return importlib.import_module(name)
     except ImportError:

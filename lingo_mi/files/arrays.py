@@ -38,14 +38,24 @@ def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: 
 
 
 def read_npy(path: PathLike | str, ndim: int | None, finite: bool = True) -> np.ndarray:
-    """The array of a .npy file. Raises InputError if it is missing, damaged, pickled, not finite (unless it need
-    not be) or not `ndim`-D (None: any)."""
+    """The array of a .npy file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, pickled, not finite (unless it need not be) or not `ndim`-D (None: any).
+    """
     return numeric(_numpy_load(path, np.ndarray), path, ndim, finite)
 
 
 def read_npz(path: PathLike | str) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file by name. Raises InputError if it is missing, damaged or holds pickled
-    objects."""
+    """The arrays of a .npz file by name.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged or holds pickled objects.
+    """
     return _numpy_load(path, dict)
 
 
@@ -92,7 +102,13 @@ def _claimed(stream: IO[bytes], size: int) -> int:
 
 
 def write_npy(path: PathLike | str, array: np.ndarray) -> None:
-    """Writes a .npy file, whole or not at all. Raises InputError if that is impossible."""
+    """Writes a .npy file, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If that is impossible.
+    """
     with replacing(path) as temporary:
         write_npy_in_place(temporary, array)
 

@@ -25,7 +25,10 @@ _NO_SCAN_LINES = 0x200 | 0x800 | 0x1000  # flags: tiles, deep pixels, several pa
 def write_exr(path: PathLike | str, image: np.ndarray) -> None:
     """Writes `image` [v, u] as the float32 channel Y (luminance), whole or not at all.
 
-    Raises InputError if the image is not 2D, empty or not finite, or the file cannot be written.
+    Raises
+    ------
+    InputError
+        If the image is not 2D, empty or not finite, or the file cannot be written.
     """
     image = np.ascontiguousarray(numeric(np.asarray(image), path, 2), np.float32)
     header = {'compression': OpenEXR.ZIP_COMPRESSION, 'type': OpenEXR.scanlineimage}
@@ -50,7 +53,10 @@ def _write(file: OpenEXR.File, path: Path) -> None:
 def read_exr(path: PathLike | str) -> np.ndarray:
     """Reads the channel Y, or the only channel, of an OpenEXR file: float32 [v, u].
 
-    Raises InputError if the file is missing, damaged, has several channels and no Y, or is not finite.
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, has several channels and no Y, or is not finite.
     """
     with reading(path):
         with open(path, 'rb') as stream:
@@ -76,7 +82,10 @@ def read_exr(path: PathLike | str) -> np.ndarray:
 def _shape(header: bytes, path: PathLike | str) -> tuple[tuple[int, int], int]:
     """Lines and columns that a file's header claims, and bytes of a pixel: before the library allocates them.
 
-    Raises InputError for a damaged header, and for files of another kind than scan lines.
+    Raises
+    ------
+    InputError
+        For a damaged header, and for files of another kind than scan lines.
     """
     window: Any = ()
     pixel = 0

@@ -57,7 +57,10 @@ _NRRD_TO_LPS = {
 def read_metaimage(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The values [x, y, z] and the affine [4, 4] in mm, ITK's axes (left, posterior, superior).
 
-    Raises InputError where a file is missing, damaged or another one, or says what is not read here.
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or another one, or says what is not read here.
     """
     with reading(path), open(path, 'rb') as stream:
         header, end = _metaimage_header(stream.read(_LONGEST_HEADER), path)
@@ -95,7 +98,10 @@ def read_metaimage(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def read_nrrd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The values [x, y, z] and the affine [4, 4] in mm, axes left, posterior, superior.
 
-    Raises InputError where a file is missing, damaged or another one, or says what is not read here.
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or another one, or says what is not read here.
     """
     with reading(path), open(path, 'rb') as stream:
         header, end = _nrrd_header(stream.read(_LONGEST_HEADER), path)

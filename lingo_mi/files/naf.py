@@ -183,7 +183,10 @@ def _scan(stream):
 def _resolve(value, left, depth=0):
     """`value` with real arrays in place of their stand-ins. Anything but plain data is refused.
 
-    left   [how many values it may still hold]: one that is used again counts again
+    Parameters
+    ----------
+    left
+        [how many values it may still hold]: one that is used again counts again.
     """
     left[0] -= 1
     if left[0] < 0:
@@ -214,9 +217,11 @@ def _plain(value):
 def load_pickle(path: PathLike | str) -> Any:
     """The plain data in a pickle, protocols 0 to 5 of Python 3, written by NumPy 1 or 2.
 
-    Raises InputError if the file is missing, truncated, or holds anything but dictionaries, lists, tuples,
-    strings, numbers and numeric arrays; the message names the refused global. No code named by the file is
-    run.
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, or holds anything but dictionaries, lists, tuples, strings, numbers and numeric arrays;
+        the message names the refused global. No code named by the file is run.
     """
     with reading(path), open(path, 'rb') as stream:
         try:
@@ -277,8 +282,15 @@ def read_naf(path: PathLike | str) -> Dataset:
     train: {projections [n, v, u], angles [n] radians}. Optional: val or test, image [x, y, z], mode ('cone'),
     offOrigin, offDetector (u, v), numTrain, numVal. Other keys are ignored.
 
-    Returns a Dataset with projections in density times mm (the file's, times 1000). Raises InputError if the
-    file is missing, damaged, refused (see `load_pickle`) or contradicts itself.
+    Returns
+    -------
+    Dataset
+        A Dataset with projections in density times mm (the file's, times 1000).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, refused (see `load_pickle`) or contradicts itself.
     """
     data = load_pickle(path)
     if not isinstance(data, dict) or 'train' not in data:
@@ -308,9 +320,13 @@ class _Pickler(pickle.Pickler):
 def write_naf(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
 
-    Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v).
-    For a panel that is not square, NAF's own code expects nDetector as (u, v); the readers of R2-Gaussian and of
-    this module do not. Raises InputError if the file cannot be written or the test views have another scanner.
+    Projections are stored in metres (ours / 1000), nDetector and dDetector as (v, u), offDetector as (u, v). For a panel that is
+    not square, NAF's own code expects nDetector as (u, v); the readers of R2-Gaussian and of this module do not.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written or the test views have another scanner.
     """
     geometry = one_circle(dataset, path)
     start, total = angle_range(geometry.angles)

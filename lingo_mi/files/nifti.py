@@ -23,7 +23,10 @@ _LONGEST_HEADER = 540
 def read_nifti(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """The values [x, y, z] with the header's slope, the affine [4, 4] in mm, and the description.
 
-    Raises InputError where a file is missing, damaged or another one.
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or another one.
     """
     from nibabel.arrayproxy import ArrayProxy
 

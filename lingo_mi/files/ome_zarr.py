@@ -25,7 +25,10 @@ SPACE = 'x', 'y', 'z'
 def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """The values [x, y, z], the affine [4, 4] in mm, and a description where the file is of ours, else ''.
 
-    Raises InputError where the folder is damaged, another one, or has several values a voxel; and where zarr is missing.
+    Raises
+    ------
+    InputError
+        If the folder is damaged, another one, or has several values a voxel; and where zarr is missing.
     """
     zarr = optional('zarr', 'ome-zarr')
 

@@ -55,7 +55,10 @@ class _Loader(yaml.SafeLoader):
 def read_yaml(path: PathLike | str) -> Any:
     """The dictionaries, lists, texts and numbers of a file.
 
-    Raises InputError where it is missing, no YAML, or holds what the module's title names.
+    Raises
+    ------
+    InputError
+        If it is missing, no YAML, or holds what the module's title names.
     """
     try:
         with reading(path):

@@ -85,11 +85,15 @@ def write_ply(
 ) -> None:
     """Writes a cloud, whole or not at all.
 
-    centres [N, 3] and scales [N, 3] (standard deviations, > 0) in one unit of length, quaternions [N, 4] (x,
-    y, z, w; normalised here), density [N] at the centres; second [N], if given, is a further property of that name, a
-    second material's share in the density. Raises InputError for wrong shapes, values that are
-    not finite, scales that are not positive, zero quaternions, an empty cloud, or a file that cannot be
-    written.
+    centres [N, 3] and scales [N, 3] (standard deviations, > 0) in one unit of length, quaternions [N, 4] (x, y, z, w; normalised
+    here), density [N] at the centres; second [N], if given, is a further property of that name, a second material's share in the
+    density.
+
+    Raises
+    ------
+    InputError
+        For wrong shapes, values that are not finite, scales that are not positive, zero quaternions, an empty cloud, or a file
+        that cannot be written.
     """
     centres, scales, quaternions, density = (np.asarray(a, float) for a in (centres, scales, quaternions, density))
     density = density.reshape(-1) if density.shape[1:] == (1,) else density
@@ -121,8 +125,12 @@ def write_radiance_ply(
     """Writes a grey cloud as 3DGS does, for its viewers, whole or not at all.
 
     centres, scales, quaternions as for `write_ply`; opacity [N] in [0, 1]; radiance [N] and harmonics [N, 0, 3, 8 or 15]:
-    coefficients of the spherical harmonics of degree 0 and of higher degrees. Viewers add 1/2 to their sum. Raises InputError
-    as `write_ply` does.
+    coefficients of the spherical harmonics of degree 0 and of higher degrees. Viewers add 1/2 to their sum.
+
+    Raises
+    ------
+    InputError
+        As `write_ply` does.
     """
     centres, scales, quaternions, opacity = (np.asarray(a, float) for a in (centres, scales, quaternions, opacity))
     _check(path, centres, scales, quaternions, opacity, 'opacity')
@@ -235,8 +243,12 @@ def require_elements(path: PathLike | str) -> None:
 def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Reads a cloud: (centres [N, 3], scales [N, 3], quaternions [N, 4] (x, y, z, w), density [N]), float32.
 
-    Properties may come in any order; all but centre, scale, rot and density are ignored. Raises InputError if
-    the file is missing, truncated, has no density, or holds values that `write_ply` would refuse.
+    Properties may come in any order; all but centre, scale, rot and density are ignored.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, has no density, or holds values that `write_ply` would refuse.
     """
     with reading(path), open(path, 'rb') as stream:
         n, dtype = _header(stream, path)

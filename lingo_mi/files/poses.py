@@ -29,12 +29,21 @@ def read_poses(
 ) -> Rays:
     """The views of a file of poses, in mm.
 
-    nDetector   (v, u) pixels
-    dDetector   (v, u) mm, if the file does not contain it
-    parallel    whether a .npy, .txt or .csv has a parallel beam; an .xml contains it
-    towards     a point in front of every source, such as the volume's centre; determines the sign of a matrix
+    Parameters
+    ----------
+    nDetector : tuple[int, int]
+        (v, u) pixels.
+    dDetector : tuple[float, float] or None
+        (v, u) mm, if the file does not contain it.
+    parallel : bool
+        Whether a .npy, .txt or .csv has a parallel beam; an .xml contains it.
+    towards : array_like
+        A point in front of every source, such as the volume's centre; determines the sign of a matrix.
 
-    Raises InputError if the file is missing, damaged or of unknown kind, or if it needs dDetector and that is missing.
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of unknown kind, or if it needs dDetector and that is missing.
     """
     path = Path(path)
     suffix = path.suffix.lower()

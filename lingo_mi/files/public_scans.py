@@ -25,9 +25,15 @@ _WALNUT = {'DSO', 'DSD', 'dDetector', 'angles', 'projections', 'air'}
 def read_public_scan(path: PathLike | str, name: str = 'ta') -> Dataset:
     """Reads a public scan.
 
-    name   which sinogram of the Helsinki Tomography Challenge
+    Parameters
+    ----------
+    name : str
+        Which sinogram of the Helsinki Tomography Challenge.
 
-    Raises InputError if the file is damaged, none of those above, or contradicts itself.
+    Raises
+    ------
+    InputError
+        If the file is damaged, none of those above, or contradicts itself.
     """
     data = arrays.read_npz(path)
     if any(key.startswith('sinogram_') for key in data) and data.keys() >= _HTC:

@@ -1,7 +1,6 @@
 """The folder of R2-Gaussian: `meta_data.json`, the true volume and one .npy file per projection.
 
-    meta_data.json   {"scanner": {...}, "vol" (or "ct"): file, "bbox", "proj_train", "proj_test":
-                     [{"file_path", "angle"}]}
+- `meta_data.json`: {"scanner": {...}, "vol" (or "ct"): file, "bbox", "proj_train", "proj_test": [{"file_path", "angle"}]}
 
 Lengths have any one unit (its synthetic scans have DSD 7, DSO 5, sVoxel 2), and so have the projections' line
 integrals; here the numbers are taken as mm. nDetector and sDetector are (v, u), rows along -z; nVoxel, sVoxel
@@ -61,8 +60,15 @@ def _views(meta, split, where):
 def read_r2(path: PathLike | str) -> Dataset:
     """Reads an R2-Gaussian folder.
 
-    Returns a Dataset; the test views and the volume are None where the folder has none. Raises InputError if
-    a file is missing or damaged, or shapes and geometry disagree.
+    Returns
+    -------
+    Dataset
+        A Dataset; the test views and the volume are None where the folder has none.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged, or shapes and geometry disagree.
     """
     folder = Path(path)
     where = folder / META
@@ -87,8 +93,12 @@ def read_r2(path: PathLike | str) -> Dataset:
 def write_r2(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a new R2-Gaussian folder, whole or not at all; lengths and projections stay in mm.
 
-    R2-Gaussian itself cannot read a folder without a volume. Raises InputError if the folder exists and is
-    not empty, cannot be written, or the test views have another scanner.
+    R2-Gaussian itself cannot read a folder without a volume.
+
+    Raises
+    ------
+    InputError
+        If the folder exists and is not empty, cannot be written, or the test views have another scanner.
     """
     geometry = one_circle(dataset, path)
     start, total = angle_range(geometry.angles)

@@ -151,18 +151,27 @@ def to_geometry(
 ) -> Geometry:
     """A Geometry from TIGRE's names.
 
-    values           DSO, DSD, nDetector, dDetector or sDetector in (v, u), nVoxel, dVoxel or sVoxel in (x, y,
-                     z); optional: mode, offOrigin (x, y, z), offDetector; all lengths in mm. With offset_order 'vu', DSO,
-                     DSD, offOrigin and offDetector may be lists of one value a view, and rotDetector, COR and tilt (one
-                     value or one a view; angles in degrees), pitch (mm a turn) or z (mm) may be given: see
-                     `Geometry.per_view` and `trajectories.helix`
-    angles           [n] radians; [n, 3] for TIGRE's Euler angles
-    where            the file, for messages
-    detector_shape   (v, u) pixels of the projections; if nDetector has these the other way round, nDetector
-                     and the panel's size are taken as (u, v)
-    offset_order     'vu' (TIGRE) or 'uv' (NAF and R2-Gaussian, which hand it to TIGRE reversed)
+    Parameters
+    ----------
+    values : dict
+        DSO, DSD, nDetector, dDetector or sDetector in (v, u), nVoxel, dVoxel or sVoxel in (x, y, z); optional: mode, offOrigin
+        (x, y, z), offDetector; all lengths in mm. With offset_order 'vu', DSO, DSD, offOrigin and offDetector may be lists of one
+        value a view, and rotDetector, COR and tilt (one value or one a view; angles in degrees), pitch (mm a turn) or z (mm) may
+        be given: see `Geometry.per_view` and `trajectories.helix`.
+    angles : array_like
+        [n] radians; [n, 3] for TIGRE's Euler angles.
+    where : path-like
+        The file, for messages.
+    detector_shape : tuple[int, ...] or None
+        (v, u) pixels of the projections; if nDetector has these the other way round, nDetector and the panel's size are taken as
+        (u, v).
+    offset_order : str
+        'vu' (TIGRE) or 'uv' (NAF and R2-Gaussian, which hand it to TIGRE reversed).
 
-    Raises InputError if a value is missing, contradictory or out of range.
+    Raises
+    ------
+    InputError
+        If a value is missing, contradictory or out of range.
     """
     values, angles = dict(values), np.asarray(angles)
     n_detector = _counts(values, 'nDetector', where, 2)
@@ -211,9 +220,15 @@ def to_geometry(
 def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) -> Geometry:
     """A Geometry of given poses: views(nDetector, dDetector or None, parallel, offOrigin) gives them.
 
-    values   nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin
+    Parameters
+    ----------
+    values : dict
+        nDetector, nVoxel, dVoxel or sVoxel; optional: dDetector or sDetector, mode, offOrigin.
 
-    Raises InputError if a value is missing or out of range, or if one is given that the poses already contain.
+    Raises
+    ------
+    InputError
+        If a value is missing or out of range, or if one is given that the poses already contain.
     """
     known = [
         k
@@ -294,7 +309,10 @@ def make_dataset(train: Scan, test: Scan | None, volume: np.ndarray | None, wher
 def one_circle(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
     """The geometry of the training views, for formats of circular scans.
 
-    Raises InputError if a view is not on the circle, or the test views differ in more than their angles.
+    Raises
+    ------
+    InputError
+        If a view is not on the circle, or the test views differ in more than their angles.
     """
     geometry = dataset.train.geometry
     circular = all(

@@ -111,7 +111,13 @@ VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 
 def load_yaml(path: PathLike | str) -> dict:
-    """The names of a geometry file. Raises InputError if it is missing, damaged, or has others."""
+    """The names of a geometry file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, or has others.
+    """
     values = plain_yaml.read_yaml(path)
     if not isinstance(values, dict):
         raise InputError(f'{path}: must hold the scan geometry as "name: value" lines')
@@ -225,7 +231,13 @@ def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
 
 
 def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
-    """The geometry file of an .npy: the one that is named, else one beside it. Raises InputError where there is none."""
+    """The geometry file of an .npy: the one that is named, else one beside it.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
     if geometry is not None:
         return geometry
     beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
@@ -263,7 +275,13 @@ def written_files(path: Path) -> list[Path]:
 
 
 def named_files(geometry: PathLike | str) -> list[Path]:
-    """The files that a geometry file, .yml, names. Raises InputError as `load_yaml`."""
+    """The files that a geometry file, .yml, names.
+
+    Raises
+    ------
+    InputError
+        As `load_yaml`.
+    """
     values = load_yaml(geometry)
     names = (values.get(key) for key in ('poses', 'test_poses', 'valid'))
     return [beside(geometry, name) for name in names if isinstance(name, str)]
@@ -364,21 +382,38 @@ def _write_exr_folder(path, dataset):
 def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Dataset:
     """Reads a scan; the format follows from the path.
 
-    path       .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: a public
-               scan (`public_scans`); a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR
-               views)
-    geometry   the geometry file of an .npy; without it, the .yml or .yaml of the same stem
-    name       which sinogram of the Helsinki Tomography Challenge
+    Parameters
+    ----------
+    path : path-like
+        .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: a public scan (`public_scans`); a
+        folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR views).
+    geometry : path-like or None
+        The geometry file of an .npy; without it, the .yml or .yaml of the same stem.
+    name : str
+        Which sinogram of the Helsinki Tomography Challenge.
 
-    Returns a Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are
-    None where the format has none. Raises InputError if a file is missing, damaged, unknown, or contradicts
-    its geometry.
+    Returns
+    -------
+    Dataset
+        A Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are None where the format
+        has none.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged, unknown, or contradicts its geometry.
     """
     return reader_of(path, geometry, name)()
 
 
 def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Callable[[], Dataset]:
-    """What reads a scan when it is called. Raises InputError for what can be seen without that; arguments as of `read_scan`."""
+    """What reads a scan when it is called.
+
+    Raises
+    ------
+    InputError
+        For what can be seen without that; arguments as of `read_scan`.
+    """
     path = Path(path)
     suffix = path.suffix.lower()
     if geometry is not None and suffix != '.npy':
@@ -417,7 +452,13 @@ _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, '
 
 
 def history_of(path: PathLike | str) -> Any:
-    """What a scan's geometry file says of how it was made; None where it says nothing. Raises InputError as `read_scan` does."""
+    """What a scan's geometry file says of how it was made; None where it says nothing.
+
+    Raises
+    ------
+    InputError
+        As `read_scan` does.
+    """
     path = Path(path)
     return load_yaml(geometry_file_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
 
@@ -425,12 +466,18 @@ def history_of(path: PathLike | str) -> Any:
 def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:
     """Writes a scan that `read_scan` reads back, whole or not at all.
 
-    kind   'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path`
-           and its .yml, for training views alone, and the mask of valid pixels if there is one
-    history   how it was made, plain values by name; for 'npy'
+    Parameters
+    ----------
+    kind : str
+        'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path` and its .yml, for
+        training views alone, and the mask of valid pixels if there is one.
+    history : dict or None
+        How it was made, plain values by name; for 'npy'.
 
-    Raises InputError if the kind is unknown, a folder exists already, the file cannot be written, or the
-    format cannot hold the data.
+    Raises
+    ------
+    InputError
+        If the kind is unknown, a folder exists already, the file cannot be written, or the format cannot hold the data.
     """
     if kind not in _WRITERS:
         raise InputError(f'{kind!r} is not a kind of scan file; choose one of {", ".join(_WRITERS)}')

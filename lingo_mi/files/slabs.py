@@ -49,16 +49,27 @@ def write_slabs(
 ) -> None:
     """Write a volume, whole or not at all, holding one slab of it at a time.
 
-    path          .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of
-                  2 x 2 x 2 voxels)
-    grid          of the whole volume
-    slabs         float32 [x, y, slices] from the first slice on, together the whole volume
-    description   what the values are, as of `write_volume`
+    Parameters
+    ----------
+    path : path-like
+        .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of 2 x 2 x 2
+        voxels).
+    grid : Grid
+        Of the whole volume.
+    slabs : Iterable[ndarray]
+        float32 [x, y, slices] from the first slice on, together the whole volume.
+    description : str
+        What the values are, as of `write_volume`.
 
-    Raises InputError for another suffix, values that are not finite, slabs that do not make the volume, and a file that cannot be
-    written. Slabs of `THICKNESS` slices make whole chunks of .ome.zarr, which are written fastest.
+    Raises
+    ------
+    InputError
+        For another suffix, values that are not finite, slabs that do not make the volume, and a file that cannot be written.
+        Slabs of `THICKNESS` slices make whole chunks of .ome.zarr, which are written fastest.
 
-        write_slabs('foot.ome.zarr', scan.geometry.grid, FDK().slabs(scan, 64))
+    Examples
+    --------
+    >>> write_slabs('foot.ome.zarr', scan.geometry.grid, FDK().slabs(scan, 64))
     """
     path = Path(path)
     check_volume_name(path)

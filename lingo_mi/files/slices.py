@@ -35,7 +35,10 @@ _MILLIMETRES = {
 def read_folder(folder: Path) -> tuple[np.ndarray, np.ndarray | None, Path | None]:
     """The values [x, y, z] of a folder of slices; a DICOM series' affine [4, 4] in mm (NIfTI's axes); the first slice of TIFF.
 
-    Raises InputError where there are none, or they do not make one volume.
+    Raises
+    ------
+    InputError
+        If there are none, or they do not make one volume.
     """
     with reading(folder, folder=True):
         tiffs = sorted((f for f in folder.iterdir() if f.suffix.lower() in ('.tif', '.tiff')), key=by_number)
@@ -118,7 +121,13 @@ def _of_imagej(file, page):
 
 
 def read_tiff_file(path: Path) -> np.ndarray:
-    """The first series of images of a TIFF file, as it is stored. Raises InputError where it is damaged, or claims too much."""
+    """The first series of images of a TIFF file, as it is stored.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, or claims too much.
+    """
     tifffile = optional('tifffile')
     try:
         with reading(path):
@@ -142,7 +151,13 @@ def read_tiff_file(path: Path) -> np.ndarray:
 
 
 def read_tiff(files: list[Path]) -> np.ndarray:
-    """The values [x, y, z] of one file of [z, y, x], or of several of [y, x]. Raises InputError where there are none."""
+    """The values [x, y, z] of one file of [z, y, x], or of several of [y, x].
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
     slices = [read_tiff_file(files[0])]
     require_room(len(files) * slices[0].size * 8, files[0])
     slices += [read_tiff_file(file) for file in files[1:]]

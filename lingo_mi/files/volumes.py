@@ -49,11 +49,16 @@ _KNOWN_RAW = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uin
 class Volume:
     """A CT volume.
 
-    data      float32 [x, y, z], density
-    spacing   voxel size (x, y, z), mm
-    affine    float64 [4, 4], voxel index to the centre of the voxel in the world, mm; NIfTI's axes (right,
-              anterior, superior) for the medical formats
-    unit      '1/mm'; 'normalised' for densities scaled to [0, 1]; or the description of a file of ours
+    Parameters
+    ----------
+    data : float32 [x, y, z]
+        Density.
+    spacing : tuple[float, float, float]
+        Voxel size (x, y, z), mm.
+    affine : float64 [4, 4]
+        Voxel index to the centre of the voxel in the world, mm; NIfTI's axes (right, anterior, superior) for the medical formats.
+    unit : str
+        '1/mm'; 'normalised' for densities scaled to [0, 1]; or the description of a file of ours.
     """
 
     data: np.ndarray
@@ -172,20 +177,31 @@ def read_volume(
 ) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
-    path       .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd; .ome.zarr (zarr); .npy, .npz with one 3D array,
-               [x, y, z]; .tif, .tiff or a folder of them, [z][y, x], sorted by name (tifffile); a folder of
-               DICOM slices, sorted by position (pydicom); .raw, or any file if shape and dtype are given
-    mu_water   attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1]
-    shape      of raw bytes, (x, y, z), x fastest
-    dtype      of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3
-               `foot`
-    spacing    voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm); TIFF has it where ImageJ or
-               OME wrote it
-    hu         whether the values are Hounsfield units, if that is not clear from the values
+    Values become densities by the rules of the module.
 
-    Values become densities by the rules of the module. Raises InputError if the file is missing, damaged,
-    empty, not 3D, not finite or ambiguous, slices are unevenly spaced, or a package of the `formats` extra is
-    missing.
+    Parameters
+    ----------
+    path : path-like
+        .nii, .nii.gz, .hdr/.img; .nrrd, .nhdr, .mha, .mhd; .ome.zarr (zarr); .npy, .npz with one 3D array, [x, y, z]; .tif, .tiff
+        or a folder of them, [z][y, x], sorted by name (tifffile); a folder of DICOM slices, sorted by position (pydicom); .raw,
+        or any file if shape and dtype are given.
+    mu_water : float or None
+        Attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1].
+    shape : Sequence[int] or None
+        Of raw bytes, (x, y, z), x fastest.
+    dtype
+        Of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3 `foot`.
+    spacing : array_like or None
+        Voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm); TIFF has it where ImageJ or OME wrote
+        it.
+    hu : bool or None
+        Whether the values are Hounsfield units, if that is not clear from the values.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, empty, not 3D, not finite or ambiguous, slices are unevenly spaced, or a package of the
+        `formats` extra is missing.
     """
     path = Path(path)
     name, description, affine, tiff = path.name.lower(), '', None, None
@@ -254,13 +270,21 @@ def read_volume(
 def write_volume(path: PathLike | str, data: np.ndarray, grid: Grid, description: str = 'normalised') -> None:
     """Writes a float32 NIfTI file, whole or not at all, that `read_volume` returns unchanged.
 
-    path          .nii or .nii.gz
-    data          [x, y, z], finite
-    grid          its voxels
-    description   what the values are, for example 'normalised' or '1/mm'; about 65 bytes fit
+    Parameters
+    ----------
+    path : path-like
+        .nii or .nii.gz.
+    data : ndarray [x, y, z]
+        Finite.
+    grid : Grid
+        Its voxels.
+    description : str
+        What the values are, for example 'normalised' or '1/mm'; about 65 bytes fit.
 
-    Raises InputError for another suffix, a shape that is not the grid's, values that are not finite, or a file that cannot be
-    written.
+    Raises
+    ------
+    InputError
+        For another suffix, a shape that is not the grid's, values that are not finite, or a file that cannot be written.
     """
     import nibabel
 

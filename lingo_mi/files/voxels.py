@@ -23,10 +23,19 @@ LPS_TO_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # DICOM's and ITK's axes, and NIfT
 
 
 def require_claim(path: PathLike | str, shape: Sequence[int], dtype: np.dtype, ratio: float = 1, start: int = 0) -> int:
-    """Bytes that an array of a file has. Raises InputError where the file is too short for it, or the memory too small.
+    """Bytes that an array of a file has.
 
-    ratio   bytes that one byte of the file may stand for: 1 unless it is compressed
-    start   bytes of the (unpacked) file before the array
+    Parameters
+    ----------
+    ratio : float
+        Bytes that one byte of the file may stand for: 1 unless it is compressed.
+    start : int
+        Bytes of the (unpacked) file before the array.
+
+    Raises
+    ------
+    InputError
+        If the file is too short for it, or the memory too small.
     """
     if min(shape, default=0) < 1 or start < 0 or dtype.hasobject or dtype.itemsize == 0:
         raise InputError(f'{path}: is damaged: its header claims the shape {list(shape)} of {dtype}; fetch it again')
@@ -42,7 +51,13 @@ def require_claim(path: PathLike | str, shape: Sequence[int], dtype: np.dtype, r
 
 
 def read_exactly(stream: Any, path: PathLike | str, size: int) -> bytes:
-    """`size` bytes of a stream that unpacks what is read of it. Raises InputError where it ends before."""
+    """`size` bytes of a stream that unpacks what is read of it.
+
+    Raises
+    ------
+    InputError
+        If it ends before.
+    """
     content = stream.read(size)
     if len(content) < size:
         raise InputError(f'{path}: is truncated or damaged: its data end too early; fetch it again')
@@ -50,7 +65,13 @@ def read_exactly(stream: Any, path: PathLike | str, size: int) -> bytes:
 
 
 def require_end(stream: Any, path: PathLike | str) -> None:
-    """Go on to the end of a stream that unpacks, where gzip's checksum is. Raises InputError where more than 1 MiB follow."""
+    """Go on to the end of a stream that unpacks, where gzip's checksum is.
+
+    Raises
+    ------
+    InputError
+        If more than 1 MiB follow.
+    """
     left = _CHUNK
     while got := len(stream.read(_CHUNK)):
         left -= got
@@ -63,10 +84,17 @@ def read_voxels(
 ) -> np.ndarray:
     """An array [x, y, z] of a file, x fastest.
 
-    start     bytes before it; -1: it is the file's end
-    packing   None, 'deflate' (zlib's or gzip's) or 'bzip2'
+    Parameters
+    ----------
+    start : int
+        Bytes before it; -1: it is the file's end.
+    packing : str or None
+        None, 'deflate' (zlib's or gzip's) or 'bzip2'.
 
-    Raises InputError where the file cannot hold what is asked for, is damaged or is not a regular file.
+    Raises
+    ------
+    InputError
+        If the file cannot hold what is asked for, is damaged or is not a regular file.
     """
     dtype = np.dtype(dtype)
     with reading(path):

@@ -15,8 +15,12 @@ from lingo_mi.fitting.method import Method
 def adam_step(state: DeviceState, gradients: dict[str, Any], method: Method, iteration: int) -> None:
     """Move the parameters of `state` that have gradients, and their moments.
 
-    gradients   of the loss, by parameter
-    iteration   counts from 0
+    Parameters
+    ----------
+    gradients : dict[str, Any]
+        Of the loss, by parameter.
+    iteration : int
+        Counts from 0.
     """
     b1, b2, step = method.rates.beta1, method.rates.beta2, iteration + 1
     # The first moment without its bias, now or as expected after the next step.

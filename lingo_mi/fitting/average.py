@@ -15,10 +15,13 @@ PREFIX = 'average.'  # of its names in a checkpoint
 class Average:
     """Exponential moving average of a state's raw parameters. It restarts when Gaussians are added or removed.
 
-    decay   weight of the previous mean in the next one; 0: no averaging
-
     After Polyak and Juditsky, "Acceleration of stochastic approximation by averaging", SIAM J. Control Optim. 30 (1992), who
     average all steps.
+
+    Parameters
+    ----------
+    decay : float
+        Weight of the previous mean in the next one; 0: no averaging.
     """
 
     def __init__(self, decay: float):

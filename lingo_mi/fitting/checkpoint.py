@@ -97,9 +97,14 @@ class Checkpoint:
         return self.seen < len(self.geometry)
 
     def save(self, path: PathLike | str) -> None:
-        """Write the file atomically: after a crash, the previous one is intact. Raises InputError if it cannot be written.
+        """Write the file atomically: after a crash, the previous one is intact.
 
         One of the name checkpoint.npz is part of the result in its folder (see `output_folder.begin`).
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
         """
         path, state = Path(path), self.state
         plain = dict(
@@ -129,8 +134,12 @@ class Checkpoint:
     def load(cls, path: PathLike | str) -> Checkpoint:
         """The fit in a file.
 
-        Loading never runs code from the file, and takes no more memory than its size tells. Raises InputError if the file is
-        missing or is not a sound checkpoint (see `checkpoint_schema`).
+        Loading never runs code from the file, and takes no more memory than its size tells.
+
+        Raises
+        ------
+        InputError
+            If the file is missing or is not a sound checkpoint (see `checkpoint_schema`).
         """
         try:
             data = _read(path)

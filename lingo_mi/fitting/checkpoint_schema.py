@@ -42,7 +42,10 @@ _OF_EFFECTS = 'array.share', 'array.scattered'  # not every effect has both
 def require_sound(arrays: dict[str, np.ndarray], plain: Any) -> tuple[Method, Geometry]:
     """The method and the geometry of a checkpoint.
 
-    Raises InputError, which says what is wrong, unless its arrays, by name, and its plain values belong to a fit that can go on.
+    Raises
+    ------
+    InputError
+        Which says what is wrong, unless its arrays, by name, and its plain values belong to a fit that can go on.
     """
     method, geometry = _require_plain(plain)
     views, steps = plain['seen'], arrays.get('array.poses.steps')

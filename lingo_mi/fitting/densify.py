@@ -40,10 +40,16 @@ def densify(
 ) -> State:
     """Clone and split, or halve, and prune once, then clear the statistic.
 
-    half      half the volume's sides, [3]; Gaussians centred outside are removed
-    rng       numpy Generator; places the halves of splits
-    flat      True for a fan beam: all Gaussians, also new ones, lie in the plane z = 0
-    largest   alpha compositing: Gaussians with a larger standard deviation are removed
+    Parameters
+    ----------
+    half : ndarray
+        Half the volume's sides, [3]; Gaussians centred outside are removed.
+    rng : Generator
+        Numpy Generator; places the halves of splits.
+    flat : bool
+        True for a fan beam: all Gaussians, also new ones, lie in the plane z = 0.
+    largest : float
+        Alpha compositing: Gaussians with a larger standard deviation are removed.
     """
     mean = np.divide(state.gradient, state.visits, out=np.zeros_like(state.gradient), where=state.visits > 0)
     strong = mean >= control.densify_threshold

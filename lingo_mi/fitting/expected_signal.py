@@ -27,10 +27,16 @@ class ExpectedSignal:
     Comput. Assist. Tomogr. 2, 1978, separate a first reconstruction in this way). The shares are constants for the
     derivatives and are updated every few steps.
 
-    effects     with lengths in the fit's frame
-    bands       of the spectrum; None if materials do not matter
-    split       densities between which the second material's share rises, 1/mm; None for one material
-    scattered   the light that the cloud scatters; None for a scan without scatter
+    Attributes
+    ----------
+    effects
+        With lengths in the fit's frame.
+    bands
+        Of the spectrum; None if materials do not matter.
+    split
+        Densities between which the second material's share rises, 1/mm; None for one material.
+    scattered
+        The light that the cloud scatters; None for a scan without scatter.
     """
 
     def __init__(self, effects: Effects, geometry: Geometry, unit: float):
@@ -50,8 +56,12 @@ class ExpectedSignal:
     def image(self, integrals: Callable[[View], Sequence], view: View, scattered: Any = None) -> Any:
         """The expected pixels of a view, Float [height * width]. Differentiable.
 
-        integrals   function of a View that returns line integrals along its rays, one Float per material
-        scattered   scattered light relative to the open beam's, Float [height * width], not differentiated; None: none
+        Parameters
+        ----------
+        integrals : callable
+            Function of a View that returns line integrals along its rays, one Float per material.
+        scattered
+            Scattered light relative to the open beam's, Float [height * width], not differentiated; None: none.
         """
 
         def seen(rays):
@@ -63,8 +73,12 @@ class ExpectedSignal:
     def shares(self, volume: np.ndarray, centres: np.ndarray, half: np.ndarray) -> Any:
         """The second material's share in every Gaussian's density, Float [N]; None for one material.
 
-        volume    [x, y, z], the cloud's density, 1/mm
-        centres   [N, 3] and half, [3], half the volume's sides: both in the fit's frame
+        Parameters
+        ----------
+        volume : ndarray [x, y, z]
+            The cloud's density, 1/mm.
+        centres : ndarray
+            [N, 3] and half, [3], half the volume's sides: both in the fit's frame.
         """
         if self.split is None:
             return None

@@ -90,7 +90,13 @@ class FittedModel:
 
     @property
     def gaussians(self) -> Gaussians:
-        """The cloud, with its cut-off: `lm.project(fit.gaussians, geometry)`. Raises InputError for a field."""
+        """The cloud, with its cut-off: `lm.project(fit.gaussians, geometry)`.
+
+        Raises
+        ------
+        InputError
+            For a field.
+        """
         arrays = self.model.gaussians(self._device)
         return Gaussians(*arrays, extent=getattr(self.method, 'extent', cutoff.RENDER))
 

@@ -107,7 +107,10 @@ def _search(
 ) -> dict:
     """The record of the search for the step to stop at: the loop on part of the views, until it predicts the others no better.
 
-    wanted   the method without the limits that the whole scan sets
+    Parameters
+    ----------
+    wanted : Method
+        The method without the limits that the whole scan sets.
     """
     judge = HeldOut(scan, method, None if stored is None else stored.search)
     seen = judge.seen
@@ -213,7 +216,13 @@ class Running:
         return loss
 
     def measure(self, loss: Any, measure: Measure | None) -> None:
-        """Add an entry to the history; the time of `measure` does not count. Raises InputError if the fit has diverged."""
+        """Add an entry to the history; the time of `measure` does not count.
+
+        Raises
+        ------
+        InputError
+            If the fit has diverged.
+        """
         dr.sync_thread()
         value = float(loss[0])
         if not (np.isfinite(value) and self.state.finite()):  # a Gaussian that is not finite would silently vanish

@@ -62,10 +62,14 @@ def gradient_error(image: Any, truth: Any, height: int, width: int) -> Any:
     """Root mean square of the gradient of image - truth, both Float [height * width], row by row.
 
     The gradient is that of differences of neighbouring pixels along rows and columns; there are none across the edge.
-    Backprojection blurs: of a structure of spatial frequency w, one step down the squared difference restores a share that
-    falls as 1 / w. FDK filters projections with w before; here the difference is squared with the weight w^2, so that fine
-    structures are restored as fast as coarse ones. Differentiable in the image, in reverse mode; the truth is a constant.
-    Raises InputError if an image has another number of pixels.
+    Backprojection blurs: of a structure of spatial frequency w, one step down the squared difference restores a share that falls
+    as 1 / w. FDK filters projections with w before; here the difference is squared with the weight w^2, so that fine structures
+    are restored as fast as coarse ones. Differentiable in the image, in reverse mode; the truth is a constant.
+
+    Raises
+    ------
+    InputError
+        If an image has another number of pixels.
     """
     _check_size('image', image, height, width)
     _check_size('truth', truth, height, width)
@@ -75,11 +79,19 @@ def gradient_error(image: Any, truth: Any, height: int, width: int) -> Any:
 def tv(volume: Any, shape: tuple[int, int, int]) -> Any:
     """Mean absolute difference of neighbouring voxels along the three axes.
 
-    volume : Float [nz * ny * nx], x fastest
-    shape  : (nz, ny, nx); an axis of one voxel has no differences
+    Subgradient 0 where neighbours agree; 0 for a single voxel. Differentiable in reverse mode.
 
-    Subgradient 0 where neighbours agree; 0 for a single voxel. Differentiable in reverse mode. Raises InputError if the
-    volume has another number of voxels.
+    Parameters
+    ----------
+    volume : Float [nz * ny * nx]
+        x fastest.
+    shape : tuple[int, int, int]
+        (nz, ny, nx); an axis of one voxel has no differences.
+
+    Raises
+    ------
+    InputError
+        If the volume has another number of voxels.
     """
     _check_size('volume', volume, *shape)
     return dr.custom(_TotalVariation, volume, tuple(shape))

@@ -26,7 +26,10 @@ def weights_of(scan: Scan, weights: str) -> np.ndarray | None:
     computed from the mean signal of 3 x 3 valid pixels: from the pixel alone, a pixel that is dark by chance would weigh less
     than a bright one. The weights are scaled to keep the largest projection, to which SSIM's constants refer.
 
-    Raises InputError for a scan with neither a photon count nor a bit depth.
+    Raises
+    ------
+    InputError
+        For a scan with neither a photon count nor a bit depth.
     """
     if weights == 'equal':
         return None
@@ -57,6 +60,12 @@ def trusted(scan: Scan, effects: str) -> Scan:
 
 
 def density_unit(scan: Scan, normalise: bool) -> float:
-    """The density that a fit counts as 1, in 1/mm; see `CloudMethod.normalise`. Raises InputError for an empty scan."""
+    """The density that a fit counts as 1, in 1/mm; see `CloudMethod.normalise`.
+
+    Raises
+    ------
+    InputError
+        For an empty scan.
+    """
     require_signal(scan, 'fit')
     return float(scan.projections.max()) * scan.geometry.grid.scale if normalise else 1.0

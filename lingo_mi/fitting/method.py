@@ -77,7 +77,13 @@ class Method(Part, ABC):
 
     @abstractmethod
     def stepper(self, scan: Scan) -> Stepper:
-        """The optimisation on a scan. Raises InputError for a scan that cannot be fitted."""
+        """The optimisation on a scan.
+
+        Raises
+        ------
+        InputError
+            For a scan that cannot be fitted.
+        """
 
     @abstractmethod
     def model(self, geometry: Geometry, unit: float, effects: Effects | None = None) -> Model:

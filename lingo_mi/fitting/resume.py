@@ -47,8 +47,12 @@ def _moments(projections: np.ndarray) -> list[float]:
 def require_same_fit(stored: Checkpoint, method: Method, scan: Scan, seed: int, path: Path) -> None:
     """Raise InputError if a checkpoint is of another fit.
 
-    method   with the limits that the scan sets
-    path     of the checkpoint, for the message
+    Parameters
+    ----------
+    method : Method
+        With the limits that the scan sets.
+    path : Path
+        Of the checkpoint, for the message.
     """
     before, now = stored.method.flat(), method.flat()
     free = {'checkpoint_seconds'}

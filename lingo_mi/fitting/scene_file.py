@@ -18,9 +18,13 @@ from lingo_mi.storage.output_folder import CLOUD, VOLUME
 def write_scene(path: Path, geometry: Geometry, extent: float | None, effects: Effects | None = None) -> None:
     """Write a scene that renders what was fitted with the scan's own scanner. It needs only `import lingo_mi`.
 
-    extent    cut-off of the Gaussians in standard deviations; None: the scene is of the volume
-    effects   the scan's effects that the fit has modelled. The scene then has their tube and a noise-free detector, so that
-              it renders the images that the fit compared with the scan
+    Parameters
+    ----------
+    extent : float or None
+        Cut-off of the Gaussians in standard deviations; None: the scene is of the volume.
+    effects : Effects or None
+        The scan's effects that the fit has modelled. The scene then has their tube and a noise-free detector, so that it renders
+        the images that the fit compared with the scan.
     """
     lines = [
         '<scene version="3.0.0">',

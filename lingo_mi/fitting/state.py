@@ -14,12 +14,18 @@ from lingo_mi.fitting.models.forward import ForwardModel
 class State:
     """N Gaussians under optimisation, on the host: NumPy arrays, float32 but for `born`. Of a neural field N is 0.
 
-    values             raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`. Those of a neural field
-                       have their own lengths, see `lingo_mi.fitting.field.network`
-    first, second      Adam's moments, like `values`
-    gradient, visits   densification statistic [N]: sum of the norms of the projected centre's gradient, and number of views in
-                       which the Gaussian was visible
-    born               whether densification made the Gaussian [N]
+    Parameters
+    ----------
+    values : dict[str, ndarray]
+        Raw parameters by name, [N, size]; see `lingo_mi.fitting.models` and `activate`. Those of a neural field have their own
+        lengths, see `lingo_mi.fitting.field.network`.
+    first, second : dict[str, ndarray]
+        Adam's moments, like `values`.
+    gradient, visits : ndarray
+        Densification statistic [N]: sum of the norms of the projected centre's gradient, and number of views in which the
+        Gaussian was visible.
+    born : ndarray
+        Whether densification made the Gaussian [N].
     """
 
     values: dict[str, np.ndarray]

@@ -93,7 +93,10 @@ class GaussianStepper(Stepper):
     def densified(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> DeviceState | None:
         """The state after densification and reset of opacities, whichever is due at this iteration; None if neither is.
 
-        Raises InputError if no Gaussian is left.
+        Raises
+        ------
+        InputError
+            If no Gaussian is left.
         """
         control = self.method.densify
         densifying = iteration > control.densify_from and iteration % control.densify_every == 0

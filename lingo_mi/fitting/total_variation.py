@@ -27,11 +27,18 @@ def random_cube_variation(
 
     Adds its gradient to the Gaussians'. Returns lambda_tv times its value, Float [1].
 
-    gaussians   centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame
-    loss        its weight of the variation, and the cube's samples
-    extent      cut-off in standard deviations
-    geometry    its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres
-    factor      the loss scale, Float [1]: multiplies the gradient, not the value that is returned; None: 1
+    Parameters
+    ----------
+    gaussians : Sequence
+        Centres, standard deviations, quaternions and densities, with gradients enabled; normalised frame.
+    loss : Loss
+        Its weight of the variation, and the cube's samples.
+    extent : float
+        Cut-off in standard deviations.
+    geometry : Geometry
+        Its voxels; samples are `tv_stride` voxels apart and stay between the outermost voxel centres.
+    factor
+        The loss scale, Float [1]: multiplies the gradient, not the value that is returned; None: 1.
     """
     half = geometry.grid.half
     voxel, between = 2 * half / geometry.grid.shape, np.array(geometry.grid.shape) - 1

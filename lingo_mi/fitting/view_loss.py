@@ -27,12 +27,20 @@ from lingo_mi.scan import Scan
 class MeasuredView:
     """A measured view on the device.
 
-    view       its rays
-    pixels     Float [height * width], normalised line integrals over the fit's unit of density
-    weights    Float, factor applied to `pixels` and to rendered images before comparison; None: 1
-    valid      Bool, which pixels are valid; None: all
-    rays       the geometry's `Rays` of this view alone
-    scattered  Float, expected scattered light in the pixels; None: none
+    Parameters
+    ----------
+    view : View
+        Its rays.
+    pixels : Float [height * width]
+        Normalised line integrals over the fit's unit of density.
+    weights : Float
+        Factor applied to `pixels` and to rendered images before comparison; None: 1.
+    valid : Bool
+        Which pixels are valid; None: all.
+    rays
+        The geometry's `Rays` of this view alone.
+    scattered : Float
+        Expected scattered light in the pixels; None: none.
     """
 
     view: View
@@ -84,18 +92,28 @@ def differentiate(
 ) -> tuple[Any, Any, Any, Any]:
     """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
 
-    loss     what is compared, and how
-    forward  the model of the Gaussians
-    batch    views per step; the loss is their mean
-    signal   `ExpectedSignal` of the detector; None: line integrals
-    share    of the second of two materials in every Gaussian, Float [N]; None: one material
-
-    Returns four values:
-
     1. the view's part of the loss, Float [1], not multiplied by the loss scale
     2. the norm of the gradient with respect to each projected centre, Float [N], for densification
     3. 1 for each Gaussian that is visible, else 0, Float [N], for densification
     4. the view's part of the loss scale, Float [1]; None without one
+
+    Parameters
+    ----------
+    loss : ImageLoss
+        What is compared, and how.
+    forward : ForwardModel
+        The model of the Gaussians.
+    batch : int
+        Views per step; the loss is their mean.
+    signal
+        `ExpectedSignal` of the detector; None: line integrals.
+    share
+        Of the second of two materials in every Gaussian, Float [N]; None: one material.
+
+    Returns
+    -------
+    tuple[Any, Any, Any, Any]
+        Four values:
     """
     view = target.view
     bundles = []  # of rays: one, or several if the signal is a mean over them

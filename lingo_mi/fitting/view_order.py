@@ -15,13 +15,18 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 def view_order(geometry: Geometry, order: str, rng: np.random.Generator) -> list[int]:
     """The numbers of all views, each once, in the order to see them in.
 
-    order   one of ORDERS. 'random': a random permutation. 'golden': around the axis, from a random view on, in steps of the
-            golden section of their number, so that any few views in a row lie well apart
-
-        view_order(scan.geometry, 'golden', np.random.default_rng(0))
-
     After the golden-angle order of radial MRI (Winkelmann et al., "An optimal radial profile order based on the golden ratio for
     time-resolved MRI", IEEE Trans. Med. Imaging 26, 2007).
+
+    Parameters
+    ----------
+    order : str
+        One of ORDERS. 'random': a random permutation. 'golden': around the axis, from a random view on, in steps of the golden
+        section of their number, so that any few views in a row lie well apart.
+
+    Examples
+    --------
+    >>> view_order(scan.geometry, 'golden', np.random.default_rng(0))
     """
     n = len(geometry)
     if order == 'random':

@@ -23,10 +23,16 @@ from lingo_mi.projectors.upload import uploaded_tensor
 class Argument:
     """An array that a caller gave.
 
-    name      for messages
-    array     of any kind
-    shape     that it must have; None for a size that the first argument with a None decides
-    double    whether it is computed on in float64, not in float32
+    Parameters
+    ----------
+    name : str
+        For messages.
+    array
+        Of any kind.
+    shape : tuple[int or None, ...]
+        That it must have; None for a size that the first argument with a None decides.
+    double : bool
+        Whether it is computed on in float64, not in float32.
     """
 
     name: str
@@ -38,12 +44,21 @@ class Argument:
 def call(function: Callable[..., Any], arguments: Sequence[Argument], shape: tuple[int, ...], name: str) -> Any:
     """A differentiable function of Dr.Jit's tensors, of a caller's arrays; a result of the caller's kind.
 
-    function   takes a tensor for each argument, or what a caller of Dr.Jit gave in its place; returns Float [prod(shape)]
-    arguments  arrays of one kind
-    shape      of the result
-    name       of the caller, for messages
+    Parameters
+    ----------
+    function : callable
+        Takes a tensor for each argument, or what a caller of Dr.Jit gave in its place; returns Float [prod(shape)].
+    arguments : Sequence[Argument]
+        Arrays of one kind.
+    shape : tuple[int, ...]
+        Of the result.
+    name : str
+        Of the caller, for messages.
 
-    Raises InputError for arrays of several kinds, of other shapes, or on a device that the active variant does not use.
+    Raises
+    ------
+    InputError
+        For arrays of several kinds, of other shapes, or on a device that the active variant does not use.
     """
     kind = _kind(arguments, name)
     if kind == 'NumPy':

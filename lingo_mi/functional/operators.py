@@ -80,30 +80,45 @@ def project(
 
     Takes `project(gaussians, geometry)`, where `gaussians` is a `Gaussians` such as `fit.gaussians`, or its four arrays:
 
-    means        [N, 3] centres, mm, in the world frame of `lingo_mi.geometry`
-    scales       [N, 3] standard deviations along the Gaussians' own axes, mm, positive
-    quaternions  [N, 4] rotations from these axes to the world, (x, y, z, w), of any length but zero
-    density      [N] values at the centres, in 1/mm for images without a unit
-    geometry     the scan; its rays run from the source through the pixel centres and on, so that a virtual panel may stand
-                 within the object (DSD = DSO); those of a parallel beam begin and end at infinity
-    extent       cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, 5 for arrays); with 5, images are good
-                 to 2e-6 and derivatives to 4e-5 (relative L2 norms, docs/accuracy.md)
-    views        indices of the views to project, n of them; None for all
-    rays         [n, 4, 3] source (of a parallel beam its direction), corner of the panel, and steps u and v from pixel to pixel,
-                 of these n views, mm, in the place of the geometry's own, which are `geometry.rays().vectors`
-
     The arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N. Rays are computed
     on in float64 where they are that. Differentiable once in all arrays: in reverse mode, in Dr.Jit also in forward mode.
     A result that is to be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
     project a few views, not all. Derivatives by the rays are exact but for the cut-off.
 
-        images = project(means, scales, quaternions, density, geometry, views=[0, 7])
-        loss = ((images - measured) ** 2).mean()
-        loss.backward()                              # PyTorch
+    Parameters
+    ----------
+    means
+        [N, 3] centres, mm, in the world frame of `lingo_mi.geometry`.
+    scales
+        [N, 3] standard deviations along the Gaussians' own axes, mm, positive.
+    quaternions
+        [N, 4] rotations from these axes to the world, (x, y, z, w), of any length but zero.
+    density
+        [N] values at the centres, in 1/mm for images without a unit.
+    geometry
+        The scan; its rays run from the source through the pixel centres and on, so that a virtual panel may stand within the
+        object (DSD = DSO); those of a parallel beam begin and end at infinity.
+    extent : float or None
+        Cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, 5 for arrays); with 5, images are good to 2e-6 and
+        derivatives to 4e-5 (relative L2 norms, docs/accuracy.md).
+    views : Iterable[int] or None
+        Indices of the views to project, n of them; None for all.
+    rays
+        [n, 4, 3] source (of a parallel beam its direction), corner of the panel, and steps u and v from pixel to pixel, of these
+        n views, mm, in the place of the geometry's own, which are `geometry.rays().vectors`.
 
-    Raises InputError for arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no
-    extent or no rotation, views that the scan has not, rays that make no view, and arrays on another device than the active
-    variant's. Within `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
+    Raises
+    ------
+    InputError
+        For arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no extent or no
+        rotation, views that the scan has not, rays that make no view, and arrays on another device than the active variant's.
+        Within `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
+
+    Examples
+    --------
+    >>> images = project(means, scales, quaternions, density, geometry, views=[0, 7])
+    >>> loss = ((images - measured) ** 2).mean()
+    >>> loss.backward()                              # PyTorch
     """
     arrays, geometry, extent = _taken(means, scales, quaternions, density, geometry, extent)
     require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
@@ -153,11 +168,16 @@ def voxelize(
 
     Takes `voxelize(gaussians, grid)`, or four arrays, as `project`.
 
-    grid   or a geometry, whose grid it is
-
     The other arguments, and errors, are those of `project`. Differentiable in all four arrays, in reverse mode.
 
-        volume = voxelize(means, scales, quaternions, density, Grid(128, 2.0))
+    Parameters
+    ----------
+    grid
+        Or a geometry, whose grid it is.
+
+    Examples
+    --------
+    >>> volume = voxelize(means, scales, quaternions, density, Grid(128, 2.0))
     """
     arrays, grid, extent = _taken(means, scales, quaternions, density, grid, extent)
     require_type('grid', grid, (Grid, Geometry), 'of a scan give scan.geometry.grid')
@@ -192,9 +212,14 @@ def _arguments(arrays: Sequence) -> list[Argument]:
 
 
 def gaussians_of(tensors: Sequence, name: str) -> list:
-    """Point3f, Vector3f, Vector4f and Float [N] of the four arrays, evaluated together. Raises InputError as `require_usable`.
+    """Point3f, Vector3f, Vector4f and Float [N] of the four arrays, evaluated together.
 
     They are copies in Dr.Jit's own memory: the kernels that follow would otherwise depend on how the caller's is aligned.
+
+    Raises
+    ------
+    InputError
+        As `require_usable`.
     """
     require_unfrozen(f'lm.{name}')
     flat = [x.array if dr.is_tensor_v(x) else x for x in tensors]
@@ -223,7 +248,13 @@ def _require_room(shape: tuple[int, ...], name: str):
 
 
 def checked_extent(extent: Any) -> float:
-    """A cut-off in standard deviations. Raises InputError for one that is none."""
+    """A cut-off in standard deviations.
+
+    Raises
+    ------
+    InputError
+        For one that is none.
+    """
     if not (isinstance(extent, Real) and 1 <= float(extent) <= 20):
         raise InputError(f'extent is in standard deviations, from 1 to 20, not {extent!r}')
     return float(extent)

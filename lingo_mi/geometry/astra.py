@@ -1,7 +1,7 @@
 """Scans of the ASTRA toolbox: its dicts, and poses as its vectors, 12 numbers a view.
 
-    cone_vec         source, panel's centre, u, v
-    parallel3d_vec   direction of the beam, panel's centre, u, v
+- `cone_vec`: source, panel's centre, u, v
+- `parallel3d_vec`: direction of the beam, panel's centre, u, v
 
 each (x, y, z), u and v one pixel long: from pixel (0, 0) to its neighbour in the row, and in the column. ASTRA's world is
 this package's, in mm. Its arrays are [v, view, u] and volumes [z, y, x]: transpose them. `to_vectors` and `from_vectors` assume
@@ -91,7 +91,10 @@ def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool)
 def circle(proj_geom: dict) -> dict[str, Any]:
     """The scanner of a dict of the types `CIRCLES`, as the numbers of a `CircularGeometry`; ASTRA's rows reversed.
 
-    Raises InputError where a number is missing.
+    Raises
+    ------
+    InputError
+        If a number is missing.
     """
     mode = CIRCLES[proj_geom['type']]
     DSO, to_panel = (
@@ -113,7 +116,10 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
 
     The beam of a parallel scan is taken to come from in front of its panel; its line integrals know no direction.
 
-    Raises InputError where the type is another one, a number is missing, or the vectors are no poses.
+    Raises
+    ------
+    InputError
+        If the type is another one, a number is missing, or the vectors are no poses.
     """
     kind = kind_of(proj_geom)
     if kind not in VECTORS:
@@ -129,7 +135,10 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
 def grid(vol_geom: dict) -> Grid:
     """The voxels of a dict of `astra.create_vol_geom`.
 
-    Raises InputError if it has two dimensions only, or a number is missing or makes no grid.
+    Raises
+    ------
+    InputError
+        If it has two dimensions only, or a number is missing or makes no grid.
     """
     if not isinstance(vol_geom, Mapping) or 'GridSliceCount' not in vol_geom:
         raise InputError('the ASTRA volume has no GridSliceCount: give one of three dimensions')
@@ -142,7 +151,13 @@ def grid(vol_geom: dict) -> Grid:
 
 
 def kind_of(proj_geom: dict) -> str:
-    """The type of a dict of ASTRA, empty where it has none. Raises InputError where this is no dict, or no text."""
+    """The type of a dict of ASTRA, empty where it has none.
+
+    Raises
+    ------
+    InputError
+        If this is no dict, or no text.
+    """
     kind = proj_geom.get('type', '') if isinstance(proj_geom, Mapping) else None
     if not isinstance(kind, str):
         raise InputError(f'an ASTRA geometry must be a dict with a type, not {shown(proj_geom)}')

@@ -171,7 +171,12 @@ class Geometry(ABC):
     ) -> Geometry:
         """A parallel beam that turns about z. The parameters are those of `cone`, without the distances.
 
-        Its beam is not turned by rotDetector. Raises InputError for numbers that make no scan.
+        Its beam is not turned by rotDetector.
+
+        Raises
+        ------
+        InputError
+            For numbers that make no scan.
 
         Examples
         --------
@@ -329,7 +334,10 @@ class Geometry(ABC):
     def joined(self, other: Geometry) -> Geometry:
         """The views of this scan, then those of another with as many pixels, on this scan's grid.
 
-        Raises InputError if one is a cone beam and the other parallel, and if the panels differ in pixels.
+        Raises
+        ------
+        InputError
+            If one is a cone beam and the other parallel, and if the panels differ in pixels.
         """
         from lingo_mi.geometry.posed import PosedGeometry
 

@@ -14,8 +14,12 @@ WIDTH, HEIGHT, MARGIN, MOST = 300, 230, 16, 360
 def drawing(rays: Rays, nDetector: tuple[int, int], grid: Grid) -> str:
     """Sources, the panel of the first view and its outermost rays, and the volume, seen along z and along y: `<svg ...`.
 
-    rays        of all views; nDetector: the panel's pixels, (v, u)
-    grid        the volume
+    Parameters
+    ----------
+    rays : Rays
+        Of all views; nDetector: the panel's pixels, (v, u).
+    grid : Grid
+        The volume.
     """
     rows, columns = nDetector
     chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST)).astype(int))

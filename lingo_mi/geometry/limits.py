@@ -22,7 +22,13 @@ MOST_VIEWS = 100_000
 
 
 def numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """`value` as float64, of any shape. Raises InputError where it is not made of numbers, or one is beyond float64."""
+    """`value` as float64, of any shape.
+
+    Raises
+    ------
+    InputError
+        If it is not made of numbers, or one is beyond float64.
+    """
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
@@ -32,7 +38,13 @@ def numbers(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def lengths(name: str, value: ArrayLike) -> np.ndarray:
-    """`value` as float64, of any shape and sign. Raises InputError where one is not finite, or too long."""
+    """`value` as float64, of any shape and sign.
+
+    Raises
+    ------
+    InputError
+        If one is not finite, or too long.
+    """
     array = numbers(name, value)
     if not np.all(np.abs(array) <= MOST_LENGTH):
         raise InputError(f'{name} must be finite lengths, at most {MOST_LENGTH:.0e}, not {shown(value)}')
@@ -40,7 +52,13 @@ def lengths(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def angles(name: str, value: ArrayLike) -> np.ndarray:
-    """`value` in radians as float64, of any shape. Raises InputError where one is not finite, or of too many turns."""
+    """`value` in radians as float64, of any shape.
+
+    Raises
+    ------
+    InputError
+        If one is not finite, or of too many turns.
+    """
     array = numbers(name, value)
     if not np.all(np.abs(array) <= MOST_ANGLE):
         raise InputError(f'{name} must be finite numbers, at most {MOST_ANGLE:.0e} radians, not {shown(value)}')
@@ -48,7 +66,13 @@ def angles(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def vector(name: str, value: ArrayLike, length: int) -> tuple:
-    """`length` floats, lengths of any sign; one number may stand for all. Raises InputError for anything else."""
+    """`length` floats, lengths of any sign; one number may stand for all.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
     array = np.atleast_1d(numbers(name, value)).ravel()
     if len(array) == 1:
         array = np.repeat(array, length)

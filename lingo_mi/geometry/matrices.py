@@ -28,13 +28,21 @@ def from_matrices(
 ) -> Rays:
     """The views whose rays the matrices [n, 3, 4] describe.
 
-    nDetector   (v, u) pixels
-    dDetector   (v, u) mm. A matrix fixes the rays of a cone beam, but not how far from the source its panel stands: it is
-                put where the steps along u are dDetector[1] long. A parallel beam's steps are the matrix's own, and
-                its panel is put beside the point `towards`
-    towards     a point in front of every source
+    Parameters
+    ----------
+    nDetector : tuple[int, int]
+        (v, u) pixels.
+    dDetector : tuple[float, float]
+        (v, u) mm. A matrix fixes the rays of a cone beam, but not how far from the source its panel stands: it is put where the
+        steps along u are dDetector[1] long. A parallel beam's steps are the matrix's own, and its panel is put beside the point
+        `towards`.
+    towards : array_like
+        A point in front of every source.
 
-    Raises InputError where a matrix is no camera of that kind.
+    Raises
+    ------
+    InputError
+        If a matrix is no camera of that kind.
     """
     matrices, towards = numbers('projection matrices', matrices), numbers('towards', towards)
     if matrices.ndim != 3 or matrices.shape[1:] != (3, 4) or not len(matrices):

@@ -19,7 +19,13 @@ Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
 
 
 def checked_views(index: Index, count: int) -> Index:
-    """`index` of some of `count` views. Raises InputError where it is neither a slice nor integers, or beyond the views."""
+    """`index` of some of `count` views.
+
+    Raises
+    ------
+    InputError
+        If it is neither a slice nor integers, or beyond the views.
+    """
     if isinstance(index, slice):
         return index
     try:
@@ -41,13 +47,18 @@ class Rays:
 
     The ray through the continuous pixel position (x, y), pixel centres at (i + 1/2, j + 1/2), is
 
-        cone       from `source` along  corner + x u + y v - source
-        parallel   from  corner + x u + y v  along `source`, which then holds the unit beam direction
+    - `cone`: from `source` along  corner + x u + y v - source
+    - `parallel`: from  corner + x u + y v  along `source`, which then holds the unit beam direction
 
-    source, corner, u, v : float64 [n, 3]; corner is the outer corner of pixel (0, 0), u and v are one pixel long steps.
+    Parameters
+    ----------
+    source, corner, u, v : float64 [n, 3]
+        Corner is the outer corner of pixel (0, 0), u and v are one pixel long steps.
 
-        rays = Rays(source, corner, u, v, parallel=False).checked()
-        x, y = rays.project(points, 0)
+    Examples
+    --------
+    >>> rays = Rays(source, corner, u, v, parallel=False).checked()
+    >>> x, y = rays.project(points, 0)
     """
 
     source: np.ndarray
@@ -77,7 +88,9 @@ class Rays:
         The first three are by a turn about the origin, a rotation vector in radians; the others by a shift. Where all views
         move together, sum over them.
 
-            turn, shift = rays.by_motion(gradient).sum(0).reshape(2, 3)
+        Examples
+        --------
+        >>> turn, shift = rays.by_motion(gradient).sum(0).reshape(2, 3)
         """
         gradient = np.asarray(by_vectors, float)
         turn = np.cross(self.vectors, gradient).sum(1)
@@ -112,8 +125,11 @@ class Rays:
     def checked(self) -> Rays:
         """These views as float64 arrays, parallel beams of unit length.
 
-        Raises InputError, naming the first bad view, where an array is not [n, 3] or not finite, where u and v span
-        no panel, or where the rays run along it.
+        Raises
+        ------
+        InputError
+            Naming the first bad view, where an array is not [n, 3] or not finite, where u and v span no panel, or where the rays
+            run along it.
         """
         source, corner, u, v = (numbers(name, a) for name, a in zip(('source', 'corner', 'u', 'v'), self._arrays()))
         if any(a.ndim != 2 or a.shape[1] != 3 or len(a) != len(corner) for a in (source, corner, u, v)) or not len(

@@ -90,11 +90,18 @@ def scan(
 def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, float]) -> Rays:
     """The views of RTK's geometry, in mm, rows down.
 
-    source                 the path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`
-    nDetector, dDetector   (v, u), pixels and mm
+    Parameters
+    ----------
+    source
+        The path of its XML file, or an `itk.RTK.ThreeDCircularProjectionGeometry`.
+    nDetector, dDetector
+        (v, u), pixels and mm.
 
-    Raises InputError where the file is missing, damaged or another one, for cylindrical detectors, and for elements that
-    are not known. The matrices, which follow from the numbers, and collimation are passed over.
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or another one, for cylindrical detectors, and for elements that are not known. The
+        matrices, which follow from the numbers, and collimation are passed over.
     """
     where = source if isinstance(source, (str, PathLike)) else "RTK's geometry"
     columns = _from_file(source) if where is source else _from_object(source)
@@ -120,8 +127,11 @@ def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, fl
 def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
 
-    Raises InputError where RTK cannot say it: panels whose rows and columns are not at right angles or differ between
-    views, mirrored ones, panels askew to a parallel beam; and where the file cannot be written.
+    Raises
+    ------
+    InputError
+        If RTK cannot say it: panels whose rows and columns are not at right angles or differ between views, mirrored ones, panels
+        askew to a parallel beam; and where the file cannot be written.
     """
     step_u, step_v = (np.linalg.norm(a, axis=1) for a in (rays.u, rays.v))
     e1, e2 = rays.u / step_u[:, None], -rays.v / step_v[:, None]

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
     """n angles, [n] radians, evenly spaced over [start, start + total) degrees: `circular(4)` is 0, pi / 2, pi, 3 pi / 2.
 
-    Raises InputError unless n is from 1 to `limits.MOST_VIEWS`, and for angles of too many turns.
+    Raises
+    ------
+    InputError
+        Unless n is from 1 to `limits.MOST_VIEWS`, and for angles of too many turns.
     """
     count = limits.numbers('the number of views', n)
     if count.ndim or not count >= 1 or np.isfinite(count) and count % 1:
@@ -34,9 +37,14 @@ def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
 def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
     """Heights [n] in mm of a helix that climbs `pitch` mm a turn: 0 at the angle 0.
 
-    angles   [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi
+    Parameters
+    ----------
+    angles : array_like
+        [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi.
 
-        helix(circular(8, total=720, start=-360), pitch=40)   # -40, -30, ..., 30
+    Examples
+    --------
+    >>> helix(circular(8, total=720, start=-360), pitch=40)   # -40, -30, ..., 30
     """
     climb = limits.lengths('pitch', pitch)
     if climb.ndim:
@@ -47,9 +55,14 @@ def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
 def spread(total: int, n: int) -> np.ndarray:
     """n indices evenly spaced over range(total), the first one 0: the views a sparse fit uses.
 
-    Raises InputError unless 1 <= n <= total.
+    Raises
+    ------
+    InputError
+        Unless 1 <= n <= total.
 
-        spread(100, 4)   # 0, 25, 50, 75
+    Examples
+    --------
+    >>> spread(100, 4)   # 0, 25, 50, 75
     """
     if not 1 <= n <= total:
         raise InputError(f'{n} views were asked for, but the scan has {total}')
@@ -72,16 +85,23 @@ def rotation(axis: str, angle: ArrayLike) -> np.ndarray:
 class Motion(TypedDict, total=False):
     """What moves a scanner's source and panel off the plain circle: once, or for every view with a first axis of n.
 
-    offDetector  (v, u), mm: shift of the panel, positive v up; after its rotation
-    rotDetector  (roll, pitch, yaw), radians: the panel is turned by Rz(roll) Ry(pitch) Rx(yaw) about its centre, in the
-                 frame (towards the source, u, up). Roll turns it about the vertical, yaw in its own plane
-    COR          shift of source and panel along u, mm: minus the offset of the true axis of rotation
-    height       shift of source and panel along z, mm (a helix)
-    tilt         radians by which the source is lifted out of the plane of rotation, the panel sunk (laminography)
-
     All are 0 where they are not given. The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code),
     but for `height` and `tilt`, which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite
     sign. The beam of a parallel scan is not turned by rotDetector.
+
+    Parameters
+    ----------
+    offDetector : array_like
+        (v, u), mm: shift of the panel, positive v up; after its rotation.
+    rotDetector : array_like
+        (roll, pitch, yaw), radians: the panel is turned by Rz(roll) Ry(pitch) Rx(yaw) about its centre, in the frame (towards the
+        source, u, up). Roll turns it about the vertical, yaw in its own plane.
+    COR : array_like
+        Shift of source and panel along u, mm: minus the offset of the true axis of rotation.
+    height : array_like
+        Shift of source and panel along z, mm (a helix).
+    tilt : array_like
+        Radians by which the source is lifted out of the plane of rotation, the panel sunk (laminography).
     """
 
     offDetector: ArrayLike
@@ -97,14 +117,25 @@ def scanner_rays(
 ) -> Rays:  # fmt: skip
     """The rays of a scanner's views in the world frame of `lingo_mi.geometry.base`, from TIGRE's numbers.
 
-    angles       [n] radians, or [n, 3] Euler angles: the view is turned by Rz(a1) Ry(a2) Rz(a3)
-    DSO, DSD     distances from the source to the axis and to the panel, mm; once or for every view
-    nDetector, dDetector   pixels and pixel size in mm, (v, u)
-    motion       see `Motion`
+    Parameters
+    ----------
+    angles : array_like
+        [n] radians, or [n, 3] Euler angles: the view is turned by Rz(a1) Ry(a2) Rz(a3).
+    DSO, DSD : array_like
+        Distances from the source to the axis and to the panel, mm; once or for every view.
+    nDetector, dDetector
+        Pixels and pixel size in mm, (v, u).
+    motion : Unpack[Motion]
+        See `Motion`.
 
-    Raises InputError where an argument has neither one value nor one a view.
+    Raises
+    ------
+    InputError
+        If an argument has neither one value nor one a view.
 
-        scanner_rays(circular(50), 1000, 1500, (384, 512), (0.8, 0.8), tilt=0.1)
+    Examples
+    --------
+    >>> scanner_rays(circular(50), 1000, 1500, (384, 512), (0.8, 0.8), tilt=0.1)
     """
     moves: dict[str, Any] = dict(offDetector=(0, 0), rotDetector=(0, 0, 0), COR=0, height=0, tilt=0)
     for name in motion.keys() - moves.keys():

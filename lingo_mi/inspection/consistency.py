@@ -22,10 +22,15 @@ STEEPEST = np.radians(75)  # from the normal of the line: beyond, 1 / cos magnif
 class Plane:
     """One row of every view in the plane of the source, air subtracted.
 
-    p        [n, u]
-    angles   [n] radians
-    u        [u] mm, places of the pixels from the foot of the axis
-    DSD      mm; 0 for a parallel beam
+    Parameters
+    ----------
+    p : ndarray [n, u]
+    angles : ndarray
+        [n] radians.
+    u : ndarray
+        [u] mm, places of the pixels from the foot of the axis.
+    DSD : float
+        Mm; 0 for a parallel beam.
     """
 
     p: np.ndarray
@@ -40,10 +45,13 @@ class Plane:
 def disagreement(plane: Plane, angles: np.ndarray, shift: float = 0.0) -> tuple[float, np.ndarray]:
     """Root mean square disagreement of the views, and that of each view [n].
 
-    shift   mm on the panel, added to the places of the pixels
-
     Fan beam: relative differences of M over all pairs. Parallel beam: distances of the centres of mass from the best curve with
     c = 0, over the half-width of the panel; nan where there are too few views.
+
+    Parameters
+    ----------
+    shift : float
+        Mm on the panel, added to the places of the pixels.
     """
     if not plane.DSD:
         return _parallel(plane, angles, shift)

@@ -11,12 +11,16 @@ STEEPEST = np.radians(6)  # between views: beyond, an outline's own motion is no
 def outline_jitter(p: np.ndarray, angles: np.ndarray) -> tuple[float, float]:
     """Standard deviation in pixels of the outline's place, (along columns, along rows); nan where it cannot be told.
 
-    p        [view, v, u] line integrals, air subtracted
-    angles   [view] radians, in the order of the views
-
     The place along a row is the mean of the object's left and right edge, and that along a column the mean of its upper and
     lower one. For independent errors of deviation s the third differences of neighbouring views have the deviation s sqrt(20).
     Their median ignores single views. What the object's own corners add stays in: 0.02 to 0.1 pixels.
+
+    Parameters
+    ----------
+    p : ndarray
+        [view, v, u] line integrals, air subtracted.
+    angles : ndarray
+        [view] radians, in the order of the views.
     """
     step = np.abs(np.diff(np.unwrap(angles)))
     if len(p) < 12 or step.max(initial=0) > STEEPEST or np.ptp(step) > 0.1 * step.max():

@@ -14,7 +14,13 @@ from lingo_mi.storage.file_access import replacing
 
 
 def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
-    """Writes a PNG. Raises InputError if the file cannot be written."""
+    """Writes a PNG.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
     figure = Figure(figsize=(13, 6.4), layout='constrained')
     FigureCanvasAgg(figure)
     _geometry(figure.add_subplot(2, 4, (1, 6), projection='3d'), scan)

@@ -31,12 +31,21 @@ TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 def opened(address: str, folder: Path, threads: int = 0, variant: str | None = None) -> Iterator[Cluster]:
     """A cluster, connected to; workers that were started here end with the block.
 
-    address   'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine
-    folder    that all workers must see; it exists
-    threads   of Dr.Jit a worker, on the CPU (0: all that a worker has; of local:N, its share)
-    variant   of Mitsuba on the workers; None: each chooses
+    Parameters
+    ----------
+    address : str
+        'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine.
+    folder : Path
+        That all workers must see; it exists.
+    threads : int
+        Of Dr.Jit a worker, on the CPU (0: all that a worker has; of local:N, its share).
+    variant : str or None
+        Of Mitsuba on the workers; None: each chooses.
 
-    Raises InputError where nobody answers there, and for workers that cannot do the jobs.
+    Raises
+    ------
+    InputError
+        If nobody answers there, and for workers that cannot do the jobs.
     """
     distributed = optional('distributed', 'cluster')
     local = re.fullmatch(r'local:(\d{1,9})', address)

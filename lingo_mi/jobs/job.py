@@ -14,11 +14,17 @@ from lingo_mi.common.errors import InputError, brief
 class Job:
     """One piece of work, which can be sent to another machine.
 
-    name        of the job, another one for each
-    steps       that it reports, for the progress
-    function    of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its
-                steps, where KeyboardInterrupt says that it must stop; what it has stored by then it finds again
-    arguments   that pickle
+    Parameters
+    ----------
+    name : str
+        Of the job, another one for each.
+    steps : int
+        That it reports, for the progress.
+    function : callable
+        Of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its steps, where
+        KeyboardInterrupt says that it must stop; what it has stored by then it finds again.
+    arguments : tuple
+        That pickle.
     """
 
     name: str
@@ -30,10 +36,15 @@ class Job:
 class Event(NamedTuple):
     """What is told of a job.
 
-    name    of the job
-    kind    'began'; 'resumed', where its first step is not the first of all; 'step'; and at the end 'done', 'failed', or
-            'stopped': interrupted, and to be gone on with
-    value   began: where (text); resumed, step: the steps done; done: what the function returned; failed: one line
+    Parameters
+    ----------
+    name : str
+        Of the job.
+    kind : str
+        'began'; 'resumed', where its first step is not the first of all; 'step'; and at the end 'done', 'failed', or 'stopped':
+        interrupted, and to be gone on with.
+    value
+        Began: where (text); resumed, step: the steps done; done: what the function returned; failed: one line.
     """
 
     name: str
@@ -53,8 +64,12 @@ class Runner(Protocol):
 def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
     """Run a job here: its last event, 'done' or 'failed'. What no `InputError` explains is also printed with its traceback.
 
-    report   called between steps, as the job's own
-    tell     called with 'resumed', where the job goes on from what is stored
+    Parameters
+    ----------
+    report : callable
+        Called between steps, as the job's own.
+    tell : Tell
+        Called with 'resumed', where the job goes on from what is stored.
     """
     first = True
 
@@ -79,7 +94,10 @@ def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
 def run_all(jobs: list[Job], runner: Runner, tell: Tell) -> dict[str, str]:
     """Run all jobs, and those that failed once more when all others have ended; the one line of each that failed twice, by name.
 
-    tell   called with every event, in this thread. After a first 'failed' the job begins again
+    Parameters
+    ----------
+    tell : Tell
+        Called with every event, in this thread. After a first 'failed' the job begins again.
     """
     failed: dict[str, str] = {}
 

@@ -41,10 +41,16 @@ def require_fit(found: dict, folder: str) -> None:
 def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str | None) -> Event:
     """Run a job in a task of Dask; returns its last event.
 
-    key       of the task
-    topic     of the events that it sends
-    folder    that all workers share
-    threads   of Dr.Jit on the CPU; 0: as many as it has
+    Parameters
+    ----------
+    key : str
+        Of the task.
+    topic : str
+        Of the events that it sends.
+    folder : str
+        That all workers share.
+    threads : int
+        Of Dr.Jit on the CPU; 0: as many as it has.
     """
     from distributed import get_worker
 

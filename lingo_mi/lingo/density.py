@@ -12,13 +12,17 @@ from lingo_mi.lingo.voxel_filter import pixels
 def mean_pixel(rays: Rays, projections: np.ndarray, points: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
     """C = 1/n sum over views of I_o[P^I_o], [N], in units of the projections.
 
-    rays         n views in the normalised frame
-    projections  [n, v, u]
-    points       [N, 3]
-    valid        bool [n, v, u], None: all pixels are valid
-
     The mean is over the views in which the point projects to a valid pixel (in the paper's intersection, all
     views). A point outside all views has the mean 0.
+
+    Parameters
+    ----------
+    rays : Rays
+        n views in the normalised frame.
+    projections : ndarray [n, v, u]
+    points : ndarray [N, 3]
+    valid : ndarray or None
+        Bool [n, v, u], None: all pixels are valid.
     """
     points = np.ascontiguousarray(np.asarray(points, float).T)
     total, seen = np.zeros(points.shape[1]), np.zeros(points.shape[1])

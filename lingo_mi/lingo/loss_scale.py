@@ -15,7 +15,10 @@ LANES = 32  # histograms per CPU thread
 def loss_scale(image: Any) -> Any:
     """T_g + 1 / (4 T_g) with T_g = max(FLOOR, `otsu_on_device`(image)): Float of width 1, detached.
 
-    image : Float [N], line integrals
+    Parameters
+    ----------
+    image : Float [N]
+        Line integrals.
     """
     threshold = dr.maximum(otsu_on_device(image), FLOOR)
     return threshold + 0.25 / threshold
@@ -24,13 +27,16 @@ def loss_scale(image: Any) -> Any:
 def otsu_on_device(image: Any) -> Any:
     """Otsu's threshold, which maximises the variance between two classes: Float of width 1, detached.
 
-    image : Float [N], any unit
-
     The histogram has 256 bins between the smallest and the largest value. The threshold is the centre of a bin, the
     lowest of equally good ones, as in `skimage.filters.threshold_otsu` (rounding may put a value into the next bin). For
     a constant image, its value is returned.
 
     Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9 (1979).
+
+    Parameters
+    ----------
+    image : Float [N]
+        Any unit.
     """
     image = dr.detach(image)
     low, high = dr.min(image), dr.max(image)

@@ -28,8 +28,12 @@ class Masks:
 def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | None = None) -> Masks:
     """M_h = I > T_h with T_h = Otsu(I), and M_l = I > T_l with T_l = `low_factor` T_h, per view.
 
-    projections  [n, v, u] line integrals (the object is bright)
-    valid        bool [n, v, u]; invalid pixels affect no threshold and are in no mask. None: all are valid
+    Parameters
+    ----------
+    projections : ndarray
+        [n, v, u] line integrals (the object is bright).
+    valid : ndarray or None
+        Bool [n, v, u]; invalid pixels affect no threshold and are in no mask. None: all are valid.
     """
     projections = np.asarray(projections)
     known = [...] * len(projections) if valid is None else valid

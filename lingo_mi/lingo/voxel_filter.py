@@ -23,8 +23,12 @@ BLOCK = 8  # cells along the side of a block, which is tested as a whole
 def voxel_centres(grid: Sequence[int] | np.ndarray, half: ArrayLike, index: np.ndarray | None = None) -> np.ndarray:
     """Centres [N, 3] of the cells `index` (flat, z fastest; default all) of a grid over [-half, half].
 
-    grid   cells (x, y, z)
-    half   half the volume's sides in the normalised frame, [3]
+    Parameters
+    ----------
+    grid : Sequence[int] or ndarray
+        Cells (x, y, z).
+    half : array_like
+        Half the volume's sides in the normalised frame, [3].
     """
     cells, half = np.asarray(grid, int), np.asarray(half, float)
     index = np.arange(cells.prod()) if index is None else index
@@ -35,12 +39,16 @@ def voxel_centres(grid: Sequence[int] | np.ndarray, half: ArrayLike, index: np.n
 def pixels(matrix: np.ndarray, points: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """P^I = floor(clip(M P)): flat pixel indices [N], and whether each point projects into the image, [N].
 
-    matrix  [3, 4], see `camera_matrices`
-    points  [3, N]
-    shape   (v, u) of the image
-
     Points outside get the index 0. Pixel (i, j) covers [i, i + 1) x [j, j + 1) of the continuous pixel
     positions.
+
+    Parameters
+    ----------
+    matrix : ndarray [3, 4]
+        See `camera_matrices`.
+    points : ndarray [3, N]
+    shape : tuple[int, int]
+        (v, u) of the image.
     """
     x, y, w = matrix[:, :3] @ points + matrix[:, 3:]
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -106,16 +114,26 @@ def valid_voxels(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The intersections of all views: flat cell indices (z fastest) of the low and the high valid set, sorted.
 
-    rays     n views in the normalised frame
-    masks    of the same n views
-    grid     cells (x, y, z) over [-half, half]
-    misses   number of views in which a valid cell may lie outside the mask (paper: 0)
-    outside  for a cell that projects outside a view's image: 'invalid' counts as a miss (paper); 'ignore' leaves
-             the view out, for truncated scans (a cell outside all views is still invalid)
-
     A view is left out for cells that project to its invalid pixels.
 
-    Raises InputError for another value of `outside`, or a number of masks that is not the number of views.
+    Parameters
+    ----------
+    rays : Rays
+        n views in the normalised frame.
+    masks : Masks
+        Of the same n views.
+    grid : Sequence[int] or ndarray
+        Cells (x, y, z) over [-half, half].
+    misses : int
+        Number of views in which a valid cell may lie outside the mask (paper: 0).
+    outside : str
+        For a cell that projects outside a view's image: 'invalid' counts as a miss (paper); 'ignore' leaves the view out, for
+        truncated scans (a cell outside all views is still invalid).
+
+    Raises
+    ------
+    InputError
+        For another value of `outside`, or a number of masks that is not the number of views.
     """
     if outside not in ('invalid', 'ignore'):
         raise InputError(f"outside must be 'invalid' or 'ignore', not {outside!r}")

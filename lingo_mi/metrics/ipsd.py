@@ -9,11 +9,15 @@ from scipy.spatial import KDTree
 def ipsd(initial: np.ndarray, structural: np.ndarray) -> float:
     """IPSD = 1/N sum over initial points of the distance to the closest structural point.
 
-    initial     P, [N, 3]: the points the fit started from
-    structural  T, [M, 3]: current centres of the Gaussians that densification made and did not remove
-
     In the points' unit (the paper's numbers: the normalised frame, with a longest side of 2). NaN if either set
     is empty.
+
+    Parameters
+    ----------
+    initial : ndarray
+        P, [N, 3]: the points the fit started from.
+    structural : ndarray
+        T, [M, 3]: current centres of the Gaussians that densification made and did not remove.
     """
     if len(initial) == 0 or len(structural) == 0:
         return float('nan')

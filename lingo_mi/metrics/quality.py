@@ -2,12 +2,11 @@
 
 Each measure comes in two forms. The plain name is the absolute one, and `_r2` is R2-Gaussian's:
 
-    psnr_2d, ssim_2d         line integrals as they are, one full scale for all views: the largest true value. A wrong
-                             gain counts as the error it is.
-    psnr_3d, ssim_3d         full scale is the largest true density, in whatever unit; the window of SSIM is as thick
-                             as it is wide.
-    psnr_2d_r2, ssim_2d_r2   every view of either stack is divided by its own maximum, so a wrong gain costs nothing.
-    psnr_3d_r2, ssim_3d_r2   full scale 1, nothing rescaled or clipped, SSIM slice by slice.
+- `psnr_2d`, `ssim_2d`: line integrals as they are, one full scale for all views: the largest true value. A wrong gain counts as
+  the error it is.
+- `psnr_3d`, `ssim_3d`: full scale is the largest true density, in whatever unit; the window of SSIM is as thick as it is wide.
+- `psnr_2d_r2`, `ssim_2d_r2`: every view of either stack is divided by its own maximum, so a wrong gain costs nothing.
+- `psnr_3d_r2`, `ssim_3d_r2`: full scale 1, nothing rescaled or clipped, SSIM slice by slice.
 
 Published tables hold R2-Gaussian's forms.
 
@@ -53,8 +52,11 @@ def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
 def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """PSNR in dB of line integrals as they are, mean over the views.
 
-    images, truth : [view, v, u]
-    peak          : the value that counts as full scale, > 0; by default the maximum of the whole truth
+    Parameters
+    ----------
+    images, truth : array_like [view, v, u]
+    peak : float or None
+        The value that counts as full scale, > 0; by default the maximum of the whole truth.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     peak = _peak(truth, peak)
@@ -64,7 +66,10 @@ def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
 def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     """SSIM as R2-Gaussian reports it: each view divided by its own maximum, mean over the views.
 
-    images, truth : [view, v, u]. Views whose truth has no positive pixel are left out.
+    Parameters
+    ----------
+    images, truth : array_like [view, v, u]
+        Views whose truth has no positive pixel are left out.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     return _mean(_each(_ssim, _own_maximum(images, truth), images[0].size))
@@ -73,8 +78,11 @@ def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
 def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of line integrals with one full scale for both stacks, mean over the views.
 
-    images, truth : [view, v, u]
-    peak          : the value that counts as full scale, > 0; by default the maximum of the whole truth
+    Parameters
+    ----------
+    images, truth : array_like [view, v, u]
+    peak : float or None
+        The value that counts as full scale, > 0; by default the maximum of the whole truth.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
     peak = _peak(truth, peak)
@@ -84,7 +92,10 @@ def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
 def psnr_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
     """PSNR in dB with peak 1, neither volume rescaled or clipped.
 
-    volume, truth : [x, y, z]. The number means what it says where the truth's densities fill [0, 1].
+    Parameters
+    ----------
+    volume, truth : array_like [x, y, z]
+        The number means what it says where the truth's densities fill [0, 1].
     """
     return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.0)
 
@@ -108,8 +119,11 @@ def ssim_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
 def psnr_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """PSNR in dB of densities in any unit.
 
-    volume, truth : [x, y, z]
-    peak          : the value that counts as full scale, > 0; by default the maximum of the truth
+    Parameters
+    ----------
+    volume, truth : array_like [x, y, z]
+    peak : float or None
+        The value that counts as full scale, > 0; by default the maximum of the truth.
     """
     volume, truth = _pair(volume, truth, 'volumes', '[x, y, z]')
     peak = _peak(truth, peak)
@@ -119,8 +133,12 @@ def psnr_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
 def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
     """SSIM of densities in any unit, with a window of 11 x 11 x 11 voxels, mean over all of them.
 
-    volume, truth : [x, y, z]; along an axis of one voxel there is no window
-    peak          : the value that counts as full scale, > 0; by default the maximum of the truth
+    Parameters
+    ----------
+    volume, truth : array_like [x, y, z]
+        Along an axis of one voxel there is no window.
+    peak : float or None
+        The value that counts as full scale, > 0; by default the maximum of the truth.
     """
     volume, truth = _pair(volume, truth, 'volumes', '[x, y, z]')
     peak = _peak(truth, peak)
@@ -211,7 +229,10 @@ def _each(function, items, size):
     """The function of each of the items, which are tuples of arguments, in their order, on threads: NumPy and SciPy work without
     Python's lock. Only so many items are taken in advance as there are threads, with three slabs of values together, or one item.
 
-    size   of an item, values
+    Parameters
+    ----------
+    size
+        Of an item, values.
     """
     threads = max(1, min(cores(), THREADS, 3 * SLAB // size))
     with ThreadPoolExecutor(threads) as pool:

@@ -38,10 +38,16 @@ class Analytic(Protocol):
 class Phantom:
     """A voxelized test object.
 
-    data      float32 [x, y, z] in [0, 1], voxel averages or centre values, see the phantom's module
-    spacing   voxel size, mm, (x, y, z)
-    name      its name in the registry
-    analytic  the same object with exact projections; None if there is no closed form
+    Parameters
+    ----------
+    data : ndarray
+        float32 [x, y, z] in [0, 1], voxel averages or centre values, see the phantom's module.
+    spacing : tuple[float, float, float]
+        Voxel size, mm, (x, y, z).
+    name : str
+        Its name in the registry.
+    analytic : Analytic or None
+        The same object with exact projections; None if there is no closed form.
     """
 
     data: np.ndarray
@@ -75,9 +81,15 @@ def require_name(name: str) -> None:
 def make(name: str, size: int, seed: int = 0) -> Phantom:
     """The phantom `name` on size^3 voxels.
 
-    seed  non-negative integer; ignored by phantoms without randomness (mesh, shepp_logan)
+    Parameters
+    ----------
+    seed : int
+        Non-negative integer; ignored by phantoms without randomness (mesh, shepp_logan).
 
-    Raises InputError for an unknown name, a size outside 8..512 or a negative seed.
+    Raises
+    ------
+    InputError
+        For an unknown name, a size outside 8..512 or a negative seed.
     """
     require_name(name)
     try:

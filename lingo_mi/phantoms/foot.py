@@ -65,10 +65,16 @@ _METATARSALS = (
 class Bone:
     """A bone's outline and what it is made of.
 
-    shaft    (a, b): the axis of a long bone, which gets a thick cortex and a marrow cavity about its middle
-    cortex   thickness at the ends, mm
-    thick    thickness at mid-shaft, mm
-    gap      joint space to earlier bones, mm
+    Parameters
+    ----------
+    shaft : tuple or None
+        (a, b): the axis of a long bone, which gets a thick cortex and a marrow cavity about its middle.
+    cortex : float
+        Thickness at the ends, mm.
+    thick : float
+        Thickness at mid-shaft, mm.
+    gap : float
+        Joint space to earlier bones, mm.
     """
 
     solid: Blend
@@ -81,9 +87,14 @@ class Bone:
 def _long(a: ArrayLike, b: ArrayLike, radii: tuple[float, float, float], thick=1.9, bow=0.0, flare=0.26) -> Bone:
     """A tapered long bone from the centre of its base to the centre of its head.
 
-    radii  of base, shaft and head, mm
-    bow    rise at mid-shaft, mm
-    flare  the fraction of its length over which the base narrows to the shaft
+    Parameters
+    ----------
+    radii : tuple[float, float, float]
+        Of base, shaft and head, mm.
+    bow
+        Rise at mid-shaft, mm.
+    flare
+        The fraction of its length over which the base narrows to the shaft.
     """
     (base, shaft, head), start, end = radii, np.array(a, float), np.array(b, float)
 

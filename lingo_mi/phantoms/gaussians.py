@@ -28,10 +28,16 @@ _WINDOW = 8.0  # sigma, of the projections
 class Cloud:
     """Gaussians in the world frame.
 
-    centres      float64 [n, 3], mm
-    scales       float64 [n, 3], mm
-    quaternions  float64 [n, 4], unit, (x, y, z, w)
-    density      float64 [n], the value at the centre
+    Parameters
+    ----------
+    centres : float64 [n, 3]
+        Mm.
+    scales : float64 [n, 3]
+        Mm.
+    quaternions : float64 [n, 4]
+        Unit, (x, y, z, w).
+    density : float64 [n]
+        The value at the centre.
     """
 
     centres: np.ndarray
@@ -70,9 +76,12 @@ class Cloud:
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm (computed in float64).
 
-        A Gaussian is evaluated on the bounding box of its 8 sigma outline; outside, it is below 2e-14 of its
-        peak. Raises InputError if the source lies in or beside a Gaussian, which then has no outline on the
-        panel.
+        A Gaussian is evaluated on the bounding box of its 8 sigma outline; outside, it is below 2e-14 of its peak.
+
+        Raises
+        ------
+        InputError
+            If the source lies in or beside a Gaussian, which then has no outline on the panel.
         """
         rays, whiten = geometry.rays(), self.whiten
         spread = np.linalg.inv(np.swapaxes(whiten, 1, 2) @ whiten)
@@ -141,7 +150,12 @@ def _square(x, y, a, b, c):
 def cloud(n: int = 2000, seed: int = 0) -> Cloud:
     """n random Gaussians in a ball of 80 mm radius: balls, needles and pancakes with scales of 1.2 to 9 mm.
 
-    Densities fall with n, so that the sum stays below 1. Raises InputError unless n is at least 1.
+    Densities fall with n, so that the sum stays below 1.
+
+    Raises
+    ------
+    InputError
+        Unless n is at least 1.
     """
     if n < 1:
         raise InputError(f'a cloud needs at least one Gaussian, not {n}')

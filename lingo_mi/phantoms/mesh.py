@@ -128,9 +128,13 @@ class Mesh:
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact chord lengths, float32 [view, v, u], mm.
 
-        The chord is the signed sum of the distances to all faces a ray crosses, so every triangle is drawn on
-        the panel once. The whole object must lie between source and panel.
-        Raises InputError if part of it is behind the source.
+        The chord is the signed sum of the distances to all faces a ray crosses, so every triangle is drawn on the panel once. The
+        whole object must lie between source and panel.
+
+        Raises
+        ------
+        InputError
+            If part of it is behind the source.
         """
         rays, faces = geometry.rays(), self.mesh.faces
         nv, nu = geometry.nDetector

@@ -42,9 +42,13 @@ TABLE = np.array(
 class UniformEllipsoids:
     """A sum of constant ellipsoids.
 
-    density  float64 [n]
-    centre   float64 [n, 3], mm
-    whiten   float64 [n, 3, 3]: takes an ellipsoid about its centre to the unit ball
+    Parameters
+    ----------
+    density : float64 [n]
+    centre : float64 [n, 3]
+        Mm.
+    whiten : float64 [n, 3, 3]
+        Takes an ellipsoid about its centre to the unit ball.
     """
 
     density: np.ndarray

@@ -161,7 +161,10 @@ class Cut:
 def tube(points: Sequence | np.ndarray, radii: Sequence[float] | np.ndarray, k: float = 0.0, smooth: int = 0) -> Blend:
     """A chain of cones through `points` with the given radii.
 
-    smooth  cones per stretch of a monotone cubic through the points; 0: straight stretches
+    Parameters
+    ----------
+    smooth : int
+        Cones per stretch of a monotone cubic through the points; 0: straight stretches.
     """
     places, thick = np.asarray(points, float), np.asarray(radii, float)
     if smooth:
@@ -242,7 +245,10 @@ class Cube:
     def paint(self, image: np.ndarray, solid: Any, value: Any, soft: float = 0.0) -> None:
         """Blend `value` (a number or a function of the box's slices) into `image` inside a solid.
 
-        soft  width over which the solid's edge fades, at least a voxel
+        Parameters
+        ----------
+        soft : float
+            Width over which the solid's edge fades, at least a voxel.
         """
         found = self.near(solid, max(self.h, soft))
         if found is None:
@@ -326,8 +332,12 @@ class Texture:
 class Branching:
     """What all branches of a random tree share.
 
-    inside   predicate of a point [3]: a branch that would leave it ends there; None: anywhere
-    shrink   radius of a branch's end over that of its start
+    Parameters
+    ----------
+    inside : callable or None
+        Predicate of a point [3]: a branch that would leave it ends there; None: anywhere.
+    shrink : float
+        Radius of a branch's end over that of its start.
     """
 
     inside: Callable[[np.ndarray], bool] | None = None
@@ -345,9 +355,14 @@ def branches(
 ) -> list[Cone]:
     """A random branching tree as cones: each branch bends a little and ends in two thinner ones.
 
-    start, direction   of the first branch, [3]; the direction of any length
-    length, radius     of it
-    depth              generations of branches after it
+    Parameters
+    ----------
+    start, direction : array_like
+        Of the first branch, [3]; the direction of any length.
+    length, radius : float
+        Of it.
+    depth : int
+        Generations of branches after it.
     """
     start, direction = np.asarray(start, float), np.asarray(direction, float)
     direction = direction / np.linalg.norm(direction)

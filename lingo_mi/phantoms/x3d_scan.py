@@ -65,7 +65,12 @@ def scan(
     """The default scan: `views` views to fit, evenly spaced over [0, 180) degrees, and as many held-out views at
     random angles in this range.
 
-    seed: of the held-out angles. pixels: of the panel (see `default_geometry`). Raises InputError unless views is at least 1.
+    seed: of the held-out angles. pixels: of the panel (see `default_geometry`).
+
+    Raises
+    ------
+    InputError
+        Unless views is at least 1.
     """
     if views < 1:
         raise InputError(f'a scan needs at least one view, not {views}')

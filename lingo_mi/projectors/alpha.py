@@ -42,10 +42,14 @@ NAMES = ('opacity', 'radiance', 'mx', 'my', 'shear', 'x', 'y')
 class Discs:
     """N projected Gaussians in one view.
 
-    values    Float [N] each, named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; (x, y) is the centre, in
-              pixels from the image's corner
-    depth     Float [N] along the panel's normal; infinite for Gaussians that are not drawn (at or behind the source)
-    first, count   UInt32 [N] each for columns and rows: the box of tiles that a Gaussian touches
+    Parameters
+    ----------
+    values : Float [N]
+        Named in NAMES: q = (mx t)^2 + (my dy)^2 with t = dx + shear dy; (x, y) is the centre, in pixels from the image's corner.
+    depth
+        Float [N] along the panel's normal; infinite for Gaussians that are not drawn (at or behind the source).
+    first, count : tuple
+        UInt32 [N] each for columns and rows: the box of tiles that a Gaussian touches.
     """
 
     values: tuple
@@ -62,9 +66,13 @@ class Discs:
 def flatten(centre: Any, scale: Any, rotation: Any, opacity: Any, radiance: Any, view: View) -> Discs:
     """Project Gaussians to a view by the affine (EWA) model; differentiable in all of them and in the view's pose.
 
-    centre, scale       Point3f, Vector3f [N], standard deviations
-    rotation            Vector4f [N], quaternion (x, y, z, w)
-    opacity, radiance   Float [N]
+    Parameters
+    ----------
+    centre, scale : Point3f, Vector3f [N]
+        Standard deviations.
+    rotation : Vector4f [N]
+        Quaternion (x, y, z, w).
+    opacity, radiance : Float [N]
     """
     nothing = dr.zeros(mi.Float, dr.width(opacity))
     footprints = project((centre, scale, rotation, nothing), view, EXTENT, WIDEN)
@@ -153,11 +161,18 @@ class _Composite(dr.CustomOp):
 class _Lists:
     """For every tile the Gaussians that touch it, front to back.
 
-    length         number of entries
-    disc, entry    UInt32 [length], sorted by tile: the Gaussian, and the entry's number when sorted by depth
-    tile_ends      UInt32 [tiles], end of each tile's entries
-    ends           UInt32 [N], end of each Gaussian's entries when sorted by depth
-    rank           UInt32 [N], a Gaussian's position by depth
+    Attributes
+    ----------
+    length
+        Number of entries.
+    disc, entry : UInt32 [length]
+        Sorted by tile: the Gaussian, and the entry's number when sorted by depth.
+    tile_ends : UInt32 [tiles]
+        End of each tile's entries.
+    ends : UInt32 [N]
+        End of each Gaussian's entries when sorted by depth.
+    rank : UInt32 [N]
+        A Gaussian's position by depth.
     """
 
     def __init__(self, boxes, height, width):

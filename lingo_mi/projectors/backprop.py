@@ -31,7 +31,10 @@ class Cuts:
     A kernel needs registers for all values that its derivatives refer to, so a long one leaves room for few warps on a GPU. On
     the CPU, where it would only take time, nothing is cut.
 
-    active   whether to cut; None: on a GPU
+    Parameters
+    ----------
+    active : bool or None
+        Whether to cut; None: on a GPU.
     """
 
     def __init__(self, active: bool | None = None):

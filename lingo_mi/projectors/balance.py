@@ -107,9 +107,13 @@ PAIRS, EIGHTS = Layout(16, 2, 4), Layout(4, 8, 1)  # on a GPU
 class Sharing:
     """The number of shares, and the width of the teams that do one share each. Images do not depend on it, but for rounding.
 
-    lanes    lanes of a team on the CPU; on a GPU it is a warp
-    shares   shares over their usual number, which is two a CPU thread, or as many as a GPU can hold warps. More shares balance
-             better, but on the CPU each has its own image
+    Parameters
+    ----------
+    lanes : int
+        Lanes of a team on the CPU; on a GPU it is a warp.
+    shares : float
+        Shares over their usual number, which is two a CPU thread, or as many as a GPU can hold warps. More shares balance better,
+        but on the CPU each has its own image.
     """
 
     lanes: int = 8
@@ -161,11 +165,18 @@ SHARING = Sharing()  # as measured: docs/tables/accuracy_shares_of_the_work.csv
 class Share:
     """The work of a kernel's lanes.
 
-    lane         UInt32, lane numbers; those of a team are consecutive
-    begin, end   of the team's share, as (item, block), UInt32
-    blocks       UInt32 [N], blocks of each item
-    layout       of the teams
-    block        rows of a block
+    Parameters
+    ----------
+    lane : UInt32
+        Lane numbers; those of a team are consecutive.
+    begin, end : tuple
+        Of the team's share, as (item, block), UInt32.
+    blocks : UInt32 [N]
+        Blocks of each item.
+    layout : Layout
+        Of the teams.
+    block : int
+        Rows of a block.
     """
 
     lane: Any
@@ -242,10 +253,16 @@ class Share:
 class Target:
     """The images that a kernel adds packets to.
 
-    values    Float, the images of all teams, or common ones
-    size      Int32, packets of an image
-    team      UInt32, of a team's own image, which needs no atomics; None: the images are common
-    parts     common images, each of a part of the items
+    Parameters
+    ----------
+    values : Float
+        The images of all teams, or common ones.
+    size : Int32
+        Packets of an image.
+    team : UInt32
+        Of a team's own image, which needs no atomics; None: the images are common.
+    parts : int
+        Common images, each of a part of the items.
     """
 
     values: Any
@@ -300,9 +317,14 @@ class Sums:
 class Work:
     """Items shared out among teams, from evaluated arrays:
 
-    blocks, block_cost   UInt32 [N], blocks of each item and cost of one block, at least 1
-    ends                 UInt64 [N], prefix sums of the items' costs
-    sharing              number of shares and lanes per team
+    Parameters
+    ----------
+    blocks, block_cost : UInt32 [N]
+        Blocks of each item and cost of one block, at least 1.
+    ends : UInt64 [N]
+        Prefix sums of the items' costs.
+    sharing : Sharing
+        Number of shares and lanes per team.
     """
 
     def __init__(self, blocks: Any, block_cost: Any, ends: Any, sharing: Sharing):
@@ -332,8 +354,11 @@ class Work:
     def add_up(self, kernel: Callable[..., Any], rows: int, width: int, parts: int = 1, /, **arguments: Any) -> Any:
         """Run kernel(share, target, **arguments), which adds to `rows` rows of `width` elements, padded to whole steps.
 
-        Returns the rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts or more. Each part
-        is summed by itself, on a GPU many in one launch, and the partial sums are added in float64.
+        Returns
+        -------
+        object
+            The rows, Float [rows * width]. With `parts` > 1, the items are divided into that many parts or more. Each part is
+            summed by itself, on a GPU many in one launch, and the partial sums are added in float64.
         """
         layout, Float64 = self.sharing.adding, dr.float64_array_t(mi.Float)
         size = rows * layout.packets(width)

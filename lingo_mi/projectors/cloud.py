@@ -39,15 +39,28 @@ def line_integrals(
 ) -> Any:
     """Line integrals of every pixel of a view, Float [height * width], row by row, in density times length.
 
-    centre, scale   Point3f, Vector3f [N]; standard deviations
-    rotation        Vector4f [N], quaternion (x, y, z, w)
-    density         Float [N], value at the centre
-    view            its pixels: one ray each, or the mean over the pixel (`options.area`); for more rays `options.subdivided`
-    options         cut-off, footprint, area and sharing
-    primal          False if only derivatives are needed: the image is then zero
+    Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has no extent
+    or no rotation leaves no finite pixel.
 
-    Differentiable in all four and in the view's pose, in forward and reverse mode. A Gaussian that is not finite, has
-    no extent or no rotation leaves no finite pixel. Raises InputError for an empty cloud.
+    Parameters
+    ----------
+    centre, scale : Point3f, Vector3f [N]
+        Standard deviations.
+    rotation : Vector4f [N]
+        Quaternion (x, y, z, w).
+    density : Float [N]
+        Value at the centre.
+    view : View
+        Its pixels: one ray each, or the mean over the pixel (`options.area`); for more rays `options.subdivided`.
+    options : RenderOptions
+        Cut-off, footprint, area and sharing.
+    primal : bool
+        False if only derivatives are needed: the image is then zero.
+
+    Raises
+    ------
+    InputError
+        For an empty cloud.
     """
     return _of_inputs((centre, scale, rotation, density), view, options, primal)
 

@@ -38,12 +38,17 @@ def parts_of(depth: Any) -> int:
 def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
     """The largest number of items that overlap in one element of a grid: Float [1], 0 for few items.
 
-    places    Int32 [N] for each axis, an item's element; it may lie outside the grid
-    covered   Float [N], elements that an item covers
-    shape     elements along each axis
-
     Counts covered elements per cell (the cell of an item's centre) at four levels: single elements, with wrapped indices; two
     coarser grids; and the whole grid. Large clouds are sampled.
+
+    Parameters
+    ----------
+    places : Sequence
+        Int32 [N] for each axis, an item's element; it may lie outside the grid.
+    covered : Float [N]
+        Elements that an item covers.
+    shape : Sequence[int]
+        Elements along each axis.
     """
     count = dr.width(covered)
     if count <= deep():

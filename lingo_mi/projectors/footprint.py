@@ -52,14 +52,21 @@ DOUBLE = 'shear', 'x', 'y'
 class Footprints:
     """Footprints of N Gaussians in one view.
 
-    values    the eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; (x, y) is
-              the projected centre, in pixels from the centre of pixel (column, row), which contains it
-    column, row            Int32 [N]
-    row_begin, row_end     Int32 [N], rows of the footprint, clipped to the image; an empty range if there are none
-    width                  Float [N], pixels across the widest row, for balancing work
-    area                   Float [N], covered pixels: those of the ellipse or of the box, whichever are fewer
-    straddles              Bool [N], Gaussians without a footprint, which `segment` must integrate; also invalid ones (a number
-                           that is not finite, or a zero scale or quaternion)
+    Parameters
+    ----------
+    values : tuple
+        The eleven differentiable numbers named in NAMES, [N] each: Float, but Float64 for those in DOUBLE; (x, y) is the
+        projected centre, in pixels from the centre of pixel (column, row), which contains it.
+    column, row : Int32 [N]
+    row_begin, row_end : Int32 [N]
+        Rows of the footprint, clipped to the image; an empty range if there are none.
+    width : Float [N]
+        Pixels across the widest row, for balancing work.
+    area : Float [N]
+        Covered pixels: those of the ellipse or of the box, whichever are fewer.
+    straddles : Bool [N]
+        Gaussians without a footprint, which `segment` must integrate; also invalid ones (a number that is not finite, or a zero
+        scale or quaternion).
     """
 
     values: tuple
@@ -81,12 +88,17 @@ class Footprints:
 def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, cut: Cuts | None = None) -> Footprints:
     """Footprints of N Gaussians in a view.
 
-    gaussians   centre Point3f [N]; scale Vector3f [N], standard deviations; rotation Vector4f [N], quaternion (x, y, z, w),
-                normalised here; density Float [N], value at the centre. The functional API calls them means, scales,
-                quaternions and density
-    extent      cut-off in standard deviations
-    widen       variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant)
-    cut         to backpropagate in parts, by its `pass_on`
+    Parameters
+    ----------
+    gaussians : Sequence
+        Centre Point3f [N]; scale Vector3f [N], standard deviations; rotation Vector4f [N], quaternion (x, y, z, w), normalised
+        here; density Float [N], value at the centre. The functional API calls them means, scales, quaternions and density.
+    extent : float
+        Cut-off in standard deviations.
+    widen : float
+        Variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant).
+    cut : Cuts or None
+        To backpropagate in parts, by its `pass_on`.
     """
     centre, scale, rotation, density = gaussians
     cut = cut or Cuts(False)

@@ -37,8 +37,12 @@ GAUSS = 0.5 / 3**0.5  # abscissae of the two-point rule on [-1/2, 1/2]
 class Lines:
     """Lines origin + t direction, t in [t_min, t_max].
 
-    origin, direction   Point3f, Vector3f; the direction need not be a unit vector, but must not be zero
-    t_min, t_max        numbers or Float, in units of the direction
+    Parameters
+    ----------
+    origin, direction : Point3f, Vector3f
+        The direction need not be a unit vector, but must not be zero.
+    t_min, t_max
+        Numbers or Float, in units of the direction.
     """
 
     origin: Any
@@ -51,9 +55,13 @@ class Lines:
 class Walk:
     """The walks of rays through a grid, in its coordinates.
 
-    origin          Vector3f
-    d, inv          Vector3f, the direction (no component is zero) and 1 / d
-    t_first, t_last   Float, ends of the walk
+    Parameters
+    ----------
+    origin : Vector3f
+    d, inv : Vector3f
+        The direction (no component is zero) and 1 / d.
+    t_first, t_last : Float
+        Ends of the walk.
     """
 
     origin: Any
@@ -220,17 +228,28 @@ def whole_box(size: Iterable[int]) -> tuple[Any, Any]:
 def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, lines: Lines) -> Any:
     """Line integrals of a voxel volume.
 
-    data               mi.Float [nx * ny * nz], z fastest: densities at the voxel centres
-    size               (nx, ny, nz), Python integers
-    box_min, box_max   opposite corners of the volume (sequences or mi.Point3f)
-    lines              along which, in the volume's unit
+    Parameters
+    ----------
+    data
+        mi.Float [nx * ny * nz], z fastest: densities at the voxel centres.
+    size : Sequence[int]
+        (nx, ny, nz), Python integers.
+    box_min, box_max
+        Opposite corners of the volume (sequences or mi.Point3f).
+    lines : Lines
+        Along which, in the volume's unit.
 
-    Returns mi.Float [lines], density times length: exact for the trilinear interpolant, zero for a ray that
-    misses the box. Differentiable with respect to `data` in both modes (the derivative is the same operator or
-    its transpose), not with respect to the rays. For full float32 precision, origins should be near the box, as
-    those of `view_rays` are.
+    Returns
+    -------
+    object
+        Mi.Float [lines], density times length: exact for the trilinear interpolant, zero for a ray that misses the box.
+        Differentiable with respect to `data` in both modes (the derivative is the same operator or its transpose), not with
+        respect to the rays. For full float32 precision, origins should be near the box, as those of `view_rays` are.
 
-    Raises InputError if `data` does not hold nx * ny * nz values.
+    Raises
+    ------
+    InputError
+        If `data` does not hold nx * ny * nz values.
     """
     nx, ny, nz = (int(n) for n in size)
     size = nx, ny, nz
@@ -324,14 +343,24 @@ def project_volume(
 ) -> np.ndarray:
     """Projections of a voxel volume along the rays of all pixel centres, exact for its trilinear interpolant.
 
-    volume     [x, y, z], of shape `geometry.grid.shape`; densities per mm
-    progress   called as progress(views done, views) after every view
+    Parameters
+    ----------
+    volume : ndarray [x, y, z]
+        Of shape `geometry.grid.shape`; densities per mm.
+    progress : callable or None
+        Called as progress(views done, views) after every view.
 
-    Returns float32 [view, v, u], density times mm. A cone beam starts at the source. Rays do not end at the
-    panel, because the usual virtual detector is a panel through the axis (DSD = DSO). Empty margins of the
-    volume cost no time. All views use one compiled kernel.
+    Returns
+    -------
+    ndarray
+        Float32 [view, v, u], density times mm. A cone beam starts at the source. Rays do not end at the panel, because the usual
+        virtual detector is a panel through the axis (DSD = DSO). Empty margins of the volume cost no time. All views use one
+        compiled kernel.
 
-    Raises InputError if the shapes disagree or the volume is not finite.
+    Raises
+    ------
+    InputError
+        If the shapes disagree or the volume is not finite.
     """
     volume = np.ascontiguousarray(volume, np.float32)
     if volume.shape != geometry.grid.shape:

@@ -22,7 +22,10 @@ from lingo_mi.projectors.upload import uploaded
 class GridPair(Stack):
     """The matrix A of a scan, with zero rows for invalid pixels. `adjoint` is its transpose to rounding.
 
-    valid   bool [view, v, u]; None: all
+    Parameters
+    ----------
+    valid : ndarray or None
+        Bool [view, v, u]; None: all.
     """
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
@@ -46,8 +49,12 @@ class GridPair(Stack):
     def adjoint(self, images: Any, views: Views, rule: Callable[[Any, Any, Any], Any] | None = None) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
-        images : mi.Float [block, u, v]
-        rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt and the sums; its result is returned instead
+        Parameters
+        ----------
+        images
+            mi.Float [block, u, v].
+        rule : callable or None
+            Function of (voxel, A^T y, A^T 1), with flat indices mi.UInt and the sums; its result is returned instead.
         """
         walk, length = self._walk(Block.of(views))
         sums = [dr.zeros(mi.Float, self.voxels) for _ in range(1 if rule is None else 2)]

@@ -111,12 +111,18 @@ def _nearest(rays: Rays, geometry):
 class Joseph(Gathered):
     """The matrix A of a scan with an upright panel: see `Gathered`.
 
-    valid   bool [view, v, u]; None: all
-
     On the device: `columns` and `rows`, see `column_table` and `row_table`; `matrices`, see `_column_matrix`. `margin`
     rows of zeros above and below images are at least as many as the rows with hats that cover a voxel.
 
-    Raises InputError for a scan that it does not serve (see `serves`), or a volume of 2^32 voxels or more.
+    Parameters
+    ----------
+    valid : ndarray or None
+        Bool [view, v, u]; None: all.
+
+    Raises
+    ------
+    InputError
+        For a scan that it does not serve (see `serves`), or a volume of 2^32 voxels or more.
     """
 
     ARRAYS = ('columns', 'rows', 'matrices', 'valid')

@@ -43,15 +43,25 @@ NEAR = 1e-9  # a mesh touches the source if its nearest vertex has at most this 
 class MeshPaths:
     """A closed mesh, ready to be projected.
 
-    vertices   [V, 3] numbers, any unit; equal positions are merged, because meshes with a normal or texture
-               coordinate per face repeat them
-    faces      [F, 3] indices of vertices, anticlockwise seen from outside; a mesh that is inside out is flipped as a
-               whole, so all its parts must be oriented alike
-    name       for error messages
-    sharing    how the work is shared out (see `balance`)
+    Where parts overlap, lengths add up.
 
-    Where parts overlap, lengths add up. Raises InputError if the mesh is empty, not finite, or not closed: every edge
-    must be used equally often in both directions.
+    Parameters
+    ----------
+    vertices : array_like
+        [V, 3] numbers, any unit; equal positions are merged, because meshes with a normal or texture coordinate per face repeat
+        them.
+    faces : array_like
+        [F, 3] indices of vertices, anticlockwise seen from outside; a mesh that is inside out is flipped as a whole, so all its
+        parts must be oriented alike.
+    name : str
+        For error messages.
+    sharing : Sharing
+        How the work is shared out (see `balance`).
+
+    Raises
+    ------
+    InputError
+        If the mesh is empty, not finite, or not closed: every edge must be used equally often in both directions.
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike, name: str, sharing: Sharing = SHARING):
@@ -67,10 +77,17 @@ class MeshPaths:
     def lengths(self, view: View) -> Any:
         """Path lengths inside the mesh along the rays of all pixel centres, Float [height * width], row by row.
 
-        view   `view.View`; the lengths have its unit
+        A mesh behind the source of a cone beam adds nothing. Not differentiable.
 
-        A mesh behind the source of a cone beam adds nothing. Not differentiable. Raises InputError if the mesh crosses the
-        plane of a cone beam's source parallel to the panel.
+        Parameters
+        ----------
+        view : View
+            `view.View`; the lengths have its unit.
+
+        Raises
+        ------
+        InputError
+            If the mesh crosses the plane of a cone beam's source parallel to the panel.
         """
         with dr.suspend_grad():
             vertices, t, scale = self._project(view)
@@ -129,11 +146,18 @@ class MeshPaths:
 class _Packed:
     """A mesh as a kernel reads it.
 
-    vertices        Float64 [V * 4], packed (x, y, q, 0)
-    triangles       Int32 [4 T]: vertices sorted by y, and the parity of that order
-    height, width   Int32, of the image
-    packets         Int32, packets per image row
-    bend            Float, 1 for a cone beam, 0 for a parallel one
+    Parameters
+    ----------
+    vertices : Float64 [V * 4]
+        Packed (x, y, q, 0).
+    triangles : Int32 [4 T]
+        Vertices sorted by y, and the parity of that order.
+    height, width : Int32
+        Of the image.
+    packets : Int32
+        Packets per image row.
+    bend : Float
+        1 for a cone beam, 0 for a parallel one.
     """
 
     vertices: Any
@@ -152,7 +176,10 @@ class _Packed:
 def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """The paths through a Mitsuba mesh (`ply`, `obj`, `cube`, `mi.Mesh` ...), in the scene's unit.
 
-    Raises InputError if the shape is not a mesh, and as `MeshPaths` does.
+    Raises
+    ------
+    InputError
+        If the shape is not a mesh, and as `MeshPaths` does.
     """
     name = shape.id()
     parameters = mi.traverse(shape)

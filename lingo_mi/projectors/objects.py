@@ -28,7 +28,10 @@ MOST_USABLE = 2
 def find_objects(scene: mi.Scene) -> list:
     """The attenuating objects of a scene.
 
-    Raises InputError for an object that `lingo_xray` cannot integrate, and for a scene without objects.
+    Raises
+    ------
+    InputError
+        For an object that `lingo_xray` cannot integrate, and for a scene without objects.
     """
     found = [thing for shape in scene.shapes() for thing in _objects(shape, scene)]
     if not found:

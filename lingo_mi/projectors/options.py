@@ -22,12 +22,19 @@ MOST_SUBPIXELS = 16
 class RenderOptions:
     """The parameters of `lingo_xray`, and how its work is shared out.
 
-    extent      cut-off of Gaussians in standard deviations
-    footprint   'exact', or 'affine': the ray's whitened length |d|^2 is constant, as at the Gaussian's centre (EWA)
-    pixel       n: a pixel is the mean of n x n rays, through the centres of its n x n parts
-    area        a pixel is the mean over its area instead of the ray through its centre, for Gaussians only: the footprint is
-                convolved with a Gaussian of the pixel's variance
-    sharing     how the work on Gaussians is shared out (see `balance`)
+    Parameters
+    ----------
+    extent : float
+        Cut-off of Gaussians in standard deviations.
+    footprint : str
+        'exact', or 'affine': the ray's whitened length |d|^2 is constant, as at the Gaussian's centre (EWA).
+    pixel : int
+        N: a pixel is the mean of n x n rays, through the centres of its n x n parts.
+    area : bool
+        A pixel is the mean over its area instead of the ray through its centre, for Gaussians only: the footprint is convolved
+        with a Gaussian of the pixel's variance.
+    sharing : Sharing
+        How the work on Gaussians is shared out (see `balance`).
     """
 
     extent: float = cutoff.RENDER

@@ -3,8 +3,8 @@ r"""How line integrals of voxels change with the rays (Dr.Jit, llvm or cuda).
 A sample of a volume f at the point p moves by :math:`\nabla f \cdot \delta p`. The models of `grid` and of `joseph` and
 `tilted_joseph` are sums of samples, so what is needed of the volume are a few sums along each ray:
 
-    exact    |D| [ integral of f dt ],   p = o + t d:   of f, of its gradient, of t times its gradient; f at both ends
-    Joseph   path [ sum over slices m of f ],  p = a + b m:   of f, of its slopes in the slice, of m times these
+- `exact`: |D| [ integral of f dt ],   p = o + t d:   of f, of its gradient, of t times its gradient; f at both ends
+- `Joseph`: path [ sum over slices m of f ],  p = a + b m:   of f, of its slopes in the slice, of m times these
 
 `moving` combines them with the rays, to first order, in Dr.Jit's graph. It goes on to the poses from there, in both modes.
 
@@ -36,9 +36,14 @@ ASIDE = 1.2e-4, 2e-4, 3.2e-4  # voxels; no ray between voxel centres, along or a
 def moving(volume: Any, geometry: Geometry, kind: type[Gathered | GridPair], view: View) -> Any:
     """Line integrals of a volume in one view, Float [u * v], v fastest, that are differentiable in the view's pose.
 
-    volume     Float [nx * ny * nz], z fastest
-    geometry   whose grid it is
-    kind       the projector whose model to differentiate
+    Parameters
+    ----------
+    volume : Float [nx * ny * nz]
+        z fastest.
+    geometry : Geometry
+        Whose grid it is.
+    kind : type[Gathered or GridPair]
+        The projector whose model to differentiate.
     """
     half, size = mi.Vector3f(*(s / 2 for s in geometry.grid.size)), geometry.grid.shape
     lines = _lines(view, geometry)

@@ -28,12 +28,17 @@ def on_grid(
 ) -> np.ndarray:
     """Density of one of a scene's objects (see `objects`) on a grid, float32 [x, y, z].
 
-    corner, step   [3] the outer corner of the first voxel, and the voxel size, mm
-    shape          voxels along x, y and z
-    extent         cut-off of Gaussians in standard deviations
-
     Gaussians are sampled at the voxel centres. A mesh is weighted by the share of each voxel that it fills. A grid is
     interpolated trilinearly, and averaged over voxels larger than its own; on its own voxels it is returned unchanged.
+
+    Parameters
+    ----------
+    corner, step
+        [3] the outer corner of the first voxel, and the voxel size, mm.
+    shape : tuple[int, int, int]
+        Voxels along x, y and z.
+    extent : float
+        Cut-off of Gaussians in standard deviations.
     """
     nx, ny, nz = shape
     _require_own_place(thing)

@@ -24,7 +24,10 @@ from lingo_mi.projectors.view import View
 def add_straddling(image: Any, gaussians: tuple, view: View, indices: Any) -> Any:
     """Add the Gaussians at `indices`, UInt32, to a cone-beam image, Float [height * width]. Differentiable.
 
-    gaussians   centres, scales, rotations and densities, as for `footprint.project`
+    Parameters
+    ----------
+    gaussians : tuple
+        Centres, scales, rotations and densities, as for `footprint.project`.
     """
     for k in range(dr.width(indices)):
         i = dr.gather(mi.UInt32, indices, dr.opaque(mi.UInt32, k))

@@ -15,7 +15,12 @@ from lingo_mi.projectors.view import View
 def views_of(sensor: Any) -> list[tuple[Any, View]]:
     """The sensors within a `mi.Sensor` and their rays: those of a `batch` from left to right, of any other the sensor itself.
 
-    Mitsuba gives each sensor of a batch a film of the size of its part. Raises InputError as `view_of`.
+    Mitsuba gives each sensor of a batch a film of the size of its part.
+
+    Raises
+    ------
+    InputError
+        As `view_of`.
     """
     if sensor.class_name() != 'BatchSensor':
         return [(sensor, view_of(sensor))]
@@ -27,8 +32,13 @@ def views_of(sensor: Any) -> list[tuple[Any, View]]:
 def view_of(sensor: Any) -> View:
     """The rays through the pixel centres of the film of a flat `mi.Sensor`.
 
-    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's
-    crop window. Raises InputError for any other sensor.
+    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's crop
+    window.
+
+    Raises
+    ------
+    InputError
+        For any other sensor.
     """
     if hasattr(sensor, 'frame'):
         return sensor.frame

@@ -50,11 +50,16 @@ def splat(
 ) -> Any:
     """The image of all footprints, Float [height * width], row by row, without the factor |D| of each pixel.
 
-    extent    cut-off in standard deviations
-    parts     number of partial sums (see `depth`)
-    sharing   how the work is shared out (see `balance`)
-
     Differentiable in `footprints.values`, in forward and in reverse mode.
+
+    Parameters
+    ----------
+    extent : float
+        Cut-off in standard deviations.
+    parts : int
+        Number of partial sums (see `depth`).
+    sharing : Sharing
+        How the work is shared out (see `balance`).
     """
     return dr.custom(_Splat, footprints.values, replace(footprints, values=()), height, width, extent, parts, sharing)
 
@@ -95,10 +100,16 @@ def prepare(values: Sequence, rest: Footprints, sharing: Sharing) -> tuple:
 class _Packed:
     """Footprints as a kernel reads them.
 
-    numbers   Float [12 N], those of `Footprints` with the ridge in place of the centre's x
-    places    Int32 [4 N]: column of the ridge, row of the centre, first row and end of the rows
-    extent2   Float, the cut-off squared
-    packets   Int32, packets per image row
+    Parameters
+    ----------
+    numbers : Float [12 N]
+        Those of `Footprints` with the ridge in place of the centre's x.
+    places : Int32 [4 N]
+        Column of the ridge, row of the centre, first row and end of the rows.
+    extent2 : Float
+        The cut-off squared.
+    packets : Int32
+        Packets per image row.
     """
 
     numbers: Any
@@ -171,7 +182,10 @@ class _Item:
 def _row(layout: Layout, i: _Item, y):
     """Constants of row y of a footprint and its packets [begin, end).
 
-    Returns dy; m = (my dy)^2; d0 and d1 with den = d0 + t (d1 + e11 t); where t is 0, as a column and a fraction; begin; end.
+    Returns
+    -------
+    object
+        Dy; m = (my dy)^2; d0 and d1 with den = d0 + t (d1 + e11 t); where t is 0, as a column and a fraction; begin; end.
     """
     n = mi.Float(y - i.row)
     dy = n - i.y

@@ -27,8 +27,12 @@ if TYPE_CHECKING:
 class Block:
     """Some views of a scan, on the device.
 
-    numbers   mi.UInt, with an extra entry: an array of length one would need another kernel
-    count     how many, mi.UInt [1]
+    Parameters
+    ----------
+    numbers
+        mi.UInt, with an extra entry: an array of length one would need another kernel.
+    count
+        How many, mi.UInt [1].
     """
 
     numbers: Any
@@ -49,10 +53,19 @@ Views = Sequence[int] | np.ndarray | Block
 
 
 class Stack:
-    """Volumes and stacks of images of a scan on the device. Raises InputError for 2^32 voxels or more.
+    """Volumes and stacks of images of a scan on the device.
 
-    size, panel   voxels along x, y and z; rows and columns
-    valid         images of all views on the device, 1 for valid pixels and 0 for others; None: all are valid
+    Attributes
+    ----------
+    size, panel
+        Voxels along x, y and z; rows and columns.
+    valid
+        Images of all views on the device, 1 for valid pixels and 0 for others; None: all are valid.
+
+    Raises
+    ------
+    InputError
+        For 2^32 voxels or more.
     """
 
     ARRAYS: tuple[str, ...] = ()  # attributes on the device
@@ -130,9 +143,13 @@ class Gathered(Stack, ABC):
     def adjoint(self, images: Any, views: Views, rule: Callable[[Any, Any, Any], Any] | None = None) -> Any:
         """Backprojection A^T y of images of the views `views`, summed over these views: mi.Float [voxels].
 
-        images : mi.Float [block, u, v]
-        rule   : function of (voxel, A^T y, A^T 1), with flat indices mi.UInt of some voxels and their sums; its result is
-                 stored instead. It is traced into the kernel, which saves memory for whole volumes
+        Parameters
+        ----------
+        images
+            mi.Float [block, u, v].
+        rule : callable or None
+            Function of (voxel, A^T y, A^T 1), with flat indices mi.UInt of some voxels and their sums; its result is stored
+            instead. It is traced into the kernel, which saves memory for whole volumes.
         """
         block, ones = Block.of(views), rule is not None
         weighted = self._weighted(images, block, ones)
@@ -159,9 +176,12 @@ class Gathered(Stack, ABC):
     def _collect(self, weighted: Any, block: Block, ones: bool) -> tuple[Any, Any]:
         """A^T y of voxels: ((voxels, whether they exist), sums), lists of as many as a lane computes.
 
-        weighted   see `_weighted`
-
         A sum is a list; with `ones`, its second entry is A^T 1.
+
+        Parameters
+        ----------
+        weighted
+            See `_weighted`.
         """
 
 
@@ -170,7 +190,10 @@ def lanes(size: tuple[int, int, int], run: int) -> tuple[tuple[Any, Any], tuple[
 
     Neighbouring lanes then fetch neighbouring values.
 
-    Returns (flat indices of a lane's voxels, whether they exist), its first voxel (x, y, z) as floats, and the step along z.
+    Returns
+    -------
+    tuple[tuple[Any, Any], tuple[Any, Any, Any], int]
+        (flat indices of a lane's voxels, whether they exist), its first voxel (x, y, z) as floats, and the step along z.
     """
     _, ny, nz = size
     run = min(run, nz)
@@ -193,9 +216,14 @@ def hat(position: Any, index: Any, n: Any) -> Any:
 def sampled(data: Any, inside: Any, first: Any, position: Any, counts: Any, strides: Any) -> Any:
     """A slice of a volume, interpolated bilinearly; edge values are held.
 
-    first              flat index of the slice's first voxel
-    position, counts   along both axes: in voxels, and how many there are
-    strides            from voxel to voxel, mi.UInt
+    Parameters
+    ----------
+    first
+        Flat index of the slice's first voxel.
+    position, counts
+        Along both axes: in voxels, and how many there are.
+    strides
+        From voxel to voxel, mi.UInt.
     """
     y, z = (dr.clip(p, 0, n - 1) for p, n in zip(position, counts))
     j, k = dr.floor(y), dr.floor(z)

@@ -39,11 +39,17 @@ def ray_table(geometry: Geometry) -> np.ndarray:
 class TiltedJoseph(Gathered):
     """The matrix A of a scan: see `Gathered`.
 
-    valid   bool [view, v, u]; None: all
-
     On the device: `rays`, see `ray_table`; `matrices`, see `Geometry.voxel_matrices`.
 
-    Raises InputError for a source beside or inside the volume (see `serves`), or a volume of 2^32 voxels or more.
+    Parameters
+    ----------
+    valid : ndarray or None
+        Bool [view, v, u]; None: all.
+
+    Raises
+    ------
+    InputError
+        For a source beside or inside the volume (see `serves`), or a volume of 2^32 voxels or more.
     """
 
     ARRAYS = ('rays', 'matrices', 'valid')
@@ -115,9 +121,14 @@ def _affine(first, step, position):
 class Ray:
     """Rays as indices a + b m along the axes that are not the main one, m the index along the main axis.
 
-    axes         `Axes` (default: of the direction)
-    lines        (a, b) of both axes
-    path         per slice, mm
+    Attributes
+    ----------
+    axes
+        `Axes` (default: of the direction).
+    lines
+        (a, b) of both axes.
+    path
+        Per slice, mm.
     """
 
     def __init__(self, origin, direction, voxel, axes: Axes | None = None):

@@ -13,10 +13,13 @@ from numpy.typing import ArrayLike
 def uploaded(values: np.ndarray, double: bool = False) -> Any:
     """A copy of NumPy's values, of any shape, as Float [N] that begins at a multiple of 64 bytes, like Dr.Jit's own arrays.
 
-    double   whether it is Float64
-
     Dr.Jit uses NumPy's memory in place and compiles its alignment into kernels. Without this copy, each densification would
     compile new ones.
+
+    Parameters
+    ----------
+    double : bool
+        Whether it is Float64.
     """
     room = np.empty(values.size + 16, np.float64 if double else np.float32)
     start = -room.ctypes.data % 64 // room.itemsize

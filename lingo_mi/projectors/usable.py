@@ -18,11 +18,19 @@ SAFE_ASPECT = 1e6
 def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: str) -> bool:
     """Whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
 
-    centre, scale, rotation, density   as for `footprint.project`
-    where                              name of the cloud, for messages
+    Warns with AccuracyWarning and returns False if a Gaussian can be integrated, but not accurately.
 
-    Warns with AccuracyWarning and returns False if a Gaussian can be integrated, but not accurately. Raises InputError if
-    one cannot be integrated: it is not finite, its quaternion is zero, or a scale is not positive or out of range.
+    Parameters
+    ----------
+    centre, scale, rotation, density
+        As for `footprint.project`.
+    where : str
+        Name of the cloud, for messages.
+
+    Raises
+    ------
+    InputError
+        If one cannot be integrated: it is not finite, its quaternion is zero, or a scale is not positive or out of range.
     """
     with dr.suspend_grad():
         shortest, longest = dr.min(scale), dr.max(scale)
@@ -63,7 +71,10 @@ def require_unfrozen(what: str) -> None:
     A projection shares its work out by counts that it reads back from the device, and these change with the cloud: a recording
     cannot be replayed, and Dr.Jit ends the process where one is tried.
 
-    what   that is called, for the message
+    Parameters
+    ----------
+    what : str
+        That is called, for the message.
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise InputError(

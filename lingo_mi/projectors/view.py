@@ -22,14 +22,19 @@ def vector64(xyz: Iterable[float]) -> Any:
 class View:
     """Rays of one view. The ray through the pixel position (x, y), pixel centres at (i + 1/2), runs
 
-        cone       from `source` along D = corner + x u + y v - source
-        parallel   through corner + x u + y v along the unit vector `source`
-
-    source, corner, u, v   Vector3d; differentiable, so gradients reach the pose
-    width, height          pixels
-    parallel               whether the beam is parallel
+    - `cone`: from `source` along D = corner + x u + y v - source
+    - `parallel`: through corner + x u + y v along the unit vector `source`
 
     Integrals of a cone beam begin at the source. They do not end at the panel, which may be a virtual one within the object.
+
+    Parameters
+    ----------
+    source, corner, u, v
+        Vector3d; differentiable, so gradients reach the pose.
+    width, height : int
+        Pixels.
+    parallel : bool
+        Whether the beam is parallel.
     """
 
     source: Any

@@ -47,10 +47,16 @@ NUMBERS = 10  # differentiable numbers of a Gaussian: density, m1, m2, m3, s1, s
 class Lattice:
     """The voxels of a grid on the device.
 
-    corner    Vector3d, opaque: the outer corner of the first voxel
-    step      Vector3d, opaque: the voxel size
-    shape     voxels along x, y and z
-    sharing   how the work is shared out (see `balance`)
+    Parameters
+    ----------
+    corner
+        Vector3d, opaque: the outer corner of the first voxel.
+    step
+        Vector3d, opaque: the voxel size.
+    shape : tuple[int, int, int]
+        Voxels along x, y and z.
+    sharing : Sharing
+        How the work is shared out (see `balance`).
     """
 
     corner: Any
@@ -68,10 +74,14 @@ def voxelize(
 ) -> Any:
     """Density at the voxel centres, Float [nz * ny * nx], x fastest. Differentiable in the cloud, in reverse mode.
 
-    centre, scale, rotation, density   as for `footprint.project`; if a Gaussian is not finite, or has a zero scale or
-                                       quaternion, all voxels become NaN
-    extent                             cut-off in standard deviations
-    deep                               whether to use partial sums where many Gaussians overlap (see `depth`)
+    Parameters
+    ----------
+    centre, scale, rotation, density
+        As for `footprint.project`; if a Gaussian is not finite, or has a zero scale or quaternion, all voxels become NaN.
+    extent : float
+        Cut-off in standard deviations.
+    deep : bool
+        Whether to use partial sums where many Gaussians overlap (see `depth`).
     """
     values, rest, length, covered, sound = _numbers((centre, scale, rotation, density), grid, extent)
     out = dr.custom(_Voxelize, values, rest, length, covered, grid, (extent, deep))
@@ -161,11 +171,17 @@ class _Voxelize(dr.CustomOp):
 class _Packed:
     """Gaussians as a kernel reads them.
 
-    numbers   Float [16 N]
-    places    Int32 [8 N]: column of the ridge, row, slice, lines; first row, first slice, rows, row of the spine
-    extent2   Float, the cut-off squared
-    packets   Int32, packets per line of voxels
-    rows      Int32, rows per slice
+    Parameters
+    ----------
+    numbers : Float [16 N]
+    places : Int32 [8 N]
+        Column of the ridge, row, slice, lines; first row, first slice, rows, row of the spine.
+    extent2 : Float
+        The cut-off squared.
+    packets : Int32
+        Packets per line of voxels.
+    rows : Int32
+        Rows per slice.
     """
 
     numbers: Any
@@ -183,7 +199,10 @@ class _Packed:
 def _line(layout: Layout, c, w, v, index, f: _Packed):
     """A line of voxels of a Gaussian.
 
-    Returns its constants dz, r and m; where t is 0, as a column and a fraction; its packets [begin, end); its first packet.
+    Returns
+    -------
+    object
+        Its constants dz, r and m; where t is 0, as a column and a fraction; its packets [begin, end); its first packet.
     """
     _, m1, m2, m3, s1, s1_low, s2, s2_low, s3, s3_low, ridge, ridge_low, spine, spine_low, fz, _ = c
     rows_of_slice = dr.maximum(v.z, 1)  # a lane of a finished team reads 0, and an integer division by 0 crashes

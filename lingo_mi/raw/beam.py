@@ -17,11 +17,18 @@ from lingo_mi.raw.options import Options, region_of
 class Beam:
     """What line integrals are relative to.
 
-    panel        of the whole frame
-    i0           counts of the beam, where they are given, as an option or as Nikon's white level
-    air          (v0, v1, u0, u1): pixels whose mean is the air level of a view
-    percentile   instead: that of its pixels is
-    limit        counts from here on are not valid
+    Parameters
+    ----------
+    panel : Fields
+        Of the whole frame.
+    i0 : float or None
+        Counts of the beam, where they are given, as an option or as Nikon's white level.
+    air : tuple[int, int, int, int] or None
+        (v0, v1, u0, u1): pixels whose mean is the air level of a view.
+    percentile : float or None
+        Instead: that of its pixels is.
+    limit : float
+        Counts from here on are not valid.
     """
 
     panel: Fields
@@ -42,7 +49,10 @@ class Beam:
     ) -> Beam:
         """As options ask for. `path` is named in errors; `white` is Nikon's white level.
 
-        Raises InputError where nothing says the beam, or more than one thing does.
+        Raises
+        ------
+        InputError
+            If nothing says the beam, or more than one thing does.
         """
         without_air = options.air is None and options.percentile is None
         if options.i0 is not None or flats is not None or not without_air:

@@ -39,10 +39,17 @@ def geometry_of(
 ) -> tuple[Geometry, float | None, tuple[int, int]]:
     """The geometry of whole frames, Nikon's white level, and the steps (1 or -1) that put rows and columns in its order.
 
-    source     as `geometry` of `import_raw`
-    recorded   angles that the frames came with, [n] degrees
+    Parameters
+    ----------
+    source : path-like or Geometry
+        As `geometry` of `import_raw`.
+    recorded : ndarray or None
+        Angles that the frames came with, [n] degrees.
 
-    Raises InputError where the two do not agree, or the geometry is incomplete.
+    Raises
+    ------
+    InputError
+        If the two do not agree, or the geometry is incomplete.
     """
     n, shape = len(frames), frames.shape
     angles = recorded

@@ -24,11 +24,18 @@ HDF5 = ('.h5', '.hdf5', '.hdf', '.nxs', '.nx')
 class Frames:
     """Images of one panel.
 
-    where   file or folder, for messages
-    count   how many
-    shape   pixels (v, u)
-    dtype   of the counts as they are stored
-    read    read(i) -> [v, u], frame i, as it is stored
+    Parameters
+    ----------
+    where : str
+        File or folder, for messages.
+    count : int
+        How many.
+    shape : tuple[int, int]
+        Pixels (v, u).
+    dtype : np.dtype
+        Of the counts as they are stored.
+    read : callable
+        read(i) -> [v, u], frame i, as it is stored.
     """
 
     where: str
@@ -79,10 +86,16 @@ class Recording:
 def open_recording(path: PathLike | str) -> Recording:
     """Opens raw frames; nothing but the first frame is read.
 
-    path   a folder of .tif, .tiff, .edf, .his, .hnd, .hnc or .xim images, in the order of the numbers in their names; a
-           multi-page .tif; a multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data)
+    Parameters
+    ----------
+    path : path-like
+        A folder of .tif, .tiff, .edf, .his, .hnd, .hnc or .xim images, in the order of the numbers in their names; a multi-page
+        .tif; a multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data).
 
-    Raises InputError where the path is missing or unknown, or a package is needed that is not installed.
+    Raises
+    ------
+    InputError
+        If the path is missing or unknown, or a package is needed that is not installed.
     """
     path = Path(path)
     suffix = path.suffix.lower()

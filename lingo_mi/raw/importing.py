@@ -30,12 +30,19 @@ def import_raw(
 ) -> tuple[Scan, dict[str, Any]]:
     """The scan, and its history: plain values by name, for the scan's file.
 
-    path       what `lingo_mi.raw.frames.open_recording` opens
-    geometry   of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, Nikon's .xtekct, or RTK's .xml. In a .yml
-               nDetector may be left out, and nVoxel and dVoxel: the voxels are then as large as a pixel on the axis
+    Parameters
+    ----------
+    path : path-like
+        What `lingo_mi.raw.frames.open_recording` opens.
+    geometry : path-like or Geometry
+        Of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, Nikon's .xtekct, or RTK's .xml. In a .yml nDetector may
+        be left out, and nVoxel and dVoxel: the voxels are then as large as a pixel on the axis.
 
-    Raises InputError where something is missing, contradictory or damaged; warns of views that are black, saturated or brighter
-    than the flat field, and where most pixels are left out.
+    Raises
+    ------
+    InputError
+        If something is missing, contradictory or damaged; warns of views that are black, saturated or brighter than the flat
+        field, and where most pixels are left out.
     """
     recording = open_recording(path)
     views, n = recording.views, len(recording.views)

@@ -28,10 +28,16 @@ HOT = 0.05  # and one whose dark count is that part of the flat's counts off its
 class Fields:
     """What the panel shows without an object.
 
-    dark      [v, u], counts
-    flat      [v, u], counts above the dark ones; None without flats
-    good      bool [v, u]: neither dead nor hot
-    photons   a pixel of a flat, from the scatter of the flats; None with fewer than two
+    Parameters
+    ----------
+    dark : ndarray [v, u]
+        Counts.
+    flat : ndarray [v, u] or None
+        Counts above the dark ones; None without flats.
+    good : bool [v, u]
+        Neither dead nor hot.
+    photons : float or None
+        A pixel of a flat, from the scatter of the flats; None with fewer than two.
     """
 
     dark: np.ndarray
@@ -49,8 +55,12 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
     """The mean dark and flat field, the pixels that are good, and the photons of a pixel.
 
     Photons are those of a Poisson signal of the same scatter: mean^2 / variance of a pixel over the flats, each divided by its
-    brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good. Raises InputError where a panel has
-    another size than `shape`, the flats are no brighter than dark or saturated, or one is unlike the others.
+    brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good.
+
+    Raises
+    ------
+    InputError
+        If a panel has another size than `shape`, the flats are no brighter than dark or saturated, or one is unlike the others.
     """
     for name, frames in (('flats', flats), ('darks', darks)):
         if frames is not None and frames.shape != shape:
@@ -111,12 +121,18 @@ def counts_to_line_integrals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line integrals of one view [v, u], and the mask of its valid pixels [v, u].
 
-    view         counts [v, u]
-    bins         (v, u) pixels that become one: their counts are added, bad ones left out, before the logarithm
-    exposure     of this view over that of the flats; without flats its air level in counts
-    saturation   counts from here on are not valid
-
     A binned pixel with fewer than half of its pixels good is not valid, nor one without counts.
+
+    Parameters
+    ----------
+    view : ndarray
+        Counts [v, u].
+    bins : tuple[int, int]
+        (v, u) pixels that become one: their counts are added, bad ones left out, before the logarithm.
+    exposure : float
+        Of this view over that of the flats; without flats its air level in counts.
+    saturation : float
+        Counts from here on are not valid.
     """
     counts = view - known.dark
     good = known.good & np.isfinite(counts) & (view < saturation)

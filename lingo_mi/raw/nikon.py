@@ -73,8 +73,12 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
 def read_numbers(path: PathLike | str) -> np.ndarray:
     """Numbers [n] of a text file: one a line, or the second column, after the number of the view, as angles in Nikon's .ang.
 
-    Lines without a number at their start (a heading) are skipped. Raises InputError where none is left, for a line that
-    goes on with something else, and for decimal commas.
+    Lines without a number at their start (a heading) are skipped.
+
+    Raises
+    ------
+    InputError
+        If none is left, for a line that goes on with something else, and for decimal commas.
     """
     found = []
     with reading(path):

@@ -17,17 +17,30 @@ from lingo_mi.common.parsing import checked, whole_number
 class Options:
     """How frames become line integrals.
 
-    flats, darks   files or folders of their own; None: those of the recording, if it has any
-    air            (v0, v1, u0, u1), pixels of the whole frame where no view has an object: their mean is the air level of a view
-    percentile     instead: that percentile of a view is its air level
-    i0             instead: counts of the unattenuated beam
-    exposure       [n] or one number: exposure of every view over that of the flats
-    saturation     counts from here on are not valid; None: the largest value of the integer type of views and of flats
-    crop           (v0, v1, u0, u1), pixels of the whole frame to keep
-    binning        pixels (v and u) that become one
-    views          (first, end, step) of the views to keep; the end may be None
-    angles         [n] degrees or the file that lists them, where the geometry does not
-    pixel          size of a raw pixel, mm; for a geometry of RTK
+    Parameters
+    ----------
+    flats, darks : path-like or None
+        Files or folders of their own; None: those of the recording, if it has any.
+    air : tuple[int, int, int, int] or None
+        (v0, v1, u0, u1), pixels of the whole frame where no view has an object: their mean is the air level of a view.
+    percentile : float or None
+        Instead: that percentile of a view is its air level.
+    i0 : float or None
+        Instead: counts of the unattenuated beam.
+    exposure
+        [n] or one number: exposure of every view over that of the flats.
+    saturation : float or None
+        Counts from here on are not valid; None: the largest value of the integer type of views and of flats.
+    crop : tuple[int, int, int, int] or None
+        (v0, v1, u0, u1), pixels of the whole frame to keep.
+    binning : int
+        Pixels (v and u) that become one.
+    views : tuple[int, int or None, int] or None
+        (first, end, step) of the views to keep; the end may be None.
+    angles
+        [n] degrees or the file that lists them, where the geometry does not.
+    pixel : float or None
+        Size of a raw pixel, mm; for a geometry of RTK.
     """
 
     flats: PathLike | str | None = None

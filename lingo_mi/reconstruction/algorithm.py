@@ -30,15 +30,22 @@ Progress = Callable[[int, int, float | None], None]
 class Reconstruction:
     """A reconstructed volume with its convergence. `numpy.asarray` of it is the volume.
 
-        found = lm.reconstruct(scan, lm.SART(niter=20))
-        found.metrics(truth)['psnr_3d']
-        found.save('out/foot.nii.gz')
+    Parameters
+    ----------
+    volume : float32 [x, y, z]
+        Density per mm.
+    residuals : list[float]
+        |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN where it was not computed; none for FDK.
+    seconds : float
+        Wall-clock time.
+    grid : Grid
+        Of the volume.
 
-    volume      float32 [x, y, z], density per mm
-    residuals   |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN where it was not computed; none for
-                FDK
-    seconds     wall-clock time
-    grid        of the volume
+    Examples
+    --------
+    >>> found = lm.reconstruct(scan, lm.SART(niter=20))
+    >>> found.metrics(truth)['psnr_3d']
+    >>> found.save('out/foot.nii.gz')
     """
 
     volume: np.ndarray
@@ -61,19 +68,32 @@ class Reconstruction:
         """PSNR in dB and SSIM of the volume: psnr_3d and ssim_3d, whose full scale is the largest true density, and psnr_3d_r2
         and ssim_3d_r2, R2-Gaussian's, whose full scale is 1; None where a value is not finite.
 
-        truth   the true densities per mm, [x, y, z], on the same voxels
+        Parameters
+        ----------
+        truth : array_like
+            The true densities per mm, [x, y, z], on the same voxels.
 
-        Raises InputError for a truth of another shape, or that is not finite.
+        Raises
+        ------
+        InputError
+            For a truth of another shape, or that is not finite.
         """
         return compared(self.volume, as_numpy(truth, 'the true volume'))
 
     def save(self, path: str | PathLike, *, force: bool = False) -> Path:
         """Write the volume, densities per mm, with voxel size and position in mm; returns the path.
 
-        path    .nii, .nii.gz, or a new .ome.zarr; its folder is made
-        force   replace an earlier file
+        Parameters
+        ----------
+        path : path-like
+            .nii, .nii.gz, or a new .ome.zarr; its folder is made.
+        force : bool
+            Replace an earlier file.
 
-        Raises InputError for another suffix, a file that is there already, or one that cannot be written.
+        Raises
+        ------
+        InputError
+            For another suffix, a file that is there already, or one that cannot be written.
         """
         path = as_path('path', path)
         with writing(path):
@@ -93,8 +113,12 @@ class Algorithm(ABC):
     `lm.reconstruct` is the public way to run an algorithm; code below it calls `run.run_algorithm`, which checks memory and
     signal, and only modules of this package call `_run`.
 
-    name       on the command line and in `ALGORITHMS`
-    no_start   why it takes no volume to start from; empty if it takes one
+    Attributes
+    ----------
+    name
+        On the command line and in `ALGORITHMS`.
+    no_start
+        Why it takes no volume to start from; empty if it takes one.
     """
 
     name: ClassVar[str]

@@ -86,38 +86,60 @@ class ASDPOCS(Algorithm):
     The first step is `alpha` times the change by the first P. As long as the data are not matched, the step shrinks by
     `alpha_red` whenever the descent changes the volume by more than `rmax` times the change by P.
 
-    niter           passes over all views, at least 1; it may stop earlier
-    blocksize       views per update of P (1: SART, else OS-SART)
-    lmbda           relaxation of P, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
-    lmbda_red       0 < lmbda_red <= 1
-    tviter          steps of steepest descent per pass, at least 1
-    alpha           length of the first of them, relative to the change by the first P, above 0
-    alpha_red       factor on the length, 0 < alpha_red <= 1
-    rmax            largest change by descent, relative to that by P, above 0
-    maxl2err        |A x - b| at which the data count as matched, density times mm, at least 0. None: 0.2 |A fdk(b) - b|; 0 for
-                    scans that FDK cannot reconstruct, so that the step shrinks whenever total variation changes too much
-    noneg           whether P sets negative densities to zero
-    OrderStrategy   of the blocks, see `OSSART`
-    exact_every     passes between corrections for the error of Joseph's projector (`System.correct`), from the first pass on;
-                    0: no corrections
-    seed            of the random order, at least 0
-
     It stops when the data are matched and both parts of a pass cancel (cosine below -0.99), or when lmbda falls below 0.005.
     The volume is that after descent, as in TIGRE; the residuals are those before it, of the passes where they decide anything
     and of the last one.
 
     Use it for few views of objects with large uniform regions. For noisy projections, maxl2err sets how closely to match them.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = lm.reconstruct(measured, lm.ASDPOCS(niter=5), progress=False)
-        >>> len(found.residuals), found.residuals[-1] < 0.05
-        (6, True)
-
     Sidky and Pan, "Image reconstruction in circular cone-beam computed tomography by constrained, total-variation minimization",
     Phys. Med. Biol. 53 (2008), algorithm of section 2.3; the defaults of lmbda, lmbda_red, tviter, alpha, alpha_red, rmax and
-    blocksize are TIGRE's. Raises InputError for an option out of its range.
+    blocksize are TIGRE's.
+
+    Parameters
+    ----------
+    niter : int
+        Passes over all views, at least 1; it may stop earlier.
+    blocksize : int
+        Views per update of P (1: SART, else OS-SART).
+    lmbda : float
+        Relaxation of P, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass.
+    lmbda_red : float
+        0 < lmbda_red <= 1.
+    tviter : int
+        Steps of steepest descent per pass, at least 1.
+    alpha : float
+        Length of the first of them, relative to the change by the first P, above 0.
+    alpha_red : float
+        Factor on the length, 0 < alpha_red <= 1.
+    rmax : float
+        Largest change by descent, relative to that by P, above 0.
+    maxl2err : float or None
+        |A x - b| at which the data count as matched, density times mm, at least 0. None: 0.2 |A fdk(b) - b|; 0 for scans that FDK
+        cannot reconstruct, so that the step shrinks whenever total variation changes too much.
+    noneg : bool
+        Whether P sets negative densities to zero.
+    OrderStrategy : str
+        Of the blocks, see `OSSART`.
+    exact_every : int
+        Passes between corrections for the error of Joseph's projector (`System.correct`), from the first pass on; 0: no
+        corrections.
+    seed : int
+        Of the random order, at least 0.
+
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
+    >>> found = lm.reconstruct(measured, lm.ASDPOCS(niter=5), progress=False)
+    >>> len(found.residuals), found.residuals[-1] < 0.05
+    (6, True)
     """
 
     name: ClassVar[str] = 'asd-pocs'
@@ -160,7 +182,10 @@ class ASDPOCS(Algorithm):
     ) -> Reconstruction:
         """Reconstruct the volume of a scan, see `run_algorithm`. `weights` and `blur` of P are as in `Sweeps._run`.
 
-        watch   called after every pass as watch(passes done, volume on the device, mi.Float [voxels]); True stops
+        Parameters
+        ----------
+        watch : callable or None
+            Called after every pass as watch(passes done, volume on the device, mi.Float [voxels]); True stops.
         """
         began = time.perf_counter()
         order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)

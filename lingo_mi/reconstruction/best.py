@@ -55,13 +55,21 @@ Fit = Callable[[Scan, Callable[[int, int], None]], Callable[[Grid], np.ndarray]]
 class Chosen(Reconstruction):
     """A `Reconstruction` by `Best`, with what it was chosen by.
 
-        found = lm.reconstruct(scan, lm.Best())
-        print(found.report())
+    Parameters
+    ----------
+    plan : tuple[Trial, ...]
+        The settings tried, a `Trial` each, in this order.
+    taken : int
+        Number of the one that was taken.
+    error : ndarray or None
+        float32 [x, y, z], density per mm: see `error_map`.
+    meaning : str
+        Of the numbers: 'means' over the voxels' cubes, or 'values' at their centres, see `Best.voxels`.
 
-    plan     the settings tried, a `Trial` each, in this order
-    taken    number of the one that was taken
-    error    float32 [x, y, z], density per mm: see `error_map`
-    meaning  of the numbers: 'means' over the voxels' cubes, or 'values' at their centres, see `Best.voxels`
+    Examples
+    --------
+    >>> found = lm.reconstruct(scan, lm.Best())
+    >>> print(found.report())
     """
 
     plan: tuple[Trial, ...] = ()
@@ -200,9 +208,15 @@ class Best(Algorithm):
     ) -> Chosen:
         """Reconstruct the volume of a scan, see `run_algorithm`. The residuals are those of the last refinement.
 
-        fit   with `cloud`: fits one (`completion.prepare.fit_cloud`)
+        Parameters
+        ----------
+        fit : Fit or None
+            With `cloud`: fits one (`completion.prepare.fit_cloud`).
 
-        Raises InputError if `cloud` is set and `fit` is missing.
+        Raises
+        ------
+        InputError
+            If `cloud` is set and `fit` is missing.
         """
         if self.cloud and fit is None:
             raise InputError('best tries a cloud where it is given a function that fits one: use lm.reconstruct')
@@ -357,9 +371,14 @@ def refine(
 ) -> Reconstruction:
     """The passes of `Refined` over measured views.
 
-    start    volume [x, y, z], on the scan's own voxels or on the smaller ones
-    finer    parts along each side of a voxel; the volume that is returned has the smaller voxels
-    smooth   whether to take more total variation
+    Parameters
+    ----------
+    start : ndarray
+        Volume [x, y, z], on the scan's own voxels or on the smaller ones.
+    finer : int
+        Parts along each side of a voxel; the volume that is returned has the smaller voxels.
+    smooth : bool
+        Whether to take more total variation.
     """
     fine = scan.on(scan.geometry.grid.finer(finer))
     if start.shape == scan.geometry.grid.shape:

@@ -25,20 +25,30 @@ class CGLS(Algorithm):
 
         x <- x + a p,  r <- r - a A p,  a = |s|^2 / |A p|^2,        p <- s + (|s|^2 / |s before|^2) p
 
-    niter   iterations, at least 1; each takes one projection and one backprojection of all views
-    tol     stop when |A x - b| / |b| <= tol; at least 0
-
     It stops early when the gradient is zero to rounding. Use it for many views, or for a plain least-squares solution. It has
     no constraints: densities may be negative, and late iterations fit the noise.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
-        >>> lm.reconstruct(measured, lm.CGLS(niter=10), progress=False).residuals[-1] < 0.05
-        True
+    Björck, "Numerical Methods for Least Squares Problems", SIAM 1996, algorithm 7.4.1.
 
-    Björck, "Numerical Methods for Least Squares Problems", SIAM 1996, algorithm 7.4.1. Raises InputError for an option out of
-    its range.
+    Parameters
+    ----------
+    niter : int
+        Iterations, at least 1; each takes one projection and one backprojection of all views.
+    tol : float
+        Stop when |A x - b| / |b| <= tol; at least 0.
+
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
+    >>> lm.reconstruct(measured, lm.CGLS(niter=10), progress=False).residuals[-1] < 0.05
+    True
     """
 
     name: ClassVar[str] = 'cgls'

@@ -50,7 +50,13 @@ BATCH = 4  # views per launch, which share the index arithmetic and the volume's
 
 
 def window_of(filter: str) -> Callable[[np.ndarray], np.ndarray]:
-    """One of `WINDOWS`, by its name or TIGRE's (with _ in place of -). Raises InputError for an unknown one."""
+    """One of `WINDOWS`, by its name or TIGRE's (with _ in place of -).
+
+    Raises
+    ------
+    InputError
+        For an unknown one.
+    """
     shape = WINDOWS.get(filter.replace('_', '-')) if isinstance(filter, str) else None
     if shape is None:
         raise InputError(f'filter {filter!r} is unknown: use one of {", ".join(WINDOWS)}')
@@ -63,7 +69,10 @@ def ramp(n: int, tau: float, window: str = 'ram-lak') -> np.ndarray:
     It is the transform of the sampled band-limited kernel h(0) = 1 / (4 tau^2), h(odd k) = -1 / (pi k tau)^2,
     times tau. Unlike a ramp sampled in frequency, it gives the right mean.
 
-    Raises InputError for an unknown window.
+    Raises
+    ------
+    InputError
+        For an unknown window.
     """
     shape = window_of(window)
     size = fft.next_fast_len(2 * n, real=True)
@@ -201,11 +210,6 @@ class FDK(Algorithm):
 
     with the pixel size tau at the axis and the distance w of x from the source along the central ray, over DSO.
 
-    filter   apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth;
-             TIGRE's 'ram_lak' and 'shepp_logan' are known too
-    fill     whether pixels that are not valid are interpolated along their rows and over views, with a warning; without, a scan
-             that has such pixels is refused
-
     Short scans (Parker) and offset panels (Wang) are weighted, see `ray_weights`. Projections of a turned or tilted panel are
     first resampled to an upright one (`rectified`). The views together must cover the whole width of the object; truncated
     rows are filtered as they are. A view adds nothing to voxels outside its panel. With one detector row, only the slice in
@@ -213,14 +217,30 @@ class FDK(Algorithm):
 
     Use it for hundreds of views, or if time is short. Few views cause streaks, and the ramp amplifies noise.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=90, pixels=48).train
-        >>> lm.reconstruct(measured, lm.FDK(filter='hann'), progress=False).volume.shape
-        (24, 24, 24)
-
     Feldkamp, Davis and Kress, "Practical cone-beam algorithm", JOSA A 1 (1984), with the ramp of Kak and Slaney, "Principles of
-    Computerized Tomographic Imaging", 1988, section 3.3. Raises InputError for an unknown filter.
+    Computerized Tomographic Imaging", 1988, section 3.3.
+
+    Parameters
+    ----------
+    filter : str
+        Apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth; TIGRE's
+        'ram_lak' and 'shepp_logan' are known too.
+    fill : bool
+        Whether pixels that are not valid are interpolated along their rows and over views, with a warning; without, a scan that
+        has such pixels is refused.
+
+    Raises
+    ------
+    InputError
+        For an unknown filter.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=90, pixels=48).train
+    >>> lm.reconstruct(measured, lm.FDK(filter='hann'), progress=False).volume.shape
+    (24, 24, 24)
     """
 
     name: ClassVar[str] = 'fdk'
@@ -241,8 +261,11 @@ class FDK(Algorithm):
     def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
         """Reconstruct the volume of a scan, see `run_algorithm`. `progress` counts views; there are no residuals.
 
-        Raises InputError for a source that is not on a circle about z, for a panel that moves relative to the source, and for
-        invalid pixels without `fill`.
+        Raises
+        ------
+        InputError
+            For a source that is not on a circle about z, for a panel that moves relative to the source, and for invalid pixels
+            without `fill`.
         """
         began = time.perf_counter()
         projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
@@ -256,13 +279,22 @@ class FDK(Algorithm):
     def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
         """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
-        progress   called as progress(views done in all slabs, views of all slabs, None)
+        Takes memory for two sets of projections and for three slabs, however large the volume.
 
-        Takes memory for two sets of projections and for three slabs, however large the volume. Raises InputError as `_run`, and
-        for too little memory.
+        Parameters
+        ----------
+        progress : Progress or None
+            Called as progress(views done in all slabs, views of all slabs, None).
 
-            for slab in FDK().slabs(scan, 64):
-                ...
+        Raises
+        ------
+        InputError
+            As `_run`, and for too little memory.
+
+        Examples
+        --------
+        >>> for slab in FDK().slabs(scan, 64):
+        ...     ...
         """
         parts = scan.geometry.grid.slabs(thickness)
         check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))

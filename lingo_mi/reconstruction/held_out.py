@@ -33,9 +33,14 @@ def split_views(scan: Scan, every: int) -> tuple[Scan, Scan]:
     """The views to reconstruct from, and those held out: one of `every` consecutive ones, never the first or the last. Views
     without a valid pixel are left out.
 
-    Raises InputError for fewer than four views.
+    Raises
+    ------
+    InputError
+        For fewer than four views.
 
-        kept, held_out = split_views(scan, 5)
+    Examples
+    --------
+    >>> kept, held_out = split_views(scan, 5)
     """
     if scan.valid is not None:
         scan = scan.subset(np.flatnonzero(scan.valid.any((1, 2))))
@@ -58,15 +63,26 @@ def held_out_views(count: int, every: int) -> np.ndarray:
 class Trial:
     """One setting, tried on the views that are kept.
 
-    name     of the setting
-    finer    parts along each side of a voxel
-    smooth   whether with more total variation
-    cloud    whether from the volume of a cloud
-    scores   `Score` of the held-out views after every pass; of a prior, of every strength
-    volume   after the pass with the lowest score, on the setting's own voxels
-    given    `Score` of the numbers that would be given out, where these decide, else None
-    strength of a prior, else None
-    before   passes of ASD-POCS that it starts from
+    Parameters
+    ----------
+    name : str
+        Of the setting.
+    finer : int
+        Parts along each side of a voxel.
+    smooth : bool
+        Whether with more total variation.
+    cloud : bool
+        Whether from the volume of a cloud.
+    scores : list[float]
+        `Score` of the held-out views after every pass; of a prior, of every strength.
+    volume : ndarray or None
+        After the pass with the lowest score, on the setting's own voxels.
+    given : float or None
+        `Score` of the numbers that would be given out, where these decide, else None.
+    strength : float or None
+        Of a prior, else None.
+    before : int
+        Passes of ASD-POCS that it starts from.
     """
 
     name: str
@@ -115,9 +131,14 @@ class Score:
 
     The line integrals A x are exact. Joseph's projector would favour small voxels, on which its error is smaller.
 
-    scan   the views, and the voxels of the volumes
+    Parameters
+    ----------
+    scan : Scan
+        The views, and the voxels of the volumes.
 
-        Score(held_out)(x)  # of a volume on the device, mi.Float [voxels]
+    Examples
+    --------
+    >>> Score(held_out)(x)  # of a volume on the device, mi.Float [voxels]
     """
 
     def __init__(self, scan: Scan):
@@ -139,9 +160,14 @@ class Score:
 class TrialWatch:
     """The `watch` of `ASDPOCS._run` that scores a trial after every pass, and keeps its best volume.
 
-    score    of the held-out views, on the trial's voxels
-    beat     score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on
-    slow     whether the trial ends, too, when `PATIENCE` passes lower its score by less than `GAIN`
+    Parameters
+    ----------
+    score : Score
+        Of the held-out views, on the trial's voxels.
+    beat : float or None
+        Score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on.
+    slow : bool
+        Whether the trial ends, too, when `PATIENCE` passes lower its score by less than `GAIN`.
     """
 
     def __init__(self, score: Score, trial: Trial, beat: float | None = None, by: int = 0, slow: bool = False):

@@ -83,8 +83,12 @@ def corrected(scan: Scan, effects: Effects, objects: Sequence, extent: float = c
     Linearises the measured views, then subtracts the error that linearising leaves in simulated views of `objects`: blur,
     scatter and the second material (Joseph and Spital, J. Comput. Assist. Tomogr. 2, 1978).
 
-    effects   whose noise is left out, so that simulated views are expected ones
-    objects   similar to the scanned ones, as from `projectors.objects.find_objects`; Gaussians end at `extent` deviations
+    Parameters
+    ----------
+    effects : Effects
+        Whose noise is left out, so that simulated views are expected ones.
+    objects : Sequence
+        Similar to the scanned ones, as from `projectors.objects.find_objects`; Gaussians end at `extent` deviations.
     """
     measured = _without_dead(scan, effects)
     effects = replace(effects, detector=effects.detector and effects.detector.expected)

@@ -153,7 +153,10 @@ class PenalisedLeastSquares(Algorithm):
         predict as well: by then the volume is near its minimum, and scores can be compared. Among those that predict alike the
         strongest is taken, as in the rule of one standard error (Breiman et al., "Classification and Regression Trees", 1984).
 
-        steps   for `progress`
+        Parameters
+        ----------
+        steps : int
+            For `progress`.
         """
         score, solver = Score(held_out), self._solver(kept)
         scores: dict[int, float] = {}
@@ -191,9 +194,15 @@ class PenalisedLeastSquares(Algorithm):
 class Solver:
     """Accelerated proximal gradient descent on one scan.
 
-    weighted   whether W is exp(-b)
+    Parameters
+    ----------
+    weighted : bool
+        Whether W is exp(-b).
 
-    residual   |A x - b| / |b| where the last step began
+    Attributes
+    ----------
+    residual
+        |A x - b| / |b| where the last step began.
     """
 
     def __init__(self, system: System, prior: Prior, upper: float, weighted: bool = False):

@@ -12,11 +12,19 @@ from lingo_mi.scan import Scan, require_finite
 
 
 def require_circle(scan: Scan, what: str) -> CircularGeometry:
-    """The geometry of a scan on a circle before an upright panel, with every pixel valid. Raises InputError for any other.
-
-    what   the method that needs it, for the message
+    """The geometry of a scan on a circle before an upright panel, with every pixel valid.
 
     `rectify.can_rectify` also allows turned and tilted panels.
+
+    Parameters
+    ----------
+    what : str
+        The method that needs it, for the message.
+
+    Raises
+    ------
+    InputError
+        For any other.
     """
     if not isinstance(scan.geometry, CircularGeometry):
         raise InputError(f'{what} needs a source on a circle about z and an upright panel; this scan has other poses')

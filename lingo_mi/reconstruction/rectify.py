@@ -25,13 +25,20 @@ MOVES = 0.1  # share of its size by which the panel's shadow may move between vi
 def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     """The scan on an upright panel, the same in all views: columns along z, rows along the source's circle.
 
-    scan   all pixels valid; the source moves on a circle about z around the origin, and the panel with it
-    what   the algorithm that needs such a panel, for messages
-
     The geometry is `rectified_geometry`. Values are interpolated by cubic splines, and zero beyond half a pixel outside the real
     panel. A circular scan with an upright panel is returned unchanged.
 
-    Raises InputError for invalid pixels, and for a source or a panel that moves otherwise.
+    Parameters
+    ----------
+    scan : Scan
+        All pixels valid; the source moves on a circle about z around the origin, and the panel with it.
+    what : str
+        The algorithm that needs such a panel, for messages.
+
+    Raises
+    ------
+    InputError
+        For invalid pixels, and for a source or a panel that moves otherwise.
     """
     require_pixels(scan, what)
     geometry, (n_v, n_u) = rectified_geometry(scan.geometry, what), scan.geometry.nDetector
@@ -66,8 +73,11 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
     With an offset panel on a closed circle, the new panel is cut on the short side where its last row begins to see, because
     `fdk.ray_weights` treats all rows alike. Otherwise, on a closed circle, it is symmetric.
 
-    Raises InputError if the source leaves a circle about z, or if the panel moves relative to the source by more than a tenth
-    of its size, is turned too far for any line along the circle to cross it, or lies partly behind the source.
+    Raises
+    ------
+    InputError
+        If the source leaves a circle about z, or if the panel moves relative to the source by more than a tenth of its size, is
+        turned too far for any line along the circle to cross it, or lies partly behind the source.
     """
     if isinstance(geometry, CircularGeometry):
         return geometry
@@ -150,8 +160,12 @@ def _homographies(of: Rays, on: Rays) -> np.ndarray:
 def _steps(to_pixels, at) -> np.ndarray:
     """Pixel sizes along both axes of a plane, [2], no larger than a pixel of any view there.
 
-    to_pixels   homographies [view, 3, 3] from the plane
-    at          positions [view, 3, corner] where they are compared
+    Parameters
+    ----------
+    to_pixels
+        Homographies [view, 3, 3] from the plane.
+    at
+        Positions [view, 3, corner] where they are compared.
     """
     x = to_pixels @ at
     # d(x / w) = (dx - (x / w) dw) / w

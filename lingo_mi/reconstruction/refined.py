@@ -46,24 +46,35 @@ class Refined(Algorithm):
     and the result is their mean over each voxel. This helps for clean projections of objects finer than the voxels. It blurs
     an object that was simulated on the scan's own voxels, and lets in more noise (docs/benchmarks/volumes.md).
 
-    niter             passes over the measured views, at least 1
-    completed_niter   passes over the completed views before, at least 0
-    tviter, alpha, alpha_red, rmax, maxl2err, exact_every
-                      see `ASDPOCS`. The defaults are for clean projections; with noise, maxl2err sets how closely to match them
-    finer             parts along each side of a voxel, at least 1; memory grows with its cube
-    seed              of the random orders, at least 0
-
     Use it for few views if a cloud has been fitted to them (`lingo_mi.completion` prepares its inputs).
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> found = x3d_scan.scan(make('foot', 24), views=10, pixels=48)
-        >>> near = lm.reconstruct(found.train, lm.SART(niter=1), progress=False)  # in the place of a cloud's volume
-        >>> refined = lm.reconstruct(found.train, lm.Refined(niter=5), start=near, progress=False)
-        >>> refined.residuals[-1] < 0.5 * near.residuals[-1]
-        True
+    Parameters
+    ----------
+    niter : int
+        Passes over the measured views, at least 1.
+    completed_niter : int
+        Passes over the completed views before, at least 0.
+    tviter, alpha, alpha_red, rmax, maxl2err, exact_every
+        See `ASDPOCS`. The defaults are for clean projections; with noise, maxl2err sets how closely to match them.
+    finer : int
+        Parts along each side of a voxel, at least 1; memory grows with its cube.
+    seed : int
+        Of the random orders, at least 0.
 
-    Raises InputError for an option out of its range.
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> found = x3d_scan.scan(make('foot', 24), views=10, pixels=48)
+    >>> near = lm.reconstruct(found.train, lm.SART(niter=1), progress=False)  # in the place of a cloud's volume
+    >>> refined = lm.reconstruct(found.train, lm.Refined(niter=5), start=near, progress=False)
+    >>> refined.residuals[-1] < 0.5 * near.residuals[-1]
+    True
     """
 
     name: ClassVar[str] = 'refined'
@@ -101,12 +112,21 @@ class Refined(Algorithm):
     ) -> Reconstruction:
         """Reconstruct the volume from measured projections. The residuals are those of the measured views.
 
-        start       the cloud's volume [x, y, z], density per mm; give either this or `sample`
-        sample      function of a grid: the cloud's densities per mm [x, y, z] at its voxel centres; needed for `finer` > 1
-        completed   the measured views, then those between (`completion.views.insert_views`); None if completed_niter is 0
-        progress    called as progress(passes done, passes, residual); the residual is None in passes over completed views
+        Parameters
+        ----------
+        start : array_like or None
+            The cloud's volume [x, y, z], density per mm; give either this or `sample`.
+        sample : callable or None
+            Function of a grid: the cloud's densities per mm [x, y, z] at its voxel centres; needed for `finer` > 1.
+        completed : Scan or None
+            The measured views, then those between (`completion.views.insert_views`); None if completed_niter is 0.
+        progress : Progress or None
+            Called as progress(passes done, passes, residual); the residual is None in passes over completed views.
 
-        Raises InputError if an input is missing or does not fit the geometry, and if the result is not finite.
+        Raises
+        ------
+        InputError
+            If an input is missing or does not fit the geometry, and if the result is not finite.
         """
         began = time.perf_counter()
         geometry, steps = scan.geometry, self.steps(scan)

@@ -73,7 +73,10 @@ def run_in_slabs(
     Iterative algorithms hold the volume in a folder beside the file, whose name ends in .slabs, until the file is written. If the
     work is stopped, the same call goes on.
 
-    progress   called as progress(steps done, `algorithm.slab_steps`, residual or None)
+    Parameters
+    ----------
+    progress : Progress or None
+        Called as progress(steps done, `algorithm.slab_steps`, residual or None).
     """
     require_signal(scan)
     if isinstance(algorithm, FDK):
@@ -94,9 +97,14 @@ def check_room(
 ) -> None:
     """Raises InputError if memory or an array is too small.
 
-    algorithm   to check for (None: the least that any algorithm needs)
-    views       number of views to reconstruct from (None: the geometry's own)
-    beside      bytes that are held beside what the algorithm needs, such as `mask_images`
+    Parameters
+    ----------
+    algorithm : Algorithm or None
+        To check for (None: the least that any algorithm needs).
+    views : int or None
+        Number of views to reconstruct from (None: the geometry's own).
+    beside : float
+        Bytes that are held beside what the algorithm needs, such as `mask_images`.
     """
     views = views or len(geometry)
     fine, pixels = geometry, 0
@@ -126,12 +134,19 @@ def progress_bar(
 ) -> Iterator[Progress]:
     """A `progress` function that shows a bar on standard error.
 
-        with progress_bar(algorithm, scan) as progress:
-            found = run_algorithm(scan, algorithm, progress=progress)
+    Parameters
+    ----------
+    label : str or None
+        Before the bar (default: the algorithm's name).
+    steps : int or None
+        In all (default: those of `run_algorithm`).
+    shown : bool
+        False: draw nothing.
 
-    label   before the bar (default: the algorithm's name)
-    steps   in all (default: those of `run_algorithm`)
-    shown   False: draw nothing
+    Examples
+    --------
+    >>> with progress_bar(algorithm, scan) as progress:
+    ...     found = run_algorithm(scan, algorithm, progress=progress)
     """
     with bars.Progress(label or algorithm.name, steps or algorithm.steps(scan), shown=shown) as bar:
         yield lambda done, _, residual: bar.update(done, residual=residual)

@@ -53,11 +53,18 @@ from lingo_mi.storage.file_access import as_path
 def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Generator) -> list[np.ndarray]:
     """The view numbers [block][view] of one pass: blocks of consecutive views, in one of three orders.
 
-    order   'ordered'; 'random'; or 'angularDistance': next is the block farthest on the circle from all previous ones (by
-            the blocks' middle views)
-    rng     for the random order
+    Parameters
+    ----------
+    order : str
+        'ordered'; 'random'; or 'angularDistance': next is the block farthest on the circle from all previous ones (by the blocks'
+        middle views).
+    rng : Generator
+        For the random order.
 
-    Raises InputError for an unknown order.
+    Raises
+    ------
+    InputError
+        For an unknown order.
     """
     check_order(order)
     parts = [np.arange(i, min(i + blocksize, len(angles))) for i in range(0, len(angles), blocksize)]
@@ -119,8 +126,12 @@ class Sweeps(Algorithm):
         """Reconstruct the volume of a scan, see `run_algorithm`. Without tol, the residual is not computed after every pass, of
         which it takes a third of the time, but at the end.
 
-        weights   of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal)
-        blur      of the change by a pass: standard deviations in voxels along x, y, z (default: none)
+        Parameters
+        ----------
+        weights : array_like or None
+            Of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal).
+        blur : Sequence[float] or None
+            Of the change by a pass: standard deviations in voxels along x, y, z (default: none).
         """
         began, how = time.perf_counter(), self._by_blocks(len(scan))
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
@@ -143,17 +154,28 @@ class Sweeps(Algorithm):
     ) -> Iterator[np.ndarray]:
         """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
-        folder     for the volume while it is made, twice its size; made if missing. Where the work was stopped, the same call
-                   goes on after the last whole update, to the same result. The files stay: remove them when the volume is safe
-        progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of
-                   this update before it)
-
         Takes memory for seven slabs, two sets of projections (three with invalid pixels), and ten images for each view of a
-        block. Raises InputError if tol is above 0, if rays leave voxels out, for too little memory or room on the
-        disk, and for a folder that holds other work.
+        block.
 
-            for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
-                ...
+        Parameters
+        ----------
+        folder : path-like
+            For the volume while it is made, twice its size; made if missing. Where the work was stopped, the same call goes on
+            after the last whole update, to the same result. The files stay: remove them when the volume is safe.
+        progress : Progress or None
+            Called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this update
+            before it).
+
+        Raises
+        ------
+        InputError
+            If tol is above 0, if rays leave voxels out, for too little memory or room on the disk, and for a folder that holds
+            other work.
+
+        Examples
+        --------
+        >>> for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
+        ...     ...
         """
         how = self._by_blocks(len(scan))
         if how.tol:
@@ -178,26 +200,42 @@ class OSSART(Sweeps):
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
-    niter           passes over all views, at least 1
-    blocksize       views per update, at least 1; the last block of a pass may have fewer
-    lmbda           relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
-    lmbda_red       0 < lmbda_red <= 1
-    noneg           whether negative densities are set to zero after every update
-    OrderStrategy   of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
-    tol             stop when |A x - b| / |b| is no larger; 0: never
-    seed            of the random order, from 0 on
-
     Use it instead of `SART` for many views: a pass has fewer updates, and each averages the noise of its views.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
-        >>> found = lm.reconstruct(measured, lm.OSSART(niter=4, blocksize=5), progress=False)
-        >>> found.volume.shape, found.residuals[-1] < 0.05
-        ((24, 24, 24), True)
+    Wang and Jiang, "Ordered-subset simultaneous algebraic reconstruction techniques (OS-SART)", J. X-Ray Sci. Technol. 12 (2004).
 
-    Wang and Jiang, "Ordered-subset simultaneous algebraic reconstruction techniques (OS-SART)", J. X-Ray Sci. Technol. 12
-    (2004). Raises InputError for an option out of its range.
+    Parameters
+    ----------
+    niter : int
+        Passes over all views, at least 1.
+    blocksize : int
+        Views per update, at least 1; the last block of a pass may have fewer.
+    lmbda : float
+        Relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass.
+    lmbda_red : float
+        0 < lmbda_red <= 1.
+    noneg : bool
+        Whether negative densities are set to zero after every update.
+    OrderStrategy : str
+        Of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`.
+    tol : float
+        Stop when |A x - b| / |b| is no larger; 0: never.
+    seed : int
+        Of the random order, from 0 on.
+
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
+    >>> found = lm.reconstruct(measured, lm.OSSART(niter=4, blocksize=5), progress=False)
+    >>> found.volume.shape, found.residuals[-1] < 0.05
+    ((24, 24, 24), True)
     """
 
     name: ClassVar[str] = 'os-sart'
@@ -231,26 +269,41 @@ class SART(Sweeps):
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
-    niter           passes over all views, at least 1
-    lmbda           relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass
-    lmbda_red       0 < lmbda_red <= 1
-    noneg           whether negative densities are set to zero after every update
-    OrderStrategy   of the views: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`
-    tol             stop when |A x - b| / |b| is no larger; 0: never
-    seed            of the random order, from 0 on
-
     Use it for few clean views, which few passes match closely. With noise, use fewer passes or a smaller lmbda.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = lm.reconstruct(measured, lm.SART(niter=3), progress=False)
-        >>> better = lm.reconstruct(measured, lm.SART(niter=3, lmbda=0.5), start=found, progress=False)
-        >>> better.residuals[-1] < found.residuals[-1] < 0.05
-        True
+    Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984).
 
-    Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984). Raises InputError for an
-    option out of its range.
+    Parameters
+    ----------
+    niter : int
+        Passes over all views, at least 1.
+    lmbda : float
+        Relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every pass.
+    lmbda_red : float
+        0 < lmbda_red <= 1.
+    noneg : bool
+        Whether negative densities are set to zero after every update.
+    OrderStrategy : str
+        Of the views: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`.
+    tol : float
+        Stop when |A x - b| / |b| is no larger; 0: never.
+    seed : int
+        Of the random order, from 0 on.
+
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
+    >>> found = lm.reconstruct(measured, lm.SART(niter=3), progress=False)
+    >>> better = lm.reconstruct(measured, lm.SART(niter=3, lmbda=0.5), start=found, progress=False)
+    >>> better.residuals[-1] < found.residuals[-1] < 0.05
+    True
     """
 
     name: ClassVar[str] = 'sart'
@@ -278,24 +331,38 @@ class SIRT(Sweeps):
 
         x  <-  max(x + lmbda (A^T W (b - A x)) / (A^T 1), 0),    W = 1 / (A 1)
 
-    niter       updates, at least 1
-    lmbda       relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every update
-    lmbda_red   0 < lmbda_red <= 1
-    noneg       whether negative densities are set to zero after every update
-    tol         stop when |A x - b| / |b| is no larger; 0: never
-
     Use it for noisy views: it approaches a least-squares solution smoothly, with many times the passes of `SART`.
     lmbda=1.9 with lmbda_red=1 is fastest.
 
-        >>> import lingo_mi as lm
-        >>> from lingo_mi.phantoms import make, x3d_scan
-        >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-        >>> found = lm.reconstruct(measured, lm.SIRT(niter=10, lmbda=1.9, lmbda_red=1.0), progress=False)
-        >>> found.residuals[-1] < 0.2 * found.residuals[0]
-        True
-
     Gilbert, "Iterative methods for the three-dimensional reconstruction of an object from projections", J. Theor. Biol. 36
-    (1972), with the weights of Andersen and Kak, Ultrasonic Imaging 6 (1984). Raises InputError for an option out of its range.
+    (1972), with the weights of Andersen and Kak, Ultrasonic Imaging 6 (1984).
+
+    Parameters
+    ----------
+    niter : int
+        Updates, at least 1.
+    lmbda : float
+        Relaxation, 0 < lmbda <= 2; multiplied by `lmbda_red` after every update.
+    lmbda_red : float
+        0 < lmbda_red <= 1.
+    noneg : bool
+        Whether negative densities are set to zero after every update.
+    tol : float
+        Stop when |A x - b| / |b| is no larger; 0: never.
+
+    Raises
+    ------
+    InputError
+        For an option out of its range.
+
+    Examples
+    --------
+    >>> import lingo_mi as lm
+    >>> from lingo_mi.phantoms import make, x3d_scan
+    >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
+    >>> found = lm.reconstruct(measured, lm.SIRT(niter=10, lmbda=1.9, lmbda_red=1.0), progress=False)
+    >>> found.residuals[-1] < 0.2 * found.residuals[0]
+    True
     """
 
     name: ClassVar[str] = 'sirt'

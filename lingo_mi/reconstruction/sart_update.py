@@ -57,7 +57,10 @@ def updated(
 ) -> Callable[[Any, Any, Any], mi.Float]:
     """The rule for `Joseph.adjoint` that makes the next volume of x (mi.Float [voxels]): x + step weights A^T y / A^T 1, or 0.
 
-    noneg   whether negative densities are set to zero
+    Parameters
+    ----------
+    noneg : bool
+        Whether negative densities are set to zero.
     """
 
     def rule(voxel, change, weight):

@@ -51,12 +51,19 @@ def swept(
 ) -> Iterator[np.ndarray]:
     """The volume after the updates, in slabs [x, y, thickness] along z; the last may be thinner.
 
-    folder     for the files. They stay, so that the volume can be had again at once; `discard` removes them
-    progress   called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this
-               update before it)
+    Parameters
+    ----------
+    folder : Path
+        For the files. They stay, so that the volume can be had again at once; `discard` removes them.
+    progress : Progress or None
+        Called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this update
+        before it).
 
-    Raises InputError for pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two
-    volumes, for a folder that holds other work, and if the volume is not finite.
+    Raises
+    ------
+    InputError
+        For pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two volumes, for a
+        folder that holds other work, and if the volume is not finite.
     """
     require_rays(scan.geometry)
     if leave_voxels_out(scan.geometry):
@@ -112,7 +119,10 @@ def _complete(system: _Slabs, updates: Sequence[Update], noneg: bool, progress: 
 class _Slabs:
     """The matrix A of a scan, by slabs of a volume on a disk. Images are mi.Float [view, u, v].
 
-    A   that of one slice, for what does not depend on the voxels
+    Attributes
+    ----------
+    A
+        That of one slice, for what does not depend on the voxels.
     """
 
     def __init__(self, scan: Scan, volume: _Volume):
@@ -159,7 +169,10 @@ class _Slabs:
     ) -> mi.Float | None:
         """Update the volume by the normalised error of some views, and return A x of the following ones.
 
-        report   called with the number of slabs that are updated
+        Parameters
+        ----------
+        report : callable
+            Called with the number of slabs that are updated.
         """
         ax = None if following is None else self._nothing(following)
         for part in range(len(self.volume.parts)):
@@ -214,8 +227,12 @@ class _Slabs:
 class _Volume:
     """A volume in slabs, in two files of a folder: one is read, the other written, and they change places.
 
-    parts   (begin, end) of the slabs
-    done    how often they have changed places; before, the volume is zero
+    Attributes
+    ----------
+    parts
+        (begin, end) of the slabs.
+    done
+        How often they have changed places; before, the volume is zero.
     """
 
     def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):

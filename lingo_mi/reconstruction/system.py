@@ -27,14 +27,22 @@ DIVERGED = 'the reconstruction is not finite: lower lmbda or alpha, or check the
 class System:
     """A x = b of a scan. Images are mi.Float [view, u, v]; projections are density times mm.
 
-    A          the projector
-    measured   the projections
-    b          the projections, `measured` or as corrected by `correct`
-    weights    of the voxels [x, y, z], for `sart.sweep`; `weighed`: their line integrals. None: no weights
-    blur       for `sart.sweep`
-    between    voxels that no ray crosses (`wide_pixels.Between`), or None
-
     Invalid pixels count for nothing.
+
+    Attributes
+    ----------
+    A
+        The projector.
+    measured
+        The projections.
+    b
+        The projections, `measured` or as corrected by `correct`.
+    weights
+        Of the voxels [x, y, z], for `sart.sweep`; `weighed`: their line integrals. None: no weights.
+    blur
+        For `sart.sweep`.
+    between
+        Voxels that no ray crosses (`wide_pixels.Between`), or None.
     """
 
     def __init__(self, scan: Scan, weights: ArrayLike | None = None, blur: Sequence[float] | None = None):
@@ -63,7 +71,10 @@ class System:
     def start(self, volume: ArrayLike | None) -> mi.Float:
         """The start volume on the device: zero, or `volume` [x, y, z], density per mm.
 
-        Raises InputError if it does not fit the geometry or is not finite.
+        Raises
+        ------
+        InputError
+            If it does not fit the geometry or is not finite.
         """
         if volume is None:
             x = dr.zeros(mi.Float, self.A.voxels)
@@ -81,7 +92,13 @@ class System:
         return r, self.relative(r)
 
     def relative(self, r: mi.Float) -> float:
-        """The norm of a residual over that of b. Raises InputError if it is not finite."""
+        """The norm of a residual over that of b.
+
+        Raises
+        ------
+        InputError
+            If it is not finite.
+        """
         value = norm(r) / self.size_b
         if not np.isfinite(value):
             raise InputError(DIVERGED)
@@ -99,7 +116,13 @@ class System:
             self.b = evaluated(self.measured + (joseph - exact))
 
     def volume(self, x: mi.Float) -> np.ndarray:
-        """A device volume as float32 [x, y, z]. Raises InputError if it is not finite."""
+        """A device volume as float32 [x, y, z].
+
+        Raises
+        ------
+        InputError
+            If it is not finite.
+        """
         volume = x.numpy().reshape(self.geometry.grid.shape)
         if not np.isfinite(volume).all():
             raise InputError(DIVERGED)
@@ -128,7 +151,13 @@ def norm(a: mi.Float) -> float:
 
 
 def on_voxels(volume: ArrayLike, geometry: Geometry, name: str) -> np.ndarray:
-    """A volume as float32 [x, y, z]. Raises InputError if it does not fit the geometry or is not finite."""
+    """A volume as float32 [x, y, z].
+
+    Raises
+    ------
+    InputError
+        If it does not fit the geometry or is not finite.
+    """
     volume = np.ascontiguousarray(as_numpy(volume, f'the {name}', np.float32))
     if volume.shape != geometry.grid.shape:
         raise InputError(f'the {name}: shape {volume.shape}, but the geometry says nVoxel = {geometry.grid.shape}')

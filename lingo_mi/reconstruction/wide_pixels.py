@@ -45,11 +45,15 @@ def excess_width(geometry: Geometry) -> tuple[float, float, float]:
 class Between:
     """Voxels that no ray crosses, or few rays at a corner, among neighbours that rays cross.
 
-    geometry   of the scan
-    A, views   its projector and views
-
     Few small steps leave these voxels behind their neighbours. Outside the field of view (less than half of the neighbourhood
     crossed) nothing counts as between.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        Of the scan.
+    A, views
+        Its projector and views.
     """
 
     @classmethod

@@ -36,7 +36,10 @@ class ReportData:
     scanner         the geometry of the fitted views, for the drawing of source and panel
     command         the command line that reproduces this result
 
-    Raises InputError if shapes do not fit or an image holds NaN or infinity.
+    Raises
+    ------
+    InputError
+        If shapes do not fit or an image holds NaN or infinity.
     """
 
     title: str

@@ -23,8 +23,12 @@ MAP_BITS = 8  # of a map of errors, which ranks voxels: no more than its colours
 def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = None) -> tuple[dict, Arrays]:
     """What the scripts know of a report beside colours and history, and its arrays by name.
 
-    surfaces   whether surfaces of the volume are among them, which take a second
-    earlier    the arrays of an earlier state of the same page; those that are the same still are taken from there
+    Parameters
+    ----------
+    surfaces : bool
+        Whether surfaces of the volume are among them, which take a second.
+    earlier : Arrays or None
+        The arrays of an earlier state of the same page; those that are the same still are taken from there.
     """
     arrays = Arrays(earlier)
     known: dict[str, Any] = {}
@@ -63,9 +67,14 @@ def slice_payload(
 ) -> dict:
     """Volumes [x, y, z] on one grid, with one scale, as previews where they would take more than `budget` bytes.
 
-    spacing     of the grid's voxels, and `centre` of the grid, mm
-    reference   the volume that the others are compared with
-    of          the grid's shape, and n, where the volumes are means of n^3 of its voxels already
+    Parameters
+    ----------
+    spacing
+        Of the grid's voxels, and `centre` of the grid, mm.
+    reference : str or None
+        The volume that the others are compared with.
+    of : tuple or None
+        The grid's shape, and n, where the volumes are means of n^3 of its voxels already.
     """
 
     def candidates():
@@ -101,7 +110,10 @@ def slice_payload(
 def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict:
     """Maps of errors [x, y, z], not negative, on the grid of the volumes, by name; each with its own scale.
 
-    known   of these volumes, as `slices` gives it
+    Parameters
+    ----------
+    known : dict
+        Of these volumes, as `slices` gives it.
     """
     for i, values in enumerate(maps.values()):
         small = block_means(np.asarray(values, np.float32), known['preview'])
@@ -119,7 +131,10 @@ def view_payload(
 ) -> dict:
     """Held-out views [n, v, u], in the order of their angles; fewer and smaller ones where they are many and large.
 
-    reference   the images that the others are compared with
+    Parameters
+    ----------
+    reference : str or None
+        The images that the others are compared with.
     """
     first = next(iter(images.values()))
     least = 1
@@ -153,9 +168,15 @@ def view_payload(
 def _add(name: str, candidates: Iterable[tuple[Any, dict[str, np.ndarray]]], arrays: Arrays, budget: float) -> tuple:
     """Pack arrays, with one scale, as `name0`, `name1`, ...: the first candidate that stays within `budget` bytes, or the last.
 
-    candidates   what says how they were made, and the arrays, the largest first
+    Parameters
+    ----------
+    candidates : Iterable[tuple[Any, dict[str, ndarray]]]
+        What says how they were made, and the arrays, the largest first.
 
-    Returns that candidate.
+    Returns
+    -------
+    tuple
+        That candidate.
     """
     for candidate in candidates:
         found = candidate[1]

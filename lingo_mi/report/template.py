@@ -22,10 +22,16 @@ SCRIPTS = (
 def page(title: str, headline: str, numbers: str, command: str, known: dict, arrays: Arrays, live: bool = False) -> str:
     """A page that loads nothing and runs no script but its own, whose digest its policy names.
 
-    title, headline     plain text
-    numbers, command    markup of those sections, made by `table` and `code`
-    known               what the scripts know (JSON); arrays: by name
-    live                whether it asks the server that sent it for news
+    Parameters
+    ----------
+    title, headline : str
+        Plain text.
+    numbers, command : str
+        Markup of those sections, made by `table` and `code`.
+    known : dict
+        What the scripts know (JSON); arrays: by name.
+    live : bool
+        Whether it asks the server that sent it for news.
     """
     known = known | dict(arrays={name: packed.head() for name, packed in arrays.items()})
     script = _script()

@@ -26,9 +26,15 @@ class Page:
     def save(self, path: str | PathLike, *, force: bool = False) -> Path:
         """Write the page; returns the path.
 
-        force   replace an earlier file
+        Parameters
+        ----------
+        force : bool
+            Replace an earlier file.
 
-        Raises InputError where the file is there already, or cannot be written.
+        Raises
+        ------
+        InputError
+            If the file is there already, or cannot be written.
         """
         path = as_path('path', path)
         with writing(path):

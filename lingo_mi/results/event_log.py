@@ -18,7 +18,10 @@ from lingo_mi.storage.file_access import as_path, optional, writing
 class EventLog:
     """A watcher (see `watch.Watcher`) that writes events into a folder, for `tensorboard --logdir FOLDER`.
 
-    Raises InputError where tensorboardX is missing, or the folder cannot be written.
+    Raises
+    ------
+    InputError
+        If tensorboardX is missing, or the folder cannot be written.
     """
 
     def __init__(self, folder: PathLike | str):

@@ -38,8 +38,12 @@ PATIENCE = 10.0  # seconds after which a page that has not asked is gone; a fini
 class Live:
     """A watcher (see `watch.Watcher`) that serves a page. `address` is where.
 
-    geometry   of the scan
-    title      of the page: any text
+    Parameters
+    ----------
+    geometry : Geometry
+        Of the scan.
+    title : str
+        Of the page: any text.
     """
 
     def __init__(self, geometry: Geometry, title: str = ''):
@@ -164,8 +168,12 @@ class Live:
     def state(self, seen: int, place: str) -> dict:
         """What a page does not know yet.
 
-        seen    the number of the state that it has seen last
-        place   how far it has the history, as it was told (`history.place`)
+        Parameters
+        ----------
+        seen : int
+            The number of the state that it has seen last.
+        place : str
+            How far it has the history, as it was told (`history.place`).
         """
         with self._lock:
             self._asked = time.perf_counter()

@@ -14,7 +14,10 @@ from lingo_mi.results.watch import Watcher
 def watchers_of(geometry: Geometry, live: bool, log_dir: str | PathLike | None, title: str) -> list[Watcher]:
     """A live page, whose address is said, and a log of events, each where it is asked for.
 
-    Raises InputError where the log cannot be written, or its library is missing.
+    Raises
+    ------
+    InputError
+        If the log cannot be written, or its library is missing.
     """
     require_type('live', live, bool)
     found: list[Watcher] = [] if log_dir is None else [EventLog(log_dir)]

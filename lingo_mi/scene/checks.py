@@ -15,8 +15,12 @@ from lingo_mi.geometry.base import Geometry
 def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0) -> None:
     """Raises InputError, before anything is allocated, for a scan that does not fit into this process's memory.
 
-    views    of all geometries together (0: the views that they have)
-    needed   peak memory of an algorithm, bytes (0: the least, see `least_memory`)
+    Parameters
+    ----------
+    views : int
+        Of all geometries together (0: the views that they have).
+    needed : float
+        Peak memory of an algorithm, bytes (0: the least, see `least_memory`).
     """
     known = [g for g in geometries if g is not None]
     views = views or sum(map(len, known))

@@ -14,9 +14,15 @@ from lingo_mi.common.errors import InputError
 def data_file(name: str, parameter: str) -> str:
     """The path of a file that a scene names: next to the scene or in the working folder, else in the folder LINGO_MI_DATA.
 
-    parameter   the scene's `<default>` that sets the file, for the message
+    Parameters
+    ----------
+    parameter : str
+        The scene's `<default>` that sets the file, for the message.
 
-    Raises InputError, in one line, if there is no such file, or if it is a device or a pipe, which may have no end.
+    Raises
+    ------
+    InputError
+        In one line, if there is no such file, or if it is a device or a pipe, which may have no end.
     """
     resolver: Any = mi.file_resolver  # declared as an object
     found = Path(str(resolver().resolve(name)))

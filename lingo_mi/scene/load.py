@@ -33,10 +33,17 @@ class LoadedScene:
 def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int = 0) -> LoadedScene:
     """Load a Mitsuba scene with a `ct_scanner`.
 
-    parameters   values for the scene's own `<default>` names
-    slab         slices of the volume that will be in memory at once (0: all)
+    Parameters
+    ----------
+    parameters : dict or None
+        Values for the scene's own `<default>` names.
+    slab : int
+        Slices of the volume that will be in memory at once (0: all).
 
-    Raises InputError, in one line, for whatever Mitsuba or a plugin finds wrong, and where memory does not suffice.
+    Raises
+    ------
+    InputError
+        In one line, for whatever mitsuba or a plugin finds wrong, and where memory does not suffice.
     """
     path = Path(path)
     known = outline(path, parameters)
@@ -63,7 +70,10 @@ def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int =
 def load_file(path: Path, parameters: dict | None = None) -> Any:
     """What Mitsuba makes of a scene file.
 
-    Raises InputError, in one line, for whatever it finds wrong, and KeyboardInterrupt after Ctrl-C, also within a plugin.
+    Raises
+    ------
+    InputError
+        In one line, for whatever it finds wrong, and keyboardinterrupt after ctrl-c, also within a plugin.
     """
     try:
         str(path).encode('utf-8')
@@ -82,7 +92,13 @@ def load_file(path: Path, parameters: dict | None = None) -> Any:
 
 
 def defaults(path: PathLike | str) -> set[str]:
-    """Names of a scene file's `<default>` parameters. Raises InputError if the file is missing or no scene (see `outline`)."""
+    """Names of a scene file's `<default>` parameters.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or no scene (see `outline`).
+    """
     return outline(path)
 
 

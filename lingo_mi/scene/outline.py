@@ -26,7 +26,10 @@ _ENCODINGS = 'utf-8', 'us-ascii', 'ascii', 'iso-8859-1', 'latin-1'
 def scene_files(path: PathLike | str, parameters: dict | None = None) -> list[Path]:
     """A scene file, those that it includes, and all files that its texts name, where they exist, also in LINGO_MI_DATA.
 
-    Raises InputError as `outline`.
+    Raises
+    ------
+    InputError
+        As `outline`.
     """
     look = _Look({name: str(value) for name, value in (parameters or {}).items()})
     look.at(Path(path), 0)
@@ -38,11 +41,17 @@ def scene_files(path: PathLike | str, parameters: dict | None = None) -> list[Pa
 def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
     """Names of a scene file's own `<default>` parameters.
 
-    parameters   values for them
+    Parameters
+    ----------
+    parameters : dict or None
+        Values for them.
 
-    Raises InputError if the file is missing or no regular one, is not XML, declares a document type, whose entities may stand for
-    more than memory holds, or is larger or deeper than any scene; and so for the files that it includes. Likewise if a shape's or
-    a texture's file is a device or a pipe, which has no end.
+    Raises
+    ------
+    InputError
+        If the file is missing or no regular one, is not XML, declares a document type, whose entities may stand for more than
+        memory holds, or is larger or deeper than any scene; and so for the files that it includes. Likewise if a shape's or a
+        texture's file is a device or a pipe, which has no end.
     """
     look = _Look({name: str(value) for name, value in (parameters or {}).items()})
     look.at(Path(path), 0)
@@ -53,11 +62,18 @@ def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
 class _Look:
     """What is known after a part of the files.
 
-    values     of the parameters
-    folders    in which names are looked for
-    scenes     the files themselves
-    texts      of all strings
-    elements   of all files so far
+    Parameters
+    ----------
+    values : dict[str, str]
+        Of the parameters.
+    folders : list[Path]
+        In which names are looked for.
+    scenes : set[Path]
+        The files themselves.
+    texts : set[str]
+        Of all strings.
+    elements : int
+        Of all files so far.
     """
 
     values: dict[str, str]

@@ -22,7 +22,10 @@ def scene_path(scene: PathLike | str) -> Path:
 
     Folders do not count: a result folder `x3d_foot` does not hide the scene of that name.
 
-    Raises InputError if there is neither. A folder of another name is returned unchanged; reading it fails later.
+    Raises
+    ------
+    InputError
+        If there is neither. A folder of another name is returned unchanged; reading it fails later.
     """
     path = Path(scene)
     if os.path.isfile(path):  # other than Path's, False for a name that is too long

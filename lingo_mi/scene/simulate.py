@@ -30,12 +30,18 @@ def take_scan(
 ) -> Dataset:
     """The scan of a scene: its measured projections if the scanner has any; otherwise all views are rendered.
 
-    views    number of views to fit, evenly spaced among the scanner's (0: all)
-    volume   `files.volumes.Volume` to scan instead of the scene's objects
-    seed     of the detector's noise, if it has any
-    truth    whether the data set gets the true volume, where that is known on the scanner's grid
-
     Held-out views are the scanner's test views, or the remaining views if it has none.
+
+    Parameters
+    ----------
+    views : int
+        Number of views to fit, evenly spaced among the scanner's (0: all).
+    volume : Volume or None
+        `files.volumes.Volume` to scan instead of the scene's objects.
+    seed : int
+        Of the detector's noise, if it has any.
+    truth : bool
+        Whether the data set gets the true volume, where that is known on the scanner's grid.
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:

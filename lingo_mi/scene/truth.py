@@ -54,6 +54,9 @@ class ScannedVolume:
 def voxelize_cloud(cloud: Ellipsoids, grid: Grid, extent: float) -> np.ndarray:
     """Density of a cloud of Gaussians at the voxel centres of a grid, float32 [x, y, z], per mm.
 
-    extent   cut-off in standard deviations
+    Parameters
+    ----------
+    extent : float
+        Cut-off in standard deviations.
     """
     return on_grid(cloud, grid.low, grid.spacing, grid.shape, extent)

@@ -30,7 +30,10 @@ def one_line(error: BaseException | str) -> str:
 def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
     """Turns what the file system says about `path` while it is read into an InputError.
 
-    folder   whether it must be a folder; else it must be a regular file: a device has no end, and a pipe may never begin
+    Parameters
+    ----------
+    folder : bool
+        Whether it must be a folder; else it must be a regular file: a device has no end, and a pipe may never begin.
     """
     try:
         try:
@@ -59,7 +62,13 @@ _LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """What a text in JSON says. Raises ValueError for any other text, also for one that is nested too deeply."""
+    """What a text in JSON says.
+
+    Raises
+    ------
+    ValueError
+        For any other text, also for one that is nested too deeply.
+    """
     try:
         return json.loads(text)
     except RecursionError:
@@ -67,7 +76,13 @@ def parsed_json(text: str | bytes) -> Any:
 
 
 def read_json(path: PathLike | str) -> Any:
-    """What a JSON file says; None where it is no JSON. Raises InputError where it cannot be read."""
+    """What a JSON file says; None where it is no JSON.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
     with reading(path):
         text = Path(path).read_bytes()
     try:
@@ -77,7 +92,13 @@ def read_json(path: PathLike | str) -> Any:
 
 
 def read_object(path: PathLike | str) -> dict[str, Any]:
-    """What a JSON file holds by name. Raises InputError where it cannot be read or holds something else."""
+    """What a JSON file holds by name.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or holds something else.
+    """
     found = read_json(path)
     if not isinstance(found, dict):
         raise InputError(f'{path}: is damaged; remove it, to make it again')
@@ -147,7 +168,12 @@ def replacing(path: PathLike | str) -> Iterator[Path]:
     """Yields a new, empty file beside `path`, which takes its place when the block ends without an error.
 
     Its content is on the disk before it has its name, so that `path` is the old file or the new one also after a crash. Where
-    `path` is a link, the link is replaced, not what it points to. Raises InputError if the file cannot be written.
+    `path` is a link, the link is replaced, not what it points to.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
     """
     with _temporary(path, _new_file, _remove_file) as temporary:
         yield temporary
@@ -156,7 +182,10 @@ def replacing(path: PathLike | str) -> Iterator[Path]:
 def leftovers(folder: Path, folders: bool = False) -> list[tuple[Path, str]]:
     """Files in a folder that a killed process of ours has left behind, and the names that they were to get (their ends).
 
-    folders   its folders instead
+    Parameters
+    ----------
+    folders : bool
+        Its folders instead.
     """
     found = [(path, _LEFTOVER.fullmatch(path.name)) for path in folder.iterdir()]
     kind = Path.is_dir if folders else Path.is_file
@@ -166,7 +195,10 @@ def leftovers(folder: Path, folders: bool = False) -> list[tuple[Path, str]]:
 def write_text(path: PathLike | str, text: str) -> None:
     """Write a text file as UTF-8, whole or not at all; characters that have no UTF-8 are escaped.
 
-    Raises InputError if it cannot be written.
+    Raises
+    ------
+    InputError
+        If it cannot be written.
     """
     with replacing(path) as temporary:
         temporary.write_bytes(text.encode('utf-8', 'backslashreplace'))
@@ -176,7 +208,10 @@ def write_text(path: PathLike | str, text: str) -> None:
 def new_folder(path: PathLike | str) -> Iterator[Path]:
     """Yields a temporary folder, which becomes `path` when the block ends without an error.
 
-    Raises InputError if `path` exists and is not an empty folder, or cannot be written.
+    Raises
+    ------
+    InputError
+        If `path` exists and is not an empty folder, or cannot be written.
     """
     path = Path(path)
     if path.exists() and not (path.is_dir() and not any(path.iterdir())):
@@ -186,7 +221,13 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
 
 
 def new_file(path: Path, force: bool) -> None:
-    """Makes the folder of a file to be written. Raises InputError where the file exists, unless `force` replaces it."""
+    """Makes the folder of a file to be written.
+
+    Raises
+    ------
+    InputError
+        If the file exists, unless `force` replaces it.
+    """
     if path.exists() and not force:
         raise InputError(f'{path}: exists already; give force=True to replace it')
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -220,7 +261,10 @@ def writing(path: PathLike | str) -> Iterator[None]:
 def require_writable(folder: Path, path: Path, mend: str = 'choose another place') -> None:
     """Raises InputError, in the name of `path`, unless `folder` can be made and written to. Leaves nothing behind.
 
-    mend   what to do, for the message
+    Parameters
+    ----------
+    mend : str
+        What to do, for the message.
     """
     try:
         with tempfile.TemporaryFile(dir=_deepest(folder)):  # of a name that no file has
@@ -255,7 +299,10 @@ def quiet(library: str) -> Iterator[None]:
 def beside(file: PathLike | str, name: Any) -> Path:
     """The path of a file that `file` names, which lies beside it or in a folder below.
 
-    Raises InputError for any other: what a stranger's file names is not looked for in the rest of the system.
+    Raises
+    ------
+    InputError
+        For any other: what a stranger's file names is not looked for in the rest of the system.
     """
     path = Path(name) if isinstance(name, str) else None
     if path is None or not name or path.is_absolute() or path.drive or '..' in path.parts:
@@ -274,7 +321,13 @@ def as_path(name: str, value: Any) -> Path:
 
 
 def optional(module: str, extra: str = 'formats') -> Any:
-    """Imports a package of an extra. Raises InputError with the command that installs it."""
+    """Imports a package of an extra.
+
+    Raises
+    ------
+    InputError
+        With the command that installs it.
+    """
     import importlib
 
     try:

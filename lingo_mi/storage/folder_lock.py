@@ -29,11 +29,18 @@ LOCK = '.lingo_mi.lock'
 def locked(folder: Path | str, name: str = LOCK) -> Iterator[None]:
     """Holds the lock of a folder, which is made if missing; folders that were made and are left empty are removed again.
 
-    name   of the lock file: another one where the folder holds files of several processes
-
     The system gives the lock back when its owner ends, however that ends. Where the file system has no such locks, the file
-    itself is the lock, and that of a dead process of this computer is taken over. Raises InputError where another process
-    has it.
+    itself is the lock, and that of a dead process of this computer is taken over.
+
+    Parameters
+    ----------
+    name : str
+        Of the lock file: another one where the folder holds files of several processes.
+
+    Raises
+    ------
+    InputError
+        If another process has it.
     """
     folder = Path(folder)
     with ExitStack() as stack, writing(folder):

@@ -47,7 +47,13 @@ def view_name(index: int) -> str:
 
 
 def manifest_of(folder: Path) -> Manifest:
-    """The manifest of a folder. Raises InputError where it is not a manifest."""
+    """The manifest of a folder.
+
+    Raises
+    ------
+    InputError
+        If it is not a manifest.
+    """
     path = folder / MANIFEST
     if not os.path.lexists(path):
         return Manifest()
@@ -75,7 +81,10 @@ def require_ours(folder: Path, names: Iterable[str]) -> None:
 def begin(folder: Path, names: Iterable[str]) -> None:
     """To be called before files of a result are changed: they become ours, and an old result in the folder is marked incomplete.
 
-    Raises InputError as `require_ours`, before anything is changed.
+    Raises
+    ------
+    InputError
+        As `require_ours`, before anything is changed.
     """
     names, manifest = frozenset(names), manifest_of(folder)
     require_ours(folder, names | manifest.files & {METRICS})
@@ -103,9 +112,15 @@ def remove_others(folder: Path, names: Iterable[str]) -> None:
 def complete_result(folder: Path, names: Iterable[str], numbers: dict, default: Callable | None = None) -> dict:
     """Write metrics.json, which marks a whole result of those of these files that exist.
 
-    Returns the numbers as written, with `files`, the digests.
+    Parameters
+    ----------
+    default : Callable or None
+        As of `json.dumps`.
 
-    default   as of `json.dumps`
+    Returns
+    -------
+    dict
+        The numbers as written, with `files`, the digests.
     """
     there = [name for name in sorted(names) if (folder / name).exists()]
     numbers = numbers | dict(files={name: digest(folder / name) for name in there})
@@ -155,9 +170,15 @@ def occupants(folder: Path) -> list[str]:
 def result_folder(path: Path, *, force: bool = False, resume: bool = False) -> Path:
     """The folder of a result, which can be made and written to. Leaves nothing behind.
 
-    force, resume   whether a folder with files in it will do
+    Parameters
+    ----------
+    force, resume : bool
+        Whether a folder with files in it will do.
 
-    Raises InputError rather than spoil what is there.
+    Raises
+    ------
+    InputError
+        Rather than spoil what is there.
     """
     if path.exists() and not path.is_dir():
         raise InputError(f'{path}: is a file, not a folder; choose another folder')

@@ -1,8 +1,8 @@
 """Other ways to compute the projections of a cloud of Gaussians, to compare the splat with.
 
-`per_ray`   the closed form of every Gaussian on every ray, in float32, float64 or with a compensated sum
-`march`     a grid marched with fixed steps
-`Tree`      Mitsuba's own acceleration structure over `ellipsoids`: closest hit, add the closed form, step on by epsilon
+- `per_ray`: the closed form of every Gaussian on every ray, in float32, float64 or with a compensated sum
+- `march`: a grid marched with fixed steps
+- `Tree`: Mitsuba's own acceleration structure over `ellipsoids`: closest hit, add the closed form, step on by epsilon
 """
 
 from __future__ import annotations
@@ -44,10 +44,12 @@ def rays(view: View, distance: float) -> tuple[Any, Any]:
 def per_ray(centre: Any, scale: Any, rotation: Any, density: Any, view: View, precision: str = 'float32') -> Any:
     """Line integrals along whole rays, without a cut-off; arguments as for `cloud.line_integrals`.
 
-    precision   'float32' or 'float64', of everything; or 'compensated': float32, summed as Kahan does, which has no
-                derivatives here
-
     Float [height * width] of that precision.
+
+    Parameters
+    ----------
+    precision : str
+        'float32' or 'float64', of everything; or 'compensated': float32, summed as Kahan does, which has no derivatives here.
     """
     with full_float64() if precision == 'float64' else nullcontext():
         return _per_ray(centre, scale, rotation, density, view, precision)
@@ -105,10 +107,13 @@ def _sum_gaussians(columns, start, direction, count, Float, Vector, compensated)
 def march(data: Any, size: int, half: float, origin: Any, direction: Any, step: float) -> Any:
     """Line integrals of a grid by the midpoint rule with steps of `step` along the rays, in the box [-half, half]^3.
 
-    data                Float [size^3], x fastest: values at the voxel centres, interpolated trilinearly
-    origin, direction   Point3f, Vector3f
-
     Differentiable in `data`.
+
+    Parameters
+    ----------
+    data : Float [size^3]
+        x fastest: values at the voxel centres, interpolated trilinearly.
+    origin, direction : Point3f, Vector3f
     """
     Texture: Any = mi.Texture3f
     texture = Texture(

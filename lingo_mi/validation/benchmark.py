@@ -45,11 +45,18 @@ TREE = 'bvh_forward_ms', 'bvh_backward_ms', 'bvh_image_error', 'bvh_gradient_err
 class Work:
     """What is rendered, and how often.
 
-    gaussians   in a cube of 160 mm
-    size        pixels along a side of the square panel
-    pixels      mean pixels in a Gaussian's box
-    extent      cut-off in standard deviations
-    repeats     turns of the integrator and the hand-written kernel
+    Parameters
+    ----------
+    gaussians : int
+        In a cube of 160 mm.
+    size : int
+        Pixels along a side of the square panel.
+    pixels : float
+        Mean pixels in a Gaussian's box.
+    extent : float
+        Cut-off in standard deviations.
+    repeats : int
+        Turns of the integrator and the hand-written kernel.
     """
 
     gaussians: int = 50_000
@@ -210,8 +217,12 @@ def build_limit(folder: PathLike | str) -> Path | None:
 def run_limit(program: Path, count: int, half: float) -> list[float]:
     """ns per pair, forward and backward, best of the program's five repeats.
 
-    count   of Gaussians
-    half    side of their boxes, halved, in pixels
+    Parameters
+    ----------
+    count : int
+        Of Gaussians.
+    half : float
+        Side of their boxes, halved, in pixels.
     """
     lines = subprocess.run([program, str(count), f'{half:.3f}'], capture_output=True, text=True, check=True).stdout
     return [float(line.split(',')[2].split()[0]) for line in lines.splitlines()]

@@ -32,13 +32,20 @@ def image_and_gradients(
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """One view of a cloud, float64 [v, u]; and derivatives of sum(weights * image) by name, float64 [N, ...].
 
-    gaussians   centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N]
-    rays        the view is its first one
-    shape       of the image, (v, u)
-    weights     [v, u], or None for no derivatives: none in the dictionary
-    order       0 for rays through the pixel centres; n for the mean over the pixels by n x n Gauss-Legendre points
-
     The source must be farther from the Gaussians than their reach.
+
+    Parameters
+    ----------
+    gaussians : Sequence[ndarray]
+        Centre, scale [N, 3]; rotation [N, 4], quaternions (x, y, z, w) of any length; density [N].
+    rays : Rays
+        The view is its first one.
+    shape : tuple[int, int]
+        Of the image, (v, u).
+    weights : ndarray [v, u] or None
+        Or None for no derivatives: none in the dictionary.
+    order : int
+        0 for rays through the pixel centres; n for the mean over the pixels by n x n Gauss-Legendre points.
     """
     gaussians = [np.asarray(x, float) for x in gaussians]
     image = np.zeros(shape)

@@ -83,8 +83,11 @@ def counts() -> dict:
 def predicted(part: str, card: Card, gaussians: int, boxes: float) -> float:
     """Seconds of a part ('image', 'derivatives' or 'step') for other work, from the counts of the foot.
 
-    boxes   pairs of a Gaussian and a pixel of its box (`pairs.count_pairs`): the largest kernels take time in their proportion,
-            the others in that of the Gaussians
+    Parameters
+    ----------
+    boxes : float
+        Pairs of a Gaussian and a pixel of its box (`pairs.count_pairs`): the largest kernels take time in their proportion, the
+        others in that of the Gaussians.
     """
     foot = counts()['foot']
     per_pair, per_gaussian = boxes / foot['boxes'], gaussians / foot['gaussians']
@@ -100,7 +103,10 @@ def predicted(part: str, card: Card, gaussians: int, boxes: float) -> float:
 def beside(what: str, part: str, measured: float, gaussians: int, boxes: float | None = None) -> str:
     """A line with a measured time on this GPU, seconds, and the predicted one; arguments as for `predicted`.
 
-    boxes   None: as many a Gaussian as in the foot
+    Parameters
+    ----------
+    boxes : float or None
+        None: as many a Gaussian as in the foot.
     """
     foot = counts()['foot']
     card = Card.of(gpu())

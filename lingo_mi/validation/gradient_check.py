@@ -3,10 +3,10 @@
 The function is L = sum(weights * image) with fixed random weights, normal about zero. Its derivatives by automatic
 differentiation are compared with
 
-    ellipsoids   central differences of the closed form in float64 NumPy, since those of a float32 image are mostly
-                 rounding; the cut-off is set to 8 standard deviations, because the closed form has none
-    grids        the image of one voxel of density 1 in an empty grid, minus that of the empty grid: integrals are
-                 linear in a grid, so the only error of this large step is rounding
+- `ellipsoids`: central differences of the closed form in float64 NumPy, since those of a float32 image are mostly rounding; the
+  cut-off is set to 8 standard deviations, because the closed form has none
+- `grids`: the image of one voxel of density 1 in an empty grid, minus that of the empty grid: integrals are linear in a grid, so
+  the only error of this large step is rounding
 
 For a scene in transmission, I = exp(-p), both use dL = -sum(weights * I * dp).
 
@@ -41,10 +41,15 @@ TOLERANCE = 1e-4
 class Row:
     """One derivative.
 
-    parameter   its name
-    ad, fd      by automatic differentiation; by differences
-    error       |ad - fd| over the length of the gradient that it is a component of: all of one kind's components of a
-                Gaussian, or all voxels that were drawn
+    Parameters
+    ----------
+    parameter : str
+        Its name.
+    ad, fd : float
+        By automatic differentiation; by differences.
+    error : float
+        |ad - fd| over the length of the gradient that it is a component of: all of one kind's components of a Gaussian, or all
+        voxels that were drawn.
     """
 
     parameter: str
@@ -63,11 +68,18 @@ def load_scene_file(path: PathLike | str) -> Any:
 def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 0) -> list[Row]:
     """Compare derivatives of a scene's image in its first sensor.
 
-    step    of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the
-            number itself for densities)
-    count   Gaussians of every cloud and voxels of every grid to check, drawn with `seed` among those in view
+    Parameters
+    ----------
+    step : float
+        Of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the number itself for
+        densities).
+    count : int
+        Gaussians of every cloud and voxels of every grid to check, drawn with `seed` among those in view.
 
-    Raises InputError where the integrator is not `lingo_xray`, or the scene has neither ellipsoids nor grids in view.
+    Raises
+    ------
+    InputError
+        If the integrator is not `lingo_xray`, or the scene has neither ellipsoids nor grids in view.
     """
     integrator = scene.integrator()
     if not str(integrator).startswith('LingoXray'):

@@ -29,10 +29,17 @@ def table(columns: list[Column], rows: Iterable[Any], first: str | None = None) 
 def insert(text: str, tables: dict[str, str], where: str | Path = 'the document') -> str:
     """The text with what stands in the places of the tables replaced by them.
 
-    tables   Markdown by name
-    where    what the text is, for the error
+    Parameters
+    ----------
+    tables : dict[str, str]
+        Markdown by name.
+    where : str or Path
+        What the text is, for the error.
 
-    Raises InputError where a table has no place.
+    Raises
+    ------
+    InputError
+        If a table has no place.
     """
     for name, table in tables.items():
         pattern = re.compile(f'(<!-- table {name} -->\n).*?(<!-- end {name} -->)', re.DOTALL)
@@ -46,7 +53,13 @@ def insert(text: str, tables: dict[str, str], where: str | Path = 'the document'
 
 
 def insert_into(document: Path, tables: dict[str, str]) -> None:
-    """`insert` the tables into a file. Raises InputError where it cannot be read or written, or a table has no place."""
+    """`insert` the tables into a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or written, or a table has no place.
+    """
     text = insert(_read(document), tables, document)
     with replacing(document) as temporary:
         temporary.write_text(text, encoding='utf-8')

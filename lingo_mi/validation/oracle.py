@@ -119,8 +119,11 @@ def whiten(scale: ArrayLike, rotation: ArrayLike, vectors: np.ndarray) -> np.nda
 def one_integral(gaussian: tuple, start: np.ndarray, direction: np.ndarray, begin: float = -np.inf) -> np.ndarray:
     """Line integrals of one Gaussian along rays, for t from `begin` on, [M].
 
-    gaussian           its centre, scale, rotation and density, as `rows` gives them
-    start, direction   [M, 3]
+    Parameters
+    ----------
+    gaussian : tuple
+        Its centre, scale, rotation and density, as `rows` gives them.
+    start, direction : ndarray [M, 3]
     """
     centre, scale, rotation, density = gaussian
     w, d = whiten(scale, rotation, centre - start), whiten(scale, rotation, direction)

@@ -15,8 +15,12 @@ from lingo_mi.projectors.view import View
 def count_pairs(gaussians: Sequence, view: View, extent: float) -> float:
     """Pairs of a pixel and a Gaussian: pixels in the bounding boxes of all footprints, summed.
 
-    gaussians   centre, scale, rotation and density as Dr.Jit arrays
-    extent      cut-off in standard deviations
+    Parameters
+    ----------
+    gaussians : Sequence
+        Centre, scale, rotation and density as Dr.Jit arrays.
+    extent : float
+        Cut-off in standard deviations.
     """
     f: Any = project(gaussians, view, extent)
     Float64: Any = dr.float64_array_t(mi.Float)

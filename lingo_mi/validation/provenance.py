@@ -25,14 +25,17 @@ def command() -> str:
 def provenance(of: str | None = None) -> dict:
     """How what is measured now is made.
 
-    of   the command line, where it is another process's
+    - `command`: the command line
+    - `commit`: the commit of the checkout that `lingo_mi` runs from, with '+' where its files have changed; None where it is
+      installed
+    - `date`: now, UTC, ISO 8601
+    - `machine`: the processor's name
+    - `versions`: of Python and of the packages that numbers depend on
 
-    command    the command line
-    commit     the commit of the checkout that `lingo_mi` runs from, with '+' where its files have changed; None where it is
-               installed
-    date       now, UTC, ISO 8601
-    machine    the processor's name
-    versions   of Python and of the packages that numbers depend on
+    Parameters
+    ----------
+    of : str or None
+        The command line, where it is another process's.
     """
     return dict(
         command=of or command(),

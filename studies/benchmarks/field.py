@@ -81,7 +81,10 @@ def measured(rays: int, samples: int, repeats: int) -> tuple[tuple[float, float]
 class NumpyField:
     """The field of `fitting.field.network.Network` and a step of its fit, written by hand in NumPy.
 
-    dtype   of all computations: float32 to be measured, float64 to be compared with
+    Parameters
+    ----------
+    dtype : type
+        Of all computations: float32 to be measured, float64 to be compared with.
     """
 
     def __init__(self, options: Field, state: State, dtype: type = np.float32):

@@ -22,7 +22,13 @@ from studies.benchmarks.rtk_bridge import require_every_pixel
 
 
 def model(geometry: Geometry, mbirjax: Any) -> Any:
-    """MBIRJAX's model of a scan. Raises InputError for one that is not on a circle, or whose voxels are no cubes on the axis."""
+    """MBIRJAX's model of a scan.
+
+    Raises
+    ------
+    InputError
+        For one that is not on a circle, or whose voxels are no cubes on the axis.
+    """
     if not isinstance(geometry, CircularGeometry) or geometry.mode != 'cone':
         raise InputError('MBIRJAX is compared with on circles of a cone beam only')
     if len(set(geometry.grid.spacing)) > 1 or any(geometry.grid.centre[:2]):
@@ -47,7 +53,10 @@ def project(volume: np.ndarray, geometry: Geometry, mbirjax: Any) -> np.ndarray:
 def reconstruct(scan: Scan, mbirjax: Any, **settings: Any) -> np.ndarray:
     """Volume [x, y, z] by MBIRJAX's reconstruction with its prior of neighbouring voxels (qGGMRF).
 
-    settings   of its model, such as sharpness=1.0
+    Parameters
+    ----------
+    settings
+        Of its model, such as sharpness=1.0.
     """
     require_every_pixel(scan, 'MBIRJAX')
     made = model(scan.geometry, mbirjax)

@@ -55,8 +55,12 @@ COLUMNS = (
 class Pair:
     """A package's operator and its transpose.
 
-    forward   volume [x, y, z], float32, to projections [view, v, u]
-    adjoint   the other way
+    Parameters
+    ----------
+    forward : callable
+        Volume [x, y, z], float32, to projections [view, v, u].
+    adjoint : callable
+        The other way.
     """
 
     forward: Callable[[np.ndarray], np.ndarray]

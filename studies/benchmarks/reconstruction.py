@@ -42,10 +42,16 @@ Operations = dict[str, Callable[[], np.ndarray]]  # by name: projector, transpos
 def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callable[[str], object] = print) -> dict:
     """Times of all packages, `compare`d, with what they were measured on.
 
-    size      voxels and pixels along a side
-    repeats   rounds; the first one, which compiles, comes on top
-    tilt      of the axis of rotation against the volume's, about x, degrees
-    say       called with a line for each package that is not installed
+    Parameters
+    ----------
+    size : int
+        Voxels and pixels along a side.
+    repeats : int
+        Rounds; the first one, which compiles, comes on top.
+    tilt : float
+        Of the axis of rotation against the volume's, about x, degrees.
+    say : callable
+        Called with a line for each package that is not installed.
     """
     cores = runtime.cores()
     runtime.use_threads(cores)

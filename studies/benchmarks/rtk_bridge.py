@@ -18,9 +18,14 @@ from lingo_mi.scan import Scan
 
 
 def gantry(geometry: Geometry, itk: Any) -> Any:
-    """RTK's geometry object. Raises InputError for a parallel beam.
+    """RTK's geometry object.
 
     A circle is told in RTK's own numbers, so that a comparison also finds an error in this package's rays.
+
+    Raises
+    ------
+    InputError
+        For a parallel beam.
     """
     if geometry.mode != 'cone':
         raise InputError('RTK is compared with on cone beams only')
@@ -70,8 +75,12 @@ def array(image: Any, itk: Any) -> np.ndarray:
 def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
     """Volume [x, y, z] of one of RTK's filters.
 
-    kind       'FDK', 'SART' or 'ConjugateGradient'
-    settings   arguments of the filter's Set... methods, such as NumberOfIterations=1
+    Parameters
+    ----------
+    kind : str
+        'FDK', 'SART' or 'ConjugateGradient'.
+    settings
+        Arguments of the filter's Set... methods, such as NumberOfIterations=1.
     """
     require_every_pixel(scan, 'RTK')
     image = itk.Image[itk.F, 3]
@@ -96,8 +105,12 @@ def reconstruct(kind: str, scan: Scan, itk: Any, **settings: Any) -> np.ndarray:
 def total_variation(scan: Scan, itk: Any, beta: float, alpha: float = 0.1, niter: int = 20) -> np.ndarray:
     """Volume [x, y, z] by RTK's ADMM with total variation: the least of |A x - b|^2 + alpha TV(x).
 
-    beta    weight of the split gradient: the smaller, the faster it converges, until it diverges, from few views sooner
-    niter   outer iterations, with ten conjugate gradients each
+    Parameters
+    ----------
+    beta : float
+        Weight of the split gradient: the smaller, the faster it converges, until it diverges, from few views sooner.
+    niter : int
+        Outer iterations, with ten conjugate gradients each.
     """
     require_every_pixel(scan, 'RTK')
     geometry = scan.geometry

@@ -20,13 +20,22 @@ from lingo_mi.common.errors import InputError
 class Kernel:
     """What the assembler makes of one entry of a module.
 
-    name        of the entry
-    test        a test file that compiled it
-    sm          compute capability times ten that it was assembled for
-    lines       PTX instructions of its module
-    registers   a thread's
-    spilled     bytes of registers that are stored in memory and loaded again
-    error       why it was not assembled; None
+    Parameters
+    ----------
+    name : str
+        Of the entry.
+    test : str
+        A test file that compiled it.
+    sm : int
+        Compute capability times ten that it was assembled for.
+    lines : int
+        PTX instructions of its module.
+    registers : int
+        A thread's.
+    spilled : int
+        Bytes of registers that are stored in memory and loaded again.
+    error : str or None
+        Why it was not assembled; None.
     """
 
     name: str
@@ -49,7 +58,13 @@ class Kernel:
 
 
 def find_ptxas() -> Path:
-    """The assembler: of the package nvidia-cuda-nvcc-cu12, or on PATH. Raises InputError where there is none."""
+    """The assembler: of the package nvidia-cuda-nvcc-cu12, or on PATH.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
     places = [Path(p) / 'nvidia/cuda_nvcc/bin/ptxas' for p in sys.path] + [Path(shutil.which('ptxas') or 'ptxas')]
     for place in places:
         if place.is_file():

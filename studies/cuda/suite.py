@@ -45,9 +45,14 @@ ANY = 'any'  # the case of cells that hold on every device
 class Outcome:
     """What the tests came to.
 
-    passed    how many
-    failed    names, with files that did not end
-    skipped   how many, by reason
+    Parameters
+    ----------
+    passed : int
+        How many.
+    failed : list[str]
+        Names, with files that did not end.
+    skipped : Counter
+        How many, by reason.
     """
 
     passed: int = 0
@@ -80,15 +85,24 @@ def run_tests(
 ) -> tuple[Outcome, list[Kernel]]:
     """Run test files, a process each, and assemble the kernels that they compile.
 
-    stand_in   the program that runs a command with its driver
-    tests      the folder of tests of a checkout
-    names      of files in it; they run from the checkout's root
-    sm         compute capability times ten
-    noise      approximate instructions err by as much as NVIDIA allows, and every address is checked
-    cells      what is done, a file each; a file that it holds is run again only where it had failed, or was of other code
-    report     called with a line for every file
-
     A file whose tests load no kernel runs once for all devices.
+
+    Parameters
+    ----------
+    stand_in : Path
+        The program that runs a command with its driver.
+    tests : Path
+        The folder of tests of a checkout.
+    names : Iterable[str]
+        Of files in it; they run from the checkout's root.
+    sm : int
+        Compute capability times ten.
+    noise : bool
+        Approximate instructions err by as much as NVIDIA allows, and every address is checked.
+    cells : CellFiles
+        What is done, a file each; a file that it holds is run again only where it had failed, or was of other code.
+    report : callable
+        Called with a line for every file.
     """
     run, known, now = f'sm_{sm}_noise' if noise else f'sm_{sm}', set(), _code(tests)
     total, kernels = Outcome(), {}

@@ -31,11 +31,16 @@ FITS = dict(clean='clean scan', ignore='effect ignored', model='effect modelled'
 class Experiment:
     """An effect, how to simulate it and how to fit what it leaves.
 
-    title   in tables and pictures
-    model   options of the fit that models it, besides those of the others
-    scene   parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have
-    turn, shift   standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are
-                  not told
+    Parameters
+    ----------
+    title : str
+        In tables and pictures.
+    model : dict
+        Options of the fit that models it, besides those of the others.
+    scene : dict
+        Parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have.
+    turn, shift : float
+        Standard deviations of every view's motion about and along each axis, degrees and mm, that the fits are not told.
     """
 
     title: str
@@ -66,7 +71,13 @@ EXPERIMENTS = dict(
 
 
 def experiment_of(name: str) -> Experiment:
-    """The experiment of a name. Raises InputError where there is none."""
+    """The experiment of a name.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
     if name not in EXPERIMENTS:
         raise InputError(f'there is no experiment {name!r}: choose one of {", ".join(EXPERIMENTS)}')
     return EXPERIMENTS[name]
@@ -75,12 +86,23 @@ def experiment_of(name: str) -> Experiment:
 def measure(name: str, parameters: dict | None = None, method: Method = METHOD, seed: int = 0) -> dict:
     """The experiment `name`: a scan of its scene and one without the effect, three fits, and their errors.
 
-    parameters   of the scene file (`<default>` names)
+    Parameters
+    ----------
+    parameters : dict or None
+        Of the scene file (`<default>` names).
 
-    Returns title, the largest line integral of the clean scan, and for each of FITS: psnr_3d (the truth's maximum is full
-    scale), psnr_3d_gain (after the factor that fits the truth best, so that a wrong scale alone costs nothing),
-    ms_per_iteration (over the second half of the steps, when all is compiled), seconds (of start and steps), volume; also
-    truth [x, y, z], 1/mm, and spacing, mm. Raises InputError for an unknown name.
+    Returns
+    -------
+    dict
+        Title, the largest line integral of the clean scan, and for each of FITS: psnr_3d (the truth's maximum is full scale),
+        psnr_3d_gain (after the factor that fits the truth best, so that a wrong scale alone costs nothing), ms_per_iteration
+        (over the second half of the steps, when all is compiled), seconds (of start and steps), volume; also truth [x, y, z],
+        1/mm, and spacing, mm.
+
+    Raises
+    ------
+    InputError
+        For an unknown name.
     """
     experiment = experiment_of(name)
     scenes, found = {}, {}

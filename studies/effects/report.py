@@ -20,11 +20,15 @@ def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | 
     """Write effects.json and effects.md into `folder`, a picture of every experiment into `figures`, and the table into a
     document.
 
-    found      what `experiments.measure` gave, by the experiments' names; effects.json keeps what it holds of others, each with
-               its own `provenance`
-    document   a Markdown file with a place for the table `worth`; None: no document
-
     `provenance` is written beside effects.md and beside the document. Returns what effects.json holds.
+
+    Parameters
+    ----------
+    found : dict[str, dict]
+        What `experiments.measure` gave, by the experiments' names; effects.json keeps what it holds of others, each with its own
+        `provenance`.
+    document : Path or None
+        A Markdown file with a place for the table `worth`; None: no document.
     """
     for path in (folder, figures):
         path.mkdir(parents=True, exist_ok=True)

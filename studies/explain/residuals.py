@@ -57,8 +57,12 @@ WITH_CLOUD = {
 class Explained:
     """A row: rms difference of held-out views, and their picture.
 
-    rms      of line integrals as measured
-    view     a held-out view's difference, float32 [v, u]
+    Parameters
+    ----------
+    rms : float
+        Of line integrals as measured.
+    view : ndarray
+        A held-out view's difference, float32 [v, u].
     """
 
     name: str

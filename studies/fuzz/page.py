@@ -11,9 +11,14 @@ from studies.fuzz.pool import Tally
 def page(tallies: dict[str, Tally], seed: int, wall: float, seconds: float, memory: int) -> str:
     """The Markdown text.
 
-    wall      seconds that all cases took
-    seconds   that a case may take
-    memory    bytes that a child may take
+    Parameters
+    ----------
+    wall : float
+        Seconds that all cases took.
+    seconds : float
+        That a case may take.
+    memory : int
+        Bytes that a child may take.
     """
     total = sum(tally.cases for tally in tallies.values())
     failed = sum(len(tally.failures) for tally in tallies.values())

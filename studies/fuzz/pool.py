@@ -101,9 +101,14 @@ def run(
 ) -> dict[str, Tally]:
     """Tallies by reader of `cases` cases each.
 
-    seconds   that a case may take
-    memory    bytes of address space that a child may take for its cases
-    report    is told how many cases are done
+    Parameters
+    ----------
+    seconds : float
+        That a case may take.
+    memory : int
+        Bytes of address space that a child may take for its cases.
+    report : callable
+        Is told how many cases are done.
     """
     tallies = {name: Tally() for name in names}
     work: queue.SimpleQueue = queue.SimpleQueue()

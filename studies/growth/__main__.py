@@ -34,7 +34,13 @@ def arguments() -> argparse.Namespace:
 
 
 def read(path: Path) -> list[dict]:
-    """Measurements of this commit on this machine that an earlier run has stored. Raises InputError for another file."""
+    """Measurements of this commit on this machine that an earlier run has stored.
+
+    Raises
+    ------
+    InputError
+        For another file.
+    """
     if not path.exists():
         return []
     with reading(path):

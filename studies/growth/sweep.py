@@ -43,10 +43,17 @@ def planned(stage: str, large: bool) -> list[tuple[str, int]]:
 def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict], list[dict]], object]) -> list[dict]:
     """Measurements: stage, axis, number, seconds of CPU time, peak in bytes.
 
-    stored       measurements of before; a stage that is whole there is not measured again
-    after_each   called after every stage with all measurements so far, and those stored that they do not replace
+    Parameters
+    ----------
+    stored : list[dict]
+        Measurements of before; a stage that is whole there is not measured again.
+    after_each : callable
+        Called after every stage with all measurements so far, and those stored that they do not replace.
 
-    Raises InputError where a stage fails.
+    Raises
+    ------
+    InputError
+        If a stage fails.
     """
     found: list[dict] = []
     for stage in DEPENDS:

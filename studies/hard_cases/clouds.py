@@ -31,9 +31,14 @@ def scanner(
 ) -> tuple[Rays, tuple]:
     """Rays of one view of a scanner around [-1, 1]^3, and the panel's shape (v, u).
 
-    angle     in degrees
-    size      of the panel, (v, u)
-    changes   to the `Geometry`
+    Parameters
+    ----------
+    angle : float
+        In degrees.
+    size : tuple[float, float]
+        Of the panel, (v, u).
+    changes
+        To the `Geometry`.
     """
     pixel = [s / n for s, n in zip(size, shape)]
     settings = dict(DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, grid=Grid(8, 0.25), angles=np.radians([angle]))

@@ -17,12 +17,19 @@ IMAGE, GRADIENT = 1e-6, 1e-5  # what a case may show unless it says otherwise
 class ViewCase:
     """A cloud in one view.
 
-    image, gradient   largest errors allowed
-    copies            how often the cloud is there, at the same place
-    warned            whether an AccuracyWarning must come with it
-    analytic          whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64
-                      are too coarse; only for Gaussians far from the ends of the rays
-    note              what limits the accuracy, where it is less than usual
+    Parameters
+    ----------
+    image, gradient : float
+        Largest errors allowed.
+    copies : int
+        How often the cloud is there, at the same place.
+    warned : bool
+        Whether an AccuracyWarning must come with it.
+    analytic : bool
+        Whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64 are too coarse;
+        only for Gaussians far from the ends of the rays.
+    note : str
+        What limits the accuracy, where it is less than usual.
     """
 
     name: str
@@ -56,7 +63,10 @@ class VoxelCase:
 class ScanCase:
     """Something done with a scan or a scene: `act()` must be refused with words of `refused`, or end well.
 
-    warned   whether an AccuracyWarning must come with it
+    Parameters
+    ----------
+    warned : bool
+        Whether an AccuracyWarning must come with it.
     """
 
     name: str

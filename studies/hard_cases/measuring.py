@@ -4,10 +4,10 @@ Errors are relative. The image's error is its root mean square deviation over it
 image with normal weights. The errors of derivatives are taken Gaussian by Gaussian, and the largest counts. Each derivative is
 first converted to the loss's unit, by a factor:
 
-    scale        the scale, so that a needle's length counts as much as its width
-    centre       the smallest standard deviation, a natural distance to move
-    quaternion   its length times the smallest over the largest standard deviation, a natural angle to turn
-    density      the density
+- `scale`: the scale, so that a needle's length counts as much as its width
+- `centre`: the smallest standard deviation, a natural distance to move
+- `quaternion`: its length times the smallest over the largest standard deviation, a natural angle to turn
+- `density`: the density
 
 The error of each kind is divided by the norm of all of the Gaussian's derivatives, since one kind alone may cancel by chance. If
 these derivatives, or a whole image, are below FLOOR times the integral through a Gaussian's thinnest part (for example, if only
@@ -52,11 +52,18 @@ APPROXIMATE = 0.6
 class Result:
     """What became of a case.
 
-    image       relative error of the image or of the densities; None where nothing is compared
-    gradients   relative errors of the derivatives by name
-    refused     the message that refused it
-    warned      the first warning
-    failed      what was wrong with what came out, where that is no matter of errors
+    Parameters
+    ----------
+    image : float or None
+        Relative error of the image or of the densities; None where nothing is compared.
+    gradients : dict[str, float]
+        Relative errors of the derivatives by name.
+    refused : str
+        The message that refused it.
+    warned : str
+        The first warning.
+    failed : str
+        What was wrong with what came out, where that is no matter of errors.
     """
 
     image: float | None = None
@@ -95,9 +102,13 @@ def image_and_gradients(
     """The device's image of a cloud in the first view of `rays`, float64 [pixels], and derivatives of sum(weights * image) by
     name.
 
-    shape     of the image, (v, u)
-    weights   [pixels]
-    extent    cut-off in standard deviations
+    Parameters
+    ----------
+    shape : tuple[int, int]
+        Of the image, (v, u).
+    weights : ndarray [pixels]
+    extent : float
+        Cut-off in standard deviations.
     """
     view, gaussians = View.of(rays, 0, shape[0], shape[1]), on_device(cloud)
     dr.enable_grad(gaussians)
@@ -133,9 +144,12 @@ def errors(
 ) -> Result:
     """Errors of an image and of derivatives, as the module's docstring counts them.
 
-    expected, expected_gradients   the same in float64
-    thickness                      [N], the largest integral through each Gaussian if its density were 1; None: along its
-                                   shortest axis
+    Parameters
+    ----------
+    expected, expected_gradients
+        The same in float64.
+    thickness
+        [N], the largest integral through each Gaussian if its density were 1; None: along its shortest axis.
     """
     thickness = np.sqrt(2 * np.pi) * cloud.scale.min(1) if thickness is None else thickness
     floor = FLOOR * np.abs(cloud.density) * thickness + TINY
@@ -222,7 +236,10 @@ def _measure_scan(case):
 def miss(case: ViewCase | VoxelCase | ScanCase, result: Result, variant: str) -> str:
     """What a case shows that it may not, in words; '' where it is within its tolerances, refused or warned of as it should be.
 
-    variant   Mitsuba's, that it was measured with
+    Parameters
+    ----------
+    variant : str
+        Mitsuba's, that it was measured with.
     """
     refused = case.refused if isinstance(case, ScanCase) else ''
     if result.failed:

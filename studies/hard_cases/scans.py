@@ -49,9 +49,15 @@ class Coincident(Start):
 def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fit:
     """A fit that densifies often.
 
-    changes   to its options
+    Parameters
+    ----------
+    changes
+        To its options.
 
-    Raises FloatingPointError unless it ends finite and within its bounds.
+    Raises
+    ------
+    FloatingPointError
+        Unless it ends finite and within its bounds.
     """
     method = replace(Fast(), start=Coincident()).changed(
         **{

@@ -25,9 +25,14 @@ Gaussian, after all are converted to one unit (`studies.hard_cases.measuring` sa
 class Stored:
     """The results of an earlier run.
 
-    variant   Mitsuba's, that they were measured with
-    results   by the case's name
-    notes     of the cases, by name
+    Parameters
+    ----------
+    variant : str
+        Mitsuba's, that they were measured with.
+    results : dict[str, Result]
+        By the case's name.
+    notes : dict[str, str]
+        Of the cases, by name.
     """
 
     variant: str
@@ -55,7 +60,13 @@ def store(path: Path, variant: str, results: Sequence[tuple]) -> None:
 
 
 def stored(path: Path) -> Stored:
-    """What `store` wrote. Raises InputError where the file cannot be read or holds something else."""
+    """What `store` wrote.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or holds something else.
+    """
     with reading(path):
         text = Path(path).read_text(encoding='utf-8')
     try:
@@ -73,9 +84,13 @@ def stored(path: Path) -> Stored:
 def markdown(results: Sequence[tuple], beside: Stored | None = None) -> str:
     """The page.
 
-    results   pairs of a case and what `measure` found
-    beside    another variant's results, to be shown in columns of their own: the image and the worst derivative. What else is
-              different there is a remark: a miss, a shorter fit, a case that was not measured
+    Parameters
+    ----------
+    results : Sequence[tuple]
+        Pairs of a case and what `measure` found.
+    beside : Stored or None
+        Another variant's results, to be shown in columns of their own: the image and the worst derivative. What else is different
+        there is a remark: a miss, a shorter fit, a case that was not measured.
     """
     titles = ['case', 'image', 'at most', *PARAMETERS, 'at most', 'remark']
     if beside:

@@ -42,10 +42,16 @@ WEIGHTED = 'noise'
 class Case:
     """A scan.
 
-    object    one of `lingo_mi.validation.tables.objects`, scanned over a full turn
-    photons   a pixel in the open beam
-    finer     how many times as many voxels are scanned along each side
-    views     fitted
+    Parameters
+    ----------
+    object : str
+        One of `lingo_mi.validation.tables.objects`, scanned over a full turn.
+    photons : float
+        A pixel in the open beam.
+    finer : int
+        How many times as many voxels are scanned along each side.
+    views : int
+        Fitted.
     """
 
     object: str
@@ -57,7 +63,10 @@ class Case:
 class Study:
     """The cells of one size below a folder: volumes of `size` voxels along the longest side, panels of `pixels` a side.
 
-    iterations   steps of a fit, at most
+    Parameters
+    ----------
+    iterations : int
+        Steps of a fit, at most.
     """
 
     def __init__(self, folder: Path, size: int = 64, pixels: int = 64, iterations: int = Fast.iterations):

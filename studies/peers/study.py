@@ -89,9 +89,14 @@ def _mbirjax() -> Any:
 class Method:
     """A way to reconstruct a scan.
 
-    label     in the table
-    volume    the volume [x, y, z] of a scan, or of a scan and a value of the setting
-    setting   chosen by held-out views among `values`, where no value is good for every scan
+    Parameters
+    ----------
+    label : str
+        In the table.
+    volume : callable
+        The volume [x, y, z] of a scan, or of a scan and a value of the setting.
+    setting : str
+        Chosen by held-out views among `values`, where no value is good for every scan.
     """
 
     label: str
@@ -133,7 +138,10 @@ NEEDS = {
 def method_of(name: str) -> Method:
     """The method of a name; `mbirjax:1` has that value of its setting.
 
-    Raises InputError for an unknown one.
+    Raises
+    ------
+    InputError
+        For an unknown one.
     """
     kind, _, value = name.partition(':')
     method = METHODS.get(kind)
@@ -149,7 +157,13 @@ def method_of(name: str) -> Method:
 
 
 def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
-    """The methods that can run here; `say` is called with a line for each that cannot. Raises InputError where none can."""
+    """The methods that can run here; `say` is called with a line for each that cannot.
+
+    Raises
+    ------
+    InputError
+        If none can.
+    """
     found = []
     for name in names:
         load, what = NEEDS.get(name.partition(':')[0], (None, ''))
@@ -167,10 +181,13 @@ def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
 class Study:
     """The cells of one scan below a folder.
 
-    dataset   all measured views to choose from, and the true volume, if known
-
     `compute_missing` raises InputError where the folder has the cells of another scan, and where there is nothing to compare
     with. A method that refuses the scan is left out, with a line that says why.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        All measured views to choose from, and the true volume, if known.
     """
 
     def __init__(self, dataset: Dataset, folder: Path):

@@ -50,10 +50,16 @@ LONGEST = 200  # characters of a folder's name before it is cut; file systems al
 class Comparison:
     """What the fits of a comparison have in common.
 
-    folder       of their folders
-    views        fitted
-    iterations   of all methods but `fast`, which keeps its own number, and those that name it themselves
-    changes      'name=value', options of every fit or parameters of its scene
+    Parameters
+    ----------
+    folder : Path
+        Of their folders.
+    views : int
+        Fitted.
+    iterations : int
+        Of all methods but `fast`, which keeps its own number, and those that name it themselves.
+    changes : tuple[str, ...]
+        'name=value', options of every fit or parameters of its scene.
     """
 
     folder: Path
@@ -64,10 +70,17 @@ class Comparison:
     def results(self, scenes: Iterable, methods: Iterable[str]) -> Results:
         """The metrics of all fits; those that are missing are run first.
 
-        scenes    files of scenes, or names of shipped ones
-        methods   names of METHODS, or `name:option=value,...`
+        Parameters
+        ----------
+        scenes : Iterable
+            Files of scenes, or names of shipped ones.
+        methods : Iterable[str]
+            Names of METHODS, or `name:option=value,...`.
 
-        Raises InputError for an unknown method, before any fit, and where a fit fails.
+        Raises
+        ------
+        InputError
+            For an unknown method, before any fit, and where a fit fails.
         """
         methods = list(methods)
         for method in methods:

@@ -57,10 +57,16 @@ BEST_CLOUD = 'best_cloud'  # `Best(cloud=True)`
 class Case:
     """A scan.
 
-    object    one of `lingo_mi.validation.tables.objects`, scanned over a full turn; or one of MEASURED
-    finer     how many times as many voxels are scanned along each side
-    views     reconstructed from
-    photons   a pixel in the open beam; 0: no noise
+    Parameters
+    ----------
+    object : str
+        One of `lingo_mi.validation.tables.objects`, scanned over a full turn; or one of MEASURED.
+    finer : int
+        How many times as many voxels are scanned along each side.
+    views : int
+        Reconstructed from.
+    photons : float
+        A pixel in the open beam; 0: no noise.
     """
 
     object: str

@@ -25,8 +25,12 @@ class Place:
 class ResponsePart(ABC):
     """A model that takes a view's line integrals p to what is measured, with K numbers c that may change from view to view.
 
-    varies   'view': numbers of every view for itself; 'smooth': polynomials in time; 'one': the same in all views
-    values   [T, K]: one row for each view, for each polynomial, or one in all
+    Parameters
+    ----------
+    varies : str
+        'view': numbers of every view for itself; 'smooth': polynomials in time; 'one': the same in all views.
+    values : ndarray [T, K]
+        One row for each view, for each polynomial, or one in all.
     """
 
     name: ClassVar[str]

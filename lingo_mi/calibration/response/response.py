@@ -24,12 +24,18 @@ ROBUST = 3.0  # median deviations beyond which a pixel counts less (Huber)
 class Response:
     """What the detector of a scan makes of line integrals, by parts: the first acts first.
 
-    geometry   of the scan, whose views define the time (`calibration.drift.times`)
-    parts      with their numbers
+    Parameters
+    ----------
+    geometry : Geometry
+        Of the scan, whose views define the time (`calibration.drift.times`).
+    parts : list[ResponsePart]
+        With their numbers.
 
-        response = Response.of(scan.geometry, air='view', curve=2, highest=1.2)
-        response.fit(expected, scan.projections)
-        line_integrals = response.undone(scan.projections, scan.geometry)
+    Examples
+    --------
+    >>> response = Response.of(scan.geometry, air='view', curve=2, highest=1.2)
+    >>> response.fit(expected, scan.projections)
+    >>> line_integrals = response.undone(scan.projections, scan.geometry)
     """
 
     geometry: Geometry
@@ -48,10 +54,16 @@ class Response:
     ) -> Response | None:
         """Nothing found yet. None without any part.
 
-        air, gain   'off', 'smooth' or 'view'
-        curve       number of coefficients, the same in all views
-        scatter     'off', or 'one' for the same image in all views
-        highest     the highest line integral, for the curve
+        Parameters
+        ----------
+        air, gain : str
+            'off', 'smooth' or 'view'.
+        curve : int
+            Number of coefficients, the same in all views.
+        scatter : str
+            'off', or 'one' for the same image in all views.
+        highest : float
+            The highest line integral, for the curve.
         """
         parts: list[ResponsePart] = [
             *([Gain(gain)] if gain != 'off' else []),
@@ -76,8 +88,12 @@ class Response:
     def fit(self, expected: np.ndarray, measured: np.ndarray, valid: np.ndarray | None = None) -> None:
         """Find all numbers by least squares with Huber's weights: what they make of the expected line integrals is measured.
 
-        expected, measured   [view, v, u] of the scan
-        valid                bool, likewise; None: all
+        Parameters
+        ----------
+        expected, measured : ndarray
+            [view, v, u] of the scan.
+        valid : ndarray or None
+            Bool, likewise; None: all.
         """
         every = max(1, int(np.ceil(np.sqrt(measured.size / SAMPLES))))
         rows, columns = (

@@ -36,9 +36,14 @@ _NAMES = ('source', 'corner', 'u', 'v')
 class Poses:
     """Corrections of n views, in the normalised frame.
 
-    turn    [n, 3] rotation vectors, radians
-    shift   [n, 3], in units of half the volume's longest side
-    first, second, steps   Adam's moments [n, 6] and number of steps [n] of every view
+    Attributes
+    ----------
+    turn
+        [n, 3] rotation vectors, radians.
+    shift
+        [n, 3], in units of half the volume's longest side.
+    first, second, steps
+        Adam's moments [n, 6] and number of steps [n] of every view.
     """
 
     def __init__(self, n: int, flat: bool = False, smooth: bool = False):
@@ -95,8 +100,12 @@ class Poses:
     def step(self, view: int, rays: Rays, gradient: np.ndarray, rate: float, adam: Rates) -> None:
         """Move a view by one Adam step, then subtract the mean motion of all views.
 
-        rays       the view with the corrections so far, [1]
-        gradient   derivatives of the loss by its source, corner, u and v, [4, 3]
+        Parameters
+        ----------
+        rays : Rays
+            The view with the corrections so far, [1].
+        gradient : ndarray
+            Derivatives of the loss by its source, corner, u and v, [4, 3].
         """
         g = rays.by_motion(gradient[None])[0] * self.free
         b1, b2 = adam.beta1, adam.beta2
@@ -133,8 +142,12 @@ def gathered(view: View) -> np.ndarray:
 class PoseCorrection(Correction):
     """Moves every view by one Adam step after its image was compared.
 
-    poses   the corrections so far
-    rates   (first, last): radians, and units of half the volume's longest side
+    Parameters
+    ----------
+    poses : Poses
+        The corrections so far.
+    rates : tuple[float, float]
+        (first, last): radians, and units of half the volume's longest side.
     """
 
     moves_views = True

@@ -25,7 +25,10 @@ POINTS = 2**18  # of the field that are evaluated at once
 class FieldModel(Model):
     """Renders and samples a neural field. No density exceeds `unit` (see `densities.largest_density`).
 
-    options   of the field
+    Parameters
+    ----------
+    options : Field
+        Of the field.
     """
 
     def __init__(self, options: Field, geometry: Geometry, unit: float):
@@ -54,7 +57,10 @@ class FieldModel(Model):
     ) -> np.ndarray:
         """Projections in the views of a geometry, float32 [view, v, u], density times mm: the midpoint rule on every ray.
 
-        progress   called as progress(views done, all views)
+        Parameters
+        ----------
+        progress : callable or None
+            Called as progress(views done, all views).
         """
         g, (height, width) = self.geometry, geometry.nDetector
         every = geometry.on(g.grid)

@@ -25,8 +25,8 @@ FEATURE_RANGE = 1e-4  # features begin uniform within it (Müller et al., sectio
 class Network:
     """Density as a function of the position, with its parameters given at every call.
 
-    features    of the hash grid, Float: `field_features` numbers an entry, level by level
-    network     matrices and biases of the layers, Float: matrix, row by row, then bias, layer by layer
+    - `features`: of the hash grid, Float: `field_features` numbers an entry, level by level
+    - `network`: matrices and biases of the layers, Float: matrix, row by row, then bias, layer by layer
 
     The matrices multiply a tensor of all points (`drjit.nn.Linear` on tensors). Cooperative vectors would do the same within
     one kernel, but their derivatives by the matrices take four times as long on the CPU.
@@ -72,7 +72,10 @@ class Network:
     def density(self, values: dict[str, Any], points: Sequence[Any]) -> Any:
         """The field at points, Float [N], in (0, 1). Differentiable by the parameters, which `values` has by name.
 
-        points   x, y, z, Float [N] each, in [0, 1]
+        Parameters
+        ----------
+        points : Sequence[Any]
+            X, y, z, Float [N] each, in [0, 1].
         """
         self.encoding.data = values['features']
         encoded: Any = dr.ravel(self.encoding(points), order='C')

@@ -18,8 +18,12 @@ from lingo_mi.projectors.grid import pixel_walk
 class FieldBox:
     """The cube that a field is encoded in, about the centre of a scan's volume; its box is the volume itself.
 
-    geometry   of the scan
-    side       of the cube, in units of the volume's longest side
+    Parameters
+    ----------
+    geometry : Geometry
+        Of the scan.
+    side : float
+        Of the cube, in units of the volume's longest side.
     """
 
     geometry: Geometry
@@ -39,14 +43,21 @@ def integrals(
 ) -> Any:
     """Line integrals of a field along rays of one view, Float [rays], in units of the field's density times mm.
 
-    density   of points in the cube: three Float [N] in [0, 1]
-    row       of the view: one of `projectors.grid.view_table`, evaluated Float [19]
-    x, y      pixel positions of the rays, Float [rays], centres at i + 1/2
-    samples   on a ray, one in each of as many equal parts of its way through the volume
-    within    where in its part a sample is, from 0 to 1: Float [rays * samples], ray by ray, or a number
-
     With random positions the result is right on average (stratified sampling), with 1/2 it is the midpoint rule. A ray that
     misses the volume has the integral 0.
+
+    Parameters
+    ----------
+    density : callable
+        Of points in the cube: three Float [N] in [0, 1].
+    row
+        Of the view: one of `projectors.grid.view_table`, evaluated Float [19].
+    x, y
+        Pixel positions of the rays, Float [rays], centres at i + 1/2.
+    samples : int
+        On a ray, one in each of as many equal parts of its way through the volume.
+    within
+        Where in its part a sample is, from 0 to 1: Float [rays * samples], ray by ray, or a number.
     """
     walk, length = pixel_walk(cube.geometry, row, x, y)
     begin, step = walk.t_first, dr.maximum(walk.t_last - walk.t_first, 0) / samples

@@ -31,7 +31,10 @@ class AlphaCompositing(ForwardModel):
     Raw parameters besides the shape: 'opacity', 'radiance' and 'harmonics', the coefficients of the radiance's spherical
     harmonics from degree 1 on, degree by degree.
 
-    sh_degree, sh_every   as of `GaussianSplatting`
+    Parameters
+    ----------
+    sh_degree, sh_every : int
+        As of `GaussianSplatting`.
     """
 
     sh_degree: int

@@ -19,7 +19,10 @@ from lingo_mi.projectors.view import View
 class CloudModel(Model):
     """Renders Gaussians by a forward model: line integrals, or grey images composited from opacities.
 
-    signal   `ExpectedSignal` of the effects that the fit models; None without effects
+    Attributes
+    ----------
+    signal : ExpectedSignal or None
+        `ExpectedSignal` of the effects that the fit models; None without effects.
     """
 
     signal: ExpectedSignal | None = None
@@ -53,8 +56,12 @@ class CloudModel(Model):
     ) -> np.ndarray:
         """The images of all views, float32 [view, v, u], density times mm.
 
-        image   called with a function that renders along the rays of a view, the view, and its number
-        share   of the second material in every Gaussian, or None
+        Parameters
+        ----------
+        image : callable
+            Called with a function that renders along the rays of a view, the view, and its number.
+        share
+            Of the second material in every Gaussian, or None.
         """
         g, (height, width) = self.geometry, geometry.nDetector
         # In the frame of the fit's own volume, whatever the voxels of this geometry.

@@ -30,8 +30,12 @@ AT_ONCE = 2**25
 class DensityModel(CloudModel):
     """Renders and voxelizes Gaussians with densities.
 
-    signal   `ExpectedSignal` of the effects; None without effects
-    extent   cut-off in standard deviations
+    Attributes
+    ----------
+    signal
+        `ExpectedSignal` of the effects; None without effects.
+    extent
+        Cut-off in standard deviations.
     """
 
     def __init__(

@@ -23,10 +23,14 @@ SHAPE = {'centre': 3, 'scale': 3, 'rotation': 4}  # raw parameters of the shape,
 class ForwardModel(ABC):
     """Gaussians with raw parameters, and their image.
 
-    bounds       of the standard deviations
-    replayable   whether a view's loss and derivatives can be replayed (`projectors.replay`)
-
     Values on the host are NumPy arrays [N, size] by parameter, on the device Dr.Jit arrays of N.
+
+    Attributes
+    ----------
+    bounds : ScaleBounds
+        Of the standard deviations.
+    replayable
+        Whether a view's loss and derivatives can be replayed (`projectors.replay`).
     """
 
     bounds: ScaleBounds
@@ -44,7 +48,10 @@ class ForwardModel(ABC):
     def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
         """The model's own raw parameters at the start of a fit with n Gaussians, float [n, size].
 
-        density   at the centres, in the fit's unit, [n]; None if the initial cloud has no densities
+        Parameters
+        ----------
+        density : ndarray or None
+            At the centres, in the fit's unit, [n]; None if the initial cloud has no densities.
         """
 
     @abstractmethod
@@ -62,9 +69,13 @@ class ForwardModel(ABC):
     def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
         """Which Gaussians may stay, bool [N].
 
-        centre, scale   [N, 3]
-        half            half the volume's sides, [3]
-        largest         upper bound of the standard deviations, if the model has one
+        Parameters
+        ----------
+        centre, scale : ndarray [N, 3]
+        half : ndarray
+            Half the volume's sides, [3].
+        largest : float
+            Upper bound of the standard deviations, if the model has one.
         """
 
     # ---- on the device ----
@@ -78,14 +89,20 @@ class ForwardModel(ABC):
     def footprints(self, gaussians: tuple, rays: View, cut: Cuts | None = None) -> Footprints | Discs:
         """Footprints of a cloud on a view's panel. The last two `values` are x and y in pixels. Differentiable.
 
-        cut   to backpropagate in parts, by its `pass_on`, where the model can
+        Parameters
+        ----------
+        cut : Cuts or None
+            To backpropagate in parts, by its `pass_on`, where the model can.
         """
 
     @abstractmethod
     def integrals(self, footprints: Any, rays: View, share: Any = None) -> list:
         """Line integrals along the rays of a view: a list of Float [height * width], one for each material. Differentiable.
 
-        share   of the second of two materials in every Gaussian, Float [N]; None: one material
+        Parameters
+        ----------
+        share
+            Of the second of two materials in every Gaussian, Float [N]; None: one material.
         """
 
     def hold_back(self, gradients: dict, iteration: int) -> None:  # noqa: B027 - most models hold nothing back

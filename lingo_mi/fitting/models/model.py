@@ -44,7 +44,10 @@ class Model(ABC):
     ) -> np.ndarray:
         """Noise-free projections in the views of a geometry, float32 [view, v, u], as the scan's detector would see them.
 
-        progress   called as progress(views done, all views)
+        Parameters
+        ----------
+        progress : callable or None
+            Called as progress(views done, all views).
         """
 
     def line_integrals(self, state: DeviceState, geometry: Geometry) -> np.ndarray:

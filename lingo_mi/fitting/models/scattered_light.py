@@ -16,7 +16,10 @@ class ScatteredLight:
 
     A view always has the same random numbers, so estimates differ only if the cloud does.
 
-    scatter   parameters; nothing scatters outside the volume, so that a single large Gaussian does not enlarge the box
+    Parameters
+    ----------
+    scatter : Scatter
+        Parameters; nothing scatters outside the volume, so that a single large Gaussian does not enlarge the box.
     """
 
     def __init__(self, scatter: Scatter, tube: Tube, response: str, geometry: Geometry):
@@ -27,7 +30,10 @@ class ScatteredLight:
     def estimate(self, cloud: Ellipsoids, geometry: Geometry) -> np.ndarray:
         """Mean scattered light and its standard error on the coarse grid of every view, float64 [2, n, rows, columns].
 
-        cloud, geometry   in mm
+        Parameters
+        ----------
+        cloud, geometry
+            In mm.
         """
         rays = geometry.rays()
         return np.stack(

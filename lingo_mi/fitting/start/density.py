@@ -22,7 +22,10 @@ def sampled_density(volume: np.ndarray, points: np.ndarray, half: ArrayLike) -> 
 def fitted_factor(scan: Scan, render: Render, points: np.ndarray, density: np.ndarray, spacing: np.ndarray) -> float:
     """The factor on the densities of a cloud that fits `VIEWS` evenly spaced views best, see `least_squares_factor`.
 
-    points, density, spacing   of the cloud, [N, 3], [N] and [N]
+    Parameters
+    ----------
+    points, density, spacing : ndarray
+        Of the cloud, [N, 3], [N] and [N].
     """
     n = len(scan.geometry)
     views = np.unique(np.arange(min(n, VIEWS)) * n // min(n, VIEWS))

@@ -25,7 +25,10 @@ __all__ = ['FULL', 'QUICK', 'Sizes', 'measure', 'measure_presets']
 def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> dict:
     """All measurements, as numbers and strings for JSON.
 
-    progress   called as progress(what) before each part
+    Parameters
+    ----------
+    progress : callable or None
+        Called as progress(what) before each part.
     """
     work, few = (Workload(n, sizes.pixels, sizes.box) for n in (sizes.gaussians, sizes.few))
     parts = dict(

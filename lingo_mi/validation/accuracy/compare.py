@@ -30,8 +30,12 @@ SHORT = 0.1  # seconds; shorter calls depend on what the caches hold
 class Method:
     """One way to compute a workload's image.
 
-    image       () -> Float [pixels], evaluated
-    gradients   () -> the four derivatives, Dr.Jit arrays or tuples of them, evaluated, forward pass included; or None
+    Parameters
+    ----------
+    image : Callable
+        () -> Float [pixels], evaluated.
+    gradients : Callable or None
+        () -> the four derivatives, Dr.Jit arrays or tuples of them, evaluated, forward pass included; or None.
     """
 
     name: str
@@ -62,7 +66,10 @@ def by_function(name: str, work: Workload, function: Callable, differentiable: b
 def by_integrator(name: str, work: Workload, sharing: Sharing = SHARING, **settings: Any) -> Method:
     """A method from `lingo_xray` with these parameters, through `mi.render` and `dr.backward`.
 
-    sharing   how its work is shared out
+    Parameters
+    ----------
+    sharing : Sharing
+        How its work is shared out.
     """
     integrator = mi.load_dict(dict(type='lingo_xray', **settings))
     integrator.options = replace(integrator.options, sharing=sharing)

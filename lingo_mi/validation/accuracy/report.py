@@ -17,10 +17,14 @@ def write(found: dict, folder: Path, figures: Path, document: Path | None = None
 
     Of presets alone there is one table and no plot.
 
-    document   a Markdown file with a place for each table that it shows; None: no document
-    beside     another variant's presets, `tables.read_presets`
-
     `provenance` is written beside accuracy.md and beside the document.
+
+    Parameters
+    ----------
+    document : Path or None
+        A Markdown file with a place for each table that it shows; None: no document.
+    beside : dict or None
+        Another variant's presets, `tables.read_presets`.
     """
     tables = make_tables(found, beside)
     folder.mkdir(parents=True, exist_ok=True)

@@ -15,11 +15,11 @@ SMALL = 60.0  # pixels in a box
 def sweeps(sizes: Sizes) -> dict:
     """Time a pair and memory of forward and backward at 3 standard deviations:
 
-    pairs       more and more Gaussians of the same size
-    small       the same with boxes of 60 pixels on 256 x 256
-    gaussians   more and more, but smaller, ones: the same pairs
-    pixels      the same cloud on finer and finer panels
-    giant       a cloud without and with one Gaussian as large as all of it
+    - `pairs`: more and more Gaussians of the same size
+    - `small`: the same with boxes of 60 pixels on 256 x 256
+    - `gaussians`: more and more, but smaller, ones: the same pairs
+    - `pixels`: the same cloud on finer and finer panels
+    - `giant`: a cloud without and with one Gaussian as large as all of it
     """
     total = sizes.gaussians * sizes.box
     clouds = dict(

@@ -9,18 +9,32 @@ from dataclasses import dataclass
 class Sizes:
     """How much is measured.
 
-    gaussians, pixels, box   the cloud, the side of its square panel, mean pixels in a box of 3 standard deviations
-    few                      Gaussians of the same kind where slow methods take part
-    grids                    voxels along a side of the grids
-    rounds, seconds          repeats of a method, fewer once it has taken so long altogether
-    pairs, counts, panels    the sweeps: pairs of a pixel and a Gaussian, Gaussians, pixels along a side
-    crowd                    Gaussians among which one as large as the scene is put
-    phantoms                 voxels and pixels along a side of the fits' phantom
-    points                   Gaussians a fit starts with
-    iterations               of a fit
-    views                    of a fit, and as many held out
-    samples                  on a ray of a neural field
-    field_pixels             along a side of its panel
+    Parameters
+    ----------
+    gaussians, pixels, box
+        The cloud, the side of its square panel, mean pixels in a box of 3 standard deviations.
+    few : int
+        Gaussians of the same kind where slow methods take part.
+    grids : tuple
+        Voxels along a side of the grids.
+    rounds, seconds
+        Repeats of a method, fewer once it has taken so long altogether.
+    pairs, counts, panels : tuple
+        The sweeps: pairs of a pixel and a Gaussian, Gaussians, pixels along a side.
+    crowd : int
+        Gaussians among which one as large as the scene is put.
+    phantoms : tuple
+        Voxels and pixels along a side of the fits' phantom.
+    points : tuple
+        Gaussians a fit starts with.
+    iterations : tuple
+        Of a fit.
+    views : int
+        Of a fit, and as many held out.
+    samples : tuple
+        On a ray of a neural field.
+    field_pixels : int
+        Along a side of its panel.
     """
 
     gaussians: int = 20_000

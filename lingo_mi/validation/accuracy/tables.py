@@ -35,7 +35,10 @@ SHOWN = 'conditions', 'presets'  # what the page of the documentation shows; it 
 def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
     """Markdown tables by name, those of TITLES; of presets alone, their own.
 
-    beside   another variant's presets, `read_presets`, whose errors are shown beside
+    Parameters
+    ----------
+    beside : dict or None
+        Another variant's presets, `read_presets`, whose errors are shown beside.
     """
     presets = preset_table(found, beside)
     if 'methods' not in found:
@@ -86,7 +89,13 @@ def preset_table(found: dict, beside: dict | None = None) -> str:
 
 
 def read_presets(path: Path) -> dict:
-    """The accuracy.json of another run. Raises InputError where it is none, or lacks a preset."""
+    """The accuracy.json of another run.
+
+    Raises
+    ------
+    InputError
+        If it is none, or lacks a preset.
+    """
     with reading(path):
         text = Path(path).read_text(encoding='utf-8')
     try:

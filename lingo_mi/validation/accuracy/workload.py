@@ -20,8 +20,12 @@ SPREAD = 1.16  # mean of a box's side over that of a Gaussian of the median scal
 class Workload:
     """A random cloud before a scanner: as arrays, as a scene, and as float64 truth.
 
-    order   of the Gauss-Legendre rule for pixel means; 0 for the rays through pixel centres
-    giant   whether the first Gaussian is as large as the whole ball
+    Parameters
+    ----------
+    order : int
+        Of the Gauss-Legendre rule for pixel means; 0 for the rays through pixel centres.
+    giant : bool
+        Whether the first Gaussian is as large as the whole ball.
     """
 
     def __init__(

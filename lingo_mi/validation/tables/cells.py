@@ -65,19 +65,32 @@ ALGORITHMS = {
 class Scale:
     """How large everything is.
 
-    size         voxels along an object's longest side, at most; larger volumes are averaged down
-    pixels       along a side of the panel
-    n_points     Gaussians that a fit starts with
-    iterations   of the fits, where the user names none
-    objects      where the user names none
-    finer        how many times as many voxels are scanned along each side, where the object has them: the projections then
-                 hold structure that the reconstructed voxels cannot
-    photons      a pixel in the open beam, by which the views to fit are measured; 0: without noise
-    electronic_noise   of the detector, standard deviation in photons
-    longest      line integral of a scan, to which its density is scaled when photons are counted
-    first        whether the views to fit are the first ones of the scan, as in the released code of X-Gaussian and SAX-NeRF,
-                 instead of evenly spaced ones
-    data         folder of scans that take the place of the objects, see `objects.scans_in`; '': objects are scanned
+    Parameters
+    ----------
+    size : int
+        Voxels along an object's longest side, at most; larger volumes are averaged down.
+    pixels : int
+        Along a side of the panel.
+    n_points : int
+        Gaussians that a fit starts with.
+    iterations : tuple[int, ...]
+        Of the fits, where the user names none.
+    objects : tuple[str, ...]
+        Where the user names none.
+    finer : int
+        How many times as many voxels are scanned along each side, where the object has them: the projections then hold structure
+        that the reconstructed voxels cannot.
+    photons : float
+        A pixel in the open beam, by which the views to fit are measured; 0: without noise.
+    electronic_noise : float
+        Of the detector, standard deviation in photons.
+    longest : float
+        Line integral of a scan, to which its density is scaled when photons are counted.
+    first : bool
+        Whether the views to fit are the first ones of the scan, as in the released code of X-Gaussian and SAX-NeRF, instead of
+        evenly spaced ones.
+    data : str
+        Folder of scans that take the place of the objects, see `objects.scans_in`; '': objects are scanned.
     """
 
     size: int
@@ -117,8 +130,12 @@ SCALES = {
 class Fit:
     """A cell: a cloud fitted to some views of an object.
 
-    method       a name of METHODS, or `name:option=value,...`
-    iterations   Adam steps; None: the method's own
+    Parameters
+    ----------
+    method : str
+        A name of METHODS, or `name:option=value,...`.
+    iterations : int or None
+        Adam steps; None: the method's own.
     """
 
     object: str
@@ -219,9 +236,15 @@ class Cells:
     def compute(self, cell: Fit | Volume, label: str, report: Callable[..., None] | None = None) -> dict:
         """Compute and store a cell, with a progress bar called `label`; a Volume's fit must be stored already.
 
-        report   called between the steps of a fit, with their number, beside the bar
+        Parameters
+        ----------
+        report : callable or None
+            Called between the steps of a fit, with their number, beside the bar.
 
-        Raises InputError where it cannot be computed, and KeyboardInterrupt, after which a fit goes on where it was.
+        Raises
+        ------
+        InputError
+            If it cannot be computed, and KeyboardInterrupt, after which a fit goes on where it was.
         """
         path = self.path(cell)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,9 +23,15 @@ VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_t
 def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
     """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
 
-    say   called with a line for each of VOLUMES that is missing
+    Parameters
+    ----------
+    say : callable
+        Called with a line for each of VOLUMES that is missing.
 
-    Raises InputError for a name that is neither, and where no object is left.
+    Raises
+    ------
+    InputError
+        For a name that is neither, and where no object is left.
     """
     found = []
     for name in names:
@@ -48,7 +54,10 @@ def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
 def scans_in(folder: Path) -> dict[str, Path]:
     """The scans of X3D's kind in a folder, by name: pickles NAME_50.pickle of SAX-NeRF and NAF, and folders of R2-Gaussian.
 
-    Raises InputError if there is none.
+    Raises
+    ------
+    InputError
+        If there is none.
     """
     if not folder.is_dir():
         raise InputError(f'{folder}: is not a folder; give the folder with the scans')
@@ -77,7 +86,10 @@ def _file(name: str) -> Path | None:
 def load_object(name: str, size: int) -> phantoms.Phantom:
     """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers.
 
-    Raises InputError where its file cannot be read.
+    Raises
+    ------
+    InputError
+        If its file cannot be read.
     """
     if name in PHANTOMS:
         return phantoms.make(name, size)

@@ -12,7 +12,10 @@ LARGEST = 4.0  # line integral of a scan: 1.8 % of the photons arrive
 def counting(photons: float, electronic_noise: float = 0.0) -> Detector:
     """A detector that counts so many photons a pixel in the open beam; its electronics' noise is in photons.
 
-    Raises InputError for values out of their ranges.
+    Raises
+    ------
+    InputError
+        For values out of their ranges.
     """
     return Detector.of(**(Detector.DEFAULTS | dict(photons=photons, electronic_noise=electronic_noise)))
 

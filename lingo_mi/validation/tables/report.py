@@ -111,9 +111,14 @@ def groups(
 ) -> list[Group]:
     """The groups of a table, by rows.
 
-    iterations   of the fits; the last one counts for `ct` and `ablation`
-    methods      columns of `views` and `ct`
-    algorithms   rows of `ct`
+    Parameters
+    ----------
+    iterations : Sequence[int]
+        Of the fits; the last one counts for `ct` and `ablation`.
+    methods : Sequence[str]
+        Columns of `views` and `ct`.
+    algorithms : Sequence[str]
+        Rows of `ct`.
     """
     last = iterations[-1]
     if table == 'views':
@@ -198,11 +203,14 @@ def plan(table_groups: list[Group], objects: Iterable[str]) -> list[Fit | Volume
 def results(table_groups: list[Group], objects: Iterable[str], every: Sequence[Cells]) -> list[dict]:
     """One dictionary a row: views, second, object and, by column, the numbers or None.
 
-    every   the cells of each seed; an object has its mean over the seeds that have it
-
     Below the objects of a group stand, over those that have all of the group's cells (nothing if there are none): 'mean' and its
     standard error; for two seeds and more the 'spread over seeds', the standard deviation of a single run; and 'gain over r2' and
     its standard error. 'paper' comes last if the paper has such a row.
+
+    Parameters
+    ----------
+    every : Sequence[Cells]
+        The cells of each seed; an object has its mean over the seeds that have it.
     """
     rows: list[dict] = []
     base: dict[int, Values] = {}
@@ -311,8 +319,12 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], every: 
 
     Each cell keeps its own provenance in its own file.
 
-    every   the cells of each seed
-    name    of the scale
+    Parameters
+    ----------
+    every : Sequence[Cells]
+        The cells of each seed.
+    name : str
+        Of the scale.
     """
     rows = results(table_groups, objects, every)
     planned = plan(table_groups, objects)

@@ -63,8 +63,13 @@ def compute_series(
     *,
     report: Callable[..., None],
 ) -> None:
-    """Compute those cells of a series that are not stored. Raises InputError where one of them cannot be computed, after the
-    others."""
+    """Compute those cells of a series that are not stored.
+
+    Raises
+    ------
+    InputError
+        If one of them cannot be computed, after the others.
+    """
     cells, done, failed = _cells(folder, scale, seed, command), 0, []
     cells.record = record
     first = series[0].fit if isinstance(series[0], Volume) else series[0]
