@@ -72,11 +72,13 @@ def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[d
     if method.makes_volume:
         write_volume(folder / VOLUME, fit.own_volume, geometry.grid, 'density per mm')
         if method.makes_gaussians:
-            write_ply(folder / CLOUD, *fit.gaussians, fit.shares())
+            means, scales, quaternions, density = fit.gaussians
+            write_ply(folder / CLOUD, means, scales, quaternions, density, fit.shares())
         extent = method.extent if isinstance(method, CloudMethod) else None
         write_scene(folder / SCENE, fit.geometry, extent, fit.model.effects)
     else:
-        write_radiance_ply(folder / CLOUD, *fit.gaussians, *harmonics(fit.state.values))
+        means, scales, quaternions, opacity = fit.gaussians
+        write_radiance_ply(folder / CLOUD, means, scales, quaternions, opacity, *harmonics(fit.state.values))
     if fit.views is not None:
         _write_views(folder, fit.views)
     numbers = numbers | description(fit)

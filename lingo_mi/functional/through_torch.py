@@ -65,4 +65,5 @@ class _OfDrJit(torch.autograd.Function):
 
 def _tensor(array: Any) -> mi.TensorXf:
     """In the memory of PyTorch's."""
-    return mi.TensorXd(array) if array.dtype == torch.float64 else mi.TensorXf(array)
+    tensor: Any = mi.TensorXd if array.dtype == torch.float64 else mi.TensorXf
+    return tensor(array)

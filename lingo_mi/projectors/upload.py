@@ -32,4 +32,5 @@ def uploaded(values: np.ndarray, double: bool = False) -> Any:
 
 def uploaded_tensor(values: ArrayLike, double: bool = False) -> Any:
     """A copy of NumPy's values of any shape: TensorXf, or TensorXd where they are to be double."""
-    return (mi.TensorXd if double else mi.TensorXf)(uploaded(np.asarray(values), double), np.shape(values))
+    tensor: Any = mi.TensorXd if double else mi.TensorXf
+    return tensor(uploaded(np.asarray(values), double), np.shape(values))

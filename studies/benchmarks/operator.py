@@ -221,7 +221,7 @@ def overhead(geometry: Geometry, turns: int) -> Iterator[tuple[str, float, float
                 dr.sync_thread()
                 least[name][i] = min(least[name][i], time.process_time() - begun)
     kernel = least.pop('bare kernel')
-    yield 'bare kernel', *kernel
+    yield 'bare kernel', kernel[0], kernel[1]
     for name, found in least.items():
         yield name, found[0] - kernel[0], found[1] - kernel[1]
 
