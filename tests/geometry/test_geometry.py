@@ -342,7 +342,7 @@ def test_angles_that_look_like_degrees_cause_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         Geometry.parallel(**panel, angles=np.arange(6))
-        Geometry.cone(**panel, DSO=100, DSD=150, angles=circular(100, 3600))
+        Geometry.cone(**panel, DSO=100, DSD=150, angles=circular(100, 1080))
 
 
 def test_a_panel_that_is_hardly_one():

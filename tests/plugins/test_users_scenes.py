@@ -1,5 +1,6 @@
 """Scenes as Mitsuba's users write them: films, crops, instances, batches, nested integrators, variants."""
 
+import gc
 import inspect
 
 import drjit as dr
@@ -244,6 +245,7 @@ def test_within_a_frozen_function():
     def frozen(factor):
         return mi.render(scene) * factor
 
+    gc.collect()  # Dr.Jit's recording does not bear objects of other tests that go meanwhile
     with pytest.raises(RuntimeError) as caught:  # Dr.Jit puts its own exception around ours
         frozen(mi.Float(2))
     assert isinstance(caught.value.__cause__, InputError) and 'dr.freeze' in str(caught.value.__cause__)

@@ -134,7 +134,7 @@ def test_command(tmp_path, monkeypatch):
     page = tmp_path / 'page.md'
     code, out, err = run_script('studies.hard_cases', '--markdown', page)
     assert code == 0 and not err and page.read_text() == out and '| density 0, cone |' in out
-    assert 'hard_cases.py' in (tmp_path / 'page.provenance.json').read_text()
+    assert 'studies.hard_cases' in (tmp_path / 'page.provenance.json').read_text()
     monkeypatch.setattr('studies.hard_cases.cases.all_cases', lambda steps: cases)
     code, out, err = run_script('studies.hard_cases')
     assert code == 1 and '| too good |' in out and err == 'missed its tolerance: too good: not warned of\n'
