@@ -7,12 +7,15 @@ Run it on a machine that does nothing else.
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import time
 
 import lingo_mi as lm
+from lingo_mi.cli.common import Parser
 from lingo_mi.fitting.methods.densities import DensityMethod
 from lingo_mi.scan import Scan
+from studies.command import run_study
 
 PAPER = {'masks': 0.47, 'masks without scaling': 5.76, 'FDK': 1.42}  # seconds
 REPEATS = 5
@@ -35,6 +38,7 @@ def seconds(method: DensityMethod, scan: Scan) -> list[float]:
 
 
 def main() -> None:
+    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     scan = lm.simulate('x3d_foot', views=25).train
     print('| start | s, median | least | most | paper, s |\n|---|---:|---:|---:|---:|')
     for name, method in methods().items():
@@ -43,4 +47,4 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    main()
+    run_study('start_times', main)

@@ -27,7 +27,7 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
     Raises
     ------
     InputError
-        If they are no array of real numbers, or one that NumPy cannot reach, such as a PyTorch tensor on a GPU.
+        If they are not an array of real numbers, or if NumPy cannot reach the array, such as a PyTorch tensor on a GPU.
 
     Examples
     --------

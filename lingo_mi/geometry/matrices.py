@@ -42,7 +42,7 @@ def from_matrices(
     Raises
     ------
     InputError
-        If a matrix is no camera of that kind.
+        If a matrix is not a camera of that kind.
     """
     matrices, towards = numbers('projection matrices', matrices), numbers('towards', towards)
     if matrices.ndim != 3 or matrices.shape[1:] != (3, 4) or not len(matrices):

@@ -211,7 +211,7 @@ def test_wavelets_are_a_soft_threshold(noisy, shifts):
     few = np.abs(fine_z) < 1e-4
     assert 0.1 < few.mean() < 0.98 and np.abs(fine - fine_z).max() < 0.1 + 1e-4
     np.testing.assert_allclose((fine - fine_z)[~few], 0.1 * np.sign(fine_z[~few]), atol=1e-4)
-    assert prox(prior, noisy, 0.1).shape == SIZE  # whose sides are no multiples of 4
+    assert prox(prior, noisy, 0.1).shape == SIZE  # whose sides are not multiples of 4
 
 
 def test_non_local_means_are_those_of_scikit_image(noisy):
