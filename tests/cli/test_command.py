@@ -109,7 +109,8 @@ def test_a_script_is_a_command(monkeypatch, capsys, path):
 def test_every_study_describes_itself(monkeypatch, capsys, name):
     for args, expected in ((['--help'], 0), (['--no-such-option'], 2)):
         monkeypatch.setattr(sys, 'argv', [name, *args])
-        monkeypatch.delitem(sys.modules, f'studies.{name}', raising=False)  # of which runpy would warn
+        program = f'studies.{name}' if (ROOT / 'studies' / f'{name}.py').exists() else f'studies.{name}.__main__'
+        monkeypatch.delitem(sys.modules, program, raising=False)  # runpy would warn of it
         with pytest.raises(SystemExit) as stop:
             runpy.run_module(f'studies.{name}', run_name='__main__')
         out, err = capsys.readouterr()
