@@ -22,6 +22,8 @@ CHEAP = tuple(name for name in NAMES if name != 'scene')
 @pytest.mark.parametrize('name', CHEAP)
 def test_the_good_files_are_read(tmp_path, name):
     """Otherwise nothing but the first check would see the mutated ones."""
+    if name == 'ome-zarr':
+        pytest.importorskip('zarr')
     read, samples = reader(name)
     for index, sample in enumerate(samples):
         write(sample, tmp_path / str(index))
