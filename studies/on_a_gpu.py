@@ -77,7 +77,7 @@ def parts(out: Path) -> list[Part]:
         return Part(name, seconds, (*command.split(), *more.split()), (*command.split(), *small.split()))
 
     return [
-        part('tests', 90, '-m pytest -q -p no:cacheprovider', '-n 4 ' + ' '.join(TESTS), TESTS[0]),
+        part('tests', 90, '-m pytest -q --all -p no:cacheprovider', '-n 4 ' + ' '.join(TESTS), TESTS[0]),
         part(
             'hard_cases',
             60,

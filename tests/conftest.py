@@ -18,10 +18,15 @@ VARIANT = os.environ.get('LINGO_MI_TEST_VARIANT', 'llvm_ad_mono')
 
 
 def pytest_addoption(parser):
+    parser.addoption('--all', action='store_true', help='also run the thorough tests, which take most of the time')
     parser.addoption('--slow', action='store_true', help='also run the full-size forms of tests')
 
 
 def pytest_collection_modifyitems(config, items):
+    if not (config.getoption('--all') or config.getoption('--slow')):
+        thorough = [item for item in items if 'thorough' in item.keywords]
+        config.hook.pytest_deselected(items=thorough)
+        items[:] = [item for item in items if 'thorough' not in item.keywords]
     skips = {}
     if not config.getoption('--slow'):
         skips['slow'] = 'full size: run with --slow'

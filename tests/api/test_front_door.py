@@ -290,6 +290,7 @@ def test_save_and_load(result, data, tmp_path):
             lm.load_fit(folder)
 
 
+@pytest.mark.thorough
 def test_a_folder_and_resume(data, tmp_path, sums_in_order):
     folder = tmp_path / 'fit'
     short = TINY | dict(iterations=6)

@@ -71,6 +71,7 @@ def test_axis_and_turn_of_the_panel():
     assert len(found.lines()) == 3 and all('not taken' not in line for line in found.lines())
 
 
+@pytest.mark.thorough
 def test_noisy_and_truncated():
     """The object beyond both sides and the upper edge; a hundredth of the highest value of noise: to a tenth of a pixel."""
     geometry, data = scanner(30)
@@ -126,6 +127,7 @@ def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, told, true
     assert taken == (pytest.approx(right, abs=0.05) if right else 0)
 
 
+@pytest.mark.thorough
 def test_an_object_that_is_cut_turns_no_panel():
     """On both sides, of a cone beam: neither shift nor turn, whose errors are told."""
     geometry, data = scanner(24, rows=40)
@@ -221,6 +223,7 @@ def test_scattered_light_is_not_negative():
     assert 'negative in places' in told[0] and 'negative in places' in told[3]
 
 
+@pytest.mark.thorough
 def test_a_slope_of_scattered_light_alone_is_not_taken():
     """Its mean is not told, so it is taken for 0; half of what is left would be negative."""
     scan, _ = responding({'scatter0_1': 0.02}, scatter='one')

@@ -15,7 +15,9 @@ def foot():
     return scanned('foot', views=24)
 
 
-@pytest.mark.parametrize('name', ['foot', 'chest', 'gaussians', 'shepp_logan'])
+@pytest.mark.parametrize(
+    'name', ['foot', *(pytest.param(n, marks=pytest.mark.thorough) for n in ('chest', 'gaussians', 'shepp_logan'))]
+)
 @pytest.mark.parametrize(
     ('total', 'views', 'mode'),
     [(360, 24, 'cone'), (180, 20, 'cone'), (60, 20, 'cone'), (180, 50, 'parallel'), (360, 6, 'cone')],

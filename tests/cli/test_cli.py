@@ -251,6 +251,7 @@ def test_resume_after_kill(result, scene, tmp_path):
     assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in whole['history']]
 
 
+@pytest.mark.thorough
 def test_resume_after_kills_in_a_search(scene, tmp_path):
     """`kill -9` while the fit searches for the step to stop at, --resume, `kill -9` while it goes there, and --resume."""
     arguments = scene, '--iterations', '60', *SMALL, '-D', 'stop=on', '-D', 'stop_every=5', '-D', 'stop_patience=15'

@@ -245,6 +245,7 @@ def try_points(bench, count):
     assert not failed, '\n'.join(f'{name}: {error}' for name, error in failed.items())
 
 
+@pytest.mark.thorough
 def test_a_share_of_all_calls_that_write(bench):
     try_points(bench, SHARE)
 

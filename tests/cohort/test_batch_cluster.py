@@ -69,6 +69,7 @@ def require_same(home, name, address):
     assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=fits_alike(0))
 
 
+@pytest.mark.thorough
 def test_a_worker_is_killed(home):
     with cluster(home, workers=3) as (address, processes):
         numbers, batch = processes(), start(home, address)
@@ -93,6 +94,7 @@ def test_a_worker_is_killed(home):
         require_all_done_once(home)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGKILL])
 def test_the_command_is_stopped(home, how):
     """After Ctrl-C every worker stops with a checkpoint, after `kill -9` at its next report; the same command ends the list."""

@@ -19,6 +19,7 @@ def test_folders_of_packages_with_few_folders_above(monkeypatch):
     assert find_libllvm() is None
 
 
+@pytest.mark.thorough
 def test_threads_change_while_a_kernel_runs():
     """A kernel that adds to a copy of its result for every thread; without waiting for it, one change in a hundred crashes."""
     before, size, count = dr.thread_count(), 1 << 20, 1 << 21

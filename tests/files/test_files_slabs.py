@@ -121,6 +121,7 @@ def test_a_cloud(tmp_path):
         result.save_volume(tmp_path / 'v.nii')
 
 
+@pytest.mark.thorough
 def test_completed_views_need_no_volume(tmp_path, monkeypatch):
     scene = tmp_path / 'tiny.xml'
     scene.write_text(SCENE)

@@ -248,6 +248,7 @@ def test_transformations_of_jax():
     np.testing.assert_allclose(jax.jit(A)(x.astype('float16')), A(x.astype('float16')), **close)
 
 
+@pytest.mark.thorough
 def test_norm_and_scipy():
     A = Projector(GEOMETRIES['cone'])
     op = A.aslinearoperator()

@@ -108,6 +108,7 @@ class RTK:
         return self.rows_down(filter)
 
 
+@pytest.mark.thorough
 def test_rtk_reads_the_geometry(name, tmp_path):
     """RTK's own source positions, in the file that this package wrote."""
     g = geometry(name)

@@ -155,6 +155,7 @@ def test_intensities(foot, counts):
     only(lm.Scan(foot.geometry, light), 'these look like intensities')
 
 
+@pytest.mark.thorough
 def test_regions_of_interest_are_no_intensities():
     for name in ('foot', 'chest', 'shepp_logan', 'gaussians'):
         scan = scanned(name)

@@ -45,6 +45,7 @@ def scan():
     return lm.Scan(geo, (p + noise).astype(np.float32)), chest.data
 
 
+@pytest.mark.thorough
 def test_the_minimum_does_not_depend_on_the_start(scan):
     """The problem is convex, so the least volume is one, whatever the start."""
     scan, truth = scan

@@ -76,12 +76,14 @@ def taken(algorithm, *sizes):
     return (peak - before) / expected, peak
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('algorithm', NEEDS)
 def test_peak_memory_of_small_scans(algorithm):
     """What `reconstruct.py` goes by. Small ones take up to twice that share, since Dr.Jit keeps some of what is freed."""
     assert 0.7 < taken(algorithm, 192, 288, 48)[0] < 2
 
 
+@pytest.mark.thorough
 def test_fdk_of_an_offset_panel():
     """It is completed by columns that no view has seen, a few views at a time. On a busy machine Dr.Jit frees later, so the
     less of two runs counts."""

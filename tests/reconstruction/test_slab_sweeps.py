@@ -194,6 +194,7 @@ def test_bad_input(scan, tmp_path, monkeypatch):
     assert not (tmp_path / 'work').exists()
 
 
+@pytest.mark.thorough
 def test_the_command(tmp_path):
     """Killed by the system, it goes on."""
     scene, out, work = tmp_path / 'tiny.xml', tmp_path / 'slabs.nii.gz', tmp_path / 'slabs.nii.gz.slabs'
@@ -246,6 +247,7 @@ print(peak() - before, expected)
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
 @pytest.mark.parametrize(
     'sizes',

@@ -88,6 +88,7 @@ def dom(path, home):
     return done.stdout
 
 
+@pytest.mark.thorough
 def test_no_script_runs_in_a_browser(tmp_path):
     """A page with a script of its own shows that one would be seen."""
     control = tmp_path / 'control.html'

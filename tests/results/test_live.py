@@ -345,6 +345,7 @@ def test_a_fit_that_does_not_answer(chromium, data):
         page.said.clear()
 
 
+@pytest.mark.thorough
 def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
     """Its last values are those of the volume that the fit gives. Once it has something to show, the fit waits for the page."""
     pages, said, results = queue.Queue(), threading.Event(), []
@@ -353,7 +354,9 @@ def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
 
     def waiting(page, entry, total):
         step(page, entry, total)
-        while (page._waiting is not None or page._number) and not said.is_set():  # before the first look there is nothing
+        while (
+            page._waiting is not None or page._number
+        ) and not said.is_set():  # before the first look there is nothing
             page._show_if_due()
             said.wait(0.05)
 

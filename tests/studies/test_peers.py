@@ -100,6 +100,7 @@ def test_missing_peers_are_left_out(peers):
     assert code == 2 and err == 'error: none of the --methods is installed\n'
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize('method, module', [('rtk-tv', 'itk'), ('mbirjax', 'mbirjax'), ('mbirjax:1', 'mbirjax')])
 def test_peers(peers, tmp_path, method, module):
     found = pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[reference]'")

@@ -370,6 +370,7 @@ def test_presets_of_two_variants(tmp_path, monkeypatch):
     assert code == 2 and 'holds no presets' in err
 
 
+@pytest.mark.thorough
 @pytest.mark.traces_rays
 def test_whole_measurement(tmp_path, monkeypatch):
     """Every part on a tiny configuration, down to the documentation, by the function and by the command."""

@@ -244,6 +244,7 @@ def _stop_at(iteration):
     return update
 
 
+@pytest.mark.thorough
 def test_killed(tmp_path):
     """`kill -9` in the middle of the second cell: the first stays, and the same command ends the table."""
     arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
@@ -381,6 +382,7 @@ def test_a_record_goes_on_without_the_files(tmp_path):
     assert code == 2 and 'is not a record of cells' in err and err.count('\n') == 1
 
 
+@pytest.mark.thorough
 def test_the_first_views(tmp_path):
     first, even = Cells(tmp_path, replace(TINY, first=True)), Cells(tmp_path, TINY)
     fit = Fit('foot', 4, 'r2', 20)
@@ -404,6 +406,7 @@ def test_volumes_are_averaged_down(tmp_path, monkeypatch):
     assert load_object('engine', 64).data.shape == data.shape
 
 
+@pytest.mark.thorough
 def test_objects_finer_than_the_voxels(tmp_path):
     """What is scanned has twice the voxels; what is reconstructed, and its truth, has those of the scale."""
     scale = replace(TINY, finer=2)
@@ -439,6 +442,7 @@ def test_objects_finer_than_the_voxels(tmp_path):
     assert '| 4 | finer | foot | – | – |' in text
 
 
+@pytest.mark.thorough
 def test_scans_with_noise(tmp_path):
     """The fitted views are counted, on a scale of the density that lets so many photons through; the held-out ones are not."""
     scale = replace(TINY, photons=1e4, electronic_noise=10.0, longest=1.0)

@@ -44,6 +44,7 @@ def tables(out, *more):
     return run(TABLES, 'ct', *ARGUMENTS, '--out', out, '--variant', mi.variant(), *more)
 
 
+@pytest.mark.thorough
 def test_a_worker_is_killed(tmp_path):
     out, cells = tmp_path / 'out', Cells(tmp_path / 'out', TINY)
     killed = []
@@ -80,6 +81,7 @@ def test_a_worker_is_killed(tmp_path):
             assert cells.get(cell)['psnr_3d_r2'] == pytest.approx(whole.get(cell)['psnr_3d_r2'], rel=tolerance)
 
 
+@pytest.mark.thorough
 def test_a_series_that_fails(tmp_path):
     """Another process has the folder of one series: the other cells are computed, and the line says which one failed."""
     cells, fit = Cells(tmp_path / 'out', TINY), Fit('foot', 4, 'none')

@@ -192,6 +192,7 @@ def test_line_integrals(scans):
         np.testing.assert_array_equal(line_integrals(masked).projections, masked.projections)
 
 
+@pytest.mark.thorough
 @pytest.mark.traces_rays
 def test_a_fit_that_models_it_finds_the_volume(scans):
     clean, lit = scans

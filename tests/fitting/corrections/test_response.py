@@ -124,6 +124,7 @@ def test_steps_are_the_same_kernels_with_and_without():
     assert off <= on
 
 
+@pytest.mark.thorough
 def test_smooth_poses_hold_and_are_told_of_views_between():
     """A drift of the panel of 1.6 pixels: most of it is found, and views between get theirs."""
     g = geometry(16, angles=circular(16, 360, start=10))
