@@ -148,7 +148,16 @@ def _run_file(stand_in, tests, name, sm, noise, known):
         if noise:
             variables |= dict(CUDA_ON_CPU_NOISE='1', CUDA_ON_CPU_CHECK='1')
         variables |= dict(LINGO_MI_TEST_VARIANT='cuda_ad_mono', LINGO_MI_CUDA_STAND_IN=f'{stand_in}')
-        command = [stand_in, sys.executable, '-m', 'pytest', '-q', '--all', tests.resolve() / name, f'--junitxml={result}']
+        command = [
+            stand_in,
+            sys.executable,
+            '-m',
+            'pytest',
+            '-q',
+            '--all',
+            tests.resolve() / name,
+            f'--junitxml={result}',
+        ]
         environment, root = os.environ | variables, tests.resolve().parent
         done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
         outcome = _read(result) if result.exists() else Outcome(failed=[f'{name}: ended by itself'])
