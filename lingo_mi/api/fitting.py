@@ -13,6 +13,7 @@ from lingo_mi.common.interrupts import between_steps
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.fitting.fit import Fit
+from lingo_mi.fitting.hold_out import with_held_out
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.measure import few_views, quick_measure
 from lingo_mi.fitting.method import Method
@@ -31,6 +32,7 @@ def fit(
     scan: Scan | Dataset,
     method: str | Method = 'fast',
     *,
+    hold_out: int | None = None,
     seed: int = 0,
     folder: str | PathLike | None = None,
     resume: bool = False,
@@ -53,6 +55,9 @@ def fit(
         `Fast` (this package's own), `LINGO` or `R2` (the published ones), `GaussianSplatting` or `XGaussian` (baselines that
         composite opacities: they make views, but no volume), `NAF` (a neural field), or a method of yours. Or its name, with
         options as in 'lingo:V_S=1'.
+    hold_out : int or None
+        One view in so many is not fitted, to measure how well unseen views are predicted; 0: all are fitted. Default: 10 of a
+        measured `Dataset`, one of 20 views or more that has neither held-out views nor a true volume, else 0.
     seed : int
         Of every random choice.
     folder : path, optional
@@ -95,7 +100,7 @@ def fit(
     require_type('method', method, (str, Method))
     require_type('live', live, bool)
     seed = parsing.seed(seed)
-    dataset = scan if isinstance(scan, Dataset) else Dataset(scan)
+    dataset = with_held_out(scan, hold_out)
     chosen = method.changed(**options) if isinstance(method, Method) else method_of(method, **options)
     if resume and folder is None:
         raise InputError('resume=True needs the folder of the checkpoint to go on from: give folder=FOLDER')
@@ -128,6 +133,9 @@ def fit(
             result = run(dataset.train, chosen, seed, measure=measure, progress=between, path=checkpoint, resume=resume)
         result = result.with_data(dataset)
         if path is not None:
+            if dataset.test is not None and (not isinstance(scan, Dataset) or scan.test is None):
+                whole = len(dataset.train) + len(dataset.test)
+                note = dict(held_out=f'{len(dataset.test)} of {whole}, evenly spaced') | (note or {})
             result.write(path, label, note)
     return result
 

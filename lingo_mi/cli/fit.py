@@ -47,6 +47,13 @@ def parser() -> Parser:
         'composite opacities and make views but no volume, and naf, a neural field; M:option=value,... changes it',
     )
     p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
+    p.add_argument(
+        '--hold-out',
+        type=int,
+        metavar='N',
+        help='hold one view in N out of the fit, to measure how well unseen views are predicted; 0: fit all (default: 10 for '
+        'measured scans of 20 views or more, else 0)',
+    )
     p.add_argument('--iterations', type=int, metavar='N', help="Adam steps (default: the method's)")
     p.add_argument(
         '--start',
@@ -129,6 +136,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
         result = fit(
             scan,
             method,
+            hold_out=args.hold_out,
             seed=args.seed,
             folder=folder,
             resume=args.resume,
@@ -143,5 +151,8 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
         again = command_line(*['--resume'] * begun, without=('--resume', '--force'))
         raise KeyboardInterrupt(f'go on with  {again}') from None
     print(summary(result.numbers))
+    if scan.test is None and result.data is not None and result.data.test is not None:
+        held = len(result.data.test)
+        print(f'{held} of the {len(scan.train)} views were held out to measure the fit; --hold-out 0 fits them, too')
     written = [name for name in (PAGE, VOLUME, CLOUD, SCENE, METRICS) if (folder / name).exists()]
     print(f'{folder}/: {", ".join(written)}')

@@ -8,6 +8,7 @@ import numpy as np
 
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.fitting.lingo_summary import lingo_summary
+from lingo_mi.fitting.residual import residual_numbers
 from lingo_mi.fitting.stopping import sentence
 from lingo_mi.metrics import quality as metrics
 from lingo_mi.metrics.ipsd import ipsd, reverse_distance
@@ -37,6 +38,7 @@ def fit_metrics(fit: FittedModel) -> dict:
         ssim_3d=of(metrics.ssim_3d, volume, truth),
         psnr_3d_r2=of(metrics.psnr_3d_r2, volume, truth),
         ssim_3d_r2=of(metrics.ssim_3d_r2, volume, truth),
+        **({} if rendered is None or test is None else residual_numbers(rendered, test)),
         **_of_gaussians(fit),
         parameters=sum(v.size for v in fit.state.values.values()),
         iterations=fit.steps,
@@ -85,8 +87,8 @@ def summary(result: dict) -> str:
     """The main numbers of a result, one line each."""
     return '\n'.join(
         [
-            f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}',
-            volume_quality(result),
+            *_view_quality(result),
+            *([volume_quality(result)] if _any(result, 'psnr_3d', 'ssim_3d') else []),
             f'{_fitted_to(result)} after {result["iterations"]} iterations of '
             f'{result["ms_per_iteration"]:.0f} ms: {result["seconds_init"]:.1f} s to start, '
             f'{result["seconds_fit"]:.0f} s to fit',
@@ -94,6 +96,18 @@ def summary(result: dict) -> str:
             *([f'LINGO           {result["lingo"]}'] if 'lingo' in result else []),
         ]
     )
+
+
+def _view_quality(result: dict) -> list[str]:
+    """How well held-out views are predicted, as lines."""
+    lines = []
+    if _any(result, 'psnr_2d', 'ssim_2d'):
+        lines.append(f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}')
+    if (rms := result.get('residual_rms')) is not None:
+        noise = result.get('residual_to_noise')
+        times = '' if noise is None else f', {noise:.2f} times the noise of their pixels'
+        lines.append(f'                residual {rms:.3g} rms{times}')
+    return lines
 
 
 def _fitted_to(result: dict) -> str:
@@ -121,9 +135,10 @@ def _number(x: float):
     return x if np.isfinite(x) else None
 
 
+def _any(result: dict, *names: str) -> bool:
+    return any(result[name] is not None for name in names)
+
+
 def _shown(result: dict, psnr: str, ssim: str) -> str:
-    psnr, ssim = (
-        'n/a' if result[name] is None else form.format(result[name])
-        for name, form in ((psnr, '{:.2f} dB'), (ssim, '{:.4f}'))
-    )
-    return f'PSNR {psnr}, SSIM {ssim}'
+    known = (('PSNR', psnr, '{:.2f} dB'), ('SSIM', ssim, '{:.4f}'))
+    return ', '.join(f'{name} {form.format(result[key])}' for name, key, form in known if result[key] is not None)

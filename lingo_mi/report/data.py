@@ -15,9 +15,10 @@ class ReportData:
     """The contents of a report. Only `title`, `metrics`, `volume` (or `shape`) and `spacing` are needed.
 
     title           of the report: any text, shown as it is, on one line of printable characters
-    metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are shown as 'n/a'; other scalar
+    metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are left out; other scalar
                     entries are listed with the settings. `history` is a list of dicts with `iteration`,
-                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None
+                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None.
+                    `residual_by_view` is a list of the residual of each of `views`, rms
     volume          [x, y, z] density, 1/mm; None for a cloud without densities
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
@@ -26,14 +27,14 @@ class ReportData:
     error_map       how far off the volume may be, 1/mm (`reconstruction.best.error_map`), not negative, as `volume`; or None
     centre          of the volume, (x, y, z), mm
     views           [n, v, u] rendered held-out views: line integrals ln(I0/I)
-    views_truth     [n, v, u] the same views as measured, or None
+    views_truth     [n, v, u] the same views as measured or simulated, or None
     views_angles    [n] degrees
     pixel           size of a detector pixel, (v, u), mm
     cloud_centres   [N, 3] centres of the Gaussians, mm
     cloud_density   [N] density at their centres, 1/mm, or the quantity that `cloud_unit` names
     cloud_scales    [N, 3] standard deviations, mm, and
     cloud_quaternions [N, 4] (x, y, z, w), for ellipsoids in place of points; None: points only
-    scanner         the geometry of the fitted views, for the drawing of source and panel
+    scanner         the geometry of the fitted views, for the drawings of source and panel
     command         the command line that reproduces this result
 
     Raises
@@ -63,6 +64,11 @@ class ReportData:
     command: str = ''
     error_map: np.ndarray | None = None
     history: list[dict] = field(init=False)
+
+    @property
+    def reference(self) -> str:
+        """What the views are that the rendered ones are compared with: those of a known object are simulated, as a rule."""
+        return 'Measured' if self.truth is None else 'Reference'
 
     def __post_init__(self):
         def fix(name, shape):

@@ -116,22 +116,22 @@ def draw_slices(fig: Any, data: Any) -> None:
 
 
 def draw_views(fig: Any, data: Any) -> None:
-    """Held-out views, in columns: rendered, measured, difference. Line plots for a detector of one row."""
+    """Held-out views, in columns: rendered, measured or the reference, residual. Line plots for a detector of one row."""
     chosen = _spread(len(data.views), 3)
-    titles = [f'View at {data.views_angles[i]:.4g}°' for i in chosen]
+    titles = [f'View at {data.views_angles[i]:.4g}°{_residual(data, i)}' for i in chosen]
     (nv, nu), (dv, du) = data.views.shape[1:], data.pixel
     if nv == 1:
         _draw_lines(fig, data, chosen, titles)
         return
     kinds = {'Rendered': data.views[chosen]}
     if data.views_truth is not None:
-        measured = data.views_truth[chosen]
-        kinds |= {'Measured': measured, 'Difference': data.views[chosen] - measured}
-    low, high = grey_range(*(v for k, v in kinds.items() if k != 'Difference'))
+        given = data.views_truth[chosen]
+        kinds |= {data.reference: given, 'Residual': data.views[chosen] - given}
+    low, high = grey_range(*(v for k, v in kinds.items() if k != 'Residual'))
     extent = (-nu * du / 2, nu * du / 2, nv * dv / 2, -nv * dv / 2)
     grid = fig.subplots(len(kinds), len(chosen), squeeze=False)
     for row, (kind, images) in enumerate(kinds.items()):
-        scale = _difference_range(images) if kind == 'Difference' else (low, high)
+        scale = _difference_range(images) if kind == 'Residual' else (low, high)
         for column, image in enumerate(images):
             ax = grid[row, column]
             drawn = ax.imshow(
@@ -140,7 +140,7 @@ def draw_views(fig: Any, data: Any) -> None:
                 extent=extent,
                 vmin=scale[0],
                 vmax=scale[1],
-                cmap=DIFFERENCE if kind == 'Difference' else 'gray',
+                cmap=DIFFERENCE if kind == 'Residual' else 'gray',
                 interpolation='nearest',
             )
             if row == 0:
@@ -154,7 +154,13 @@ def draw_views(fig: Any, data: Any) -> None:
                 ax.set_xlabel('u [mm]')
             else:
                 ax.tick_params(labelbottom=False)
-        _bar(fig, drawn, list(grid[row]), 'Δ ln(I0/I)' if kind == 'Difference' else 'ln(I0/I)')
+        _bar(fig, drawn, list(grid[row]), 'Δ ln(I0/I)' if kind == 'Residual' else 'ln(I0/I)')
+
+
+def _residual(data, view):
+    """The residual of a view, for its title."""
+    rms = (data.metrics.get('residual_by_view') or {view: None})[view]
+    return '' if rms is None else f', residual {rms:.3g} rms'
 
 
 def _draw_lines(fig, data, chosen, titles):
@@ -174,7 +180,7 @@ def _draw_lines(fig, data, chosen, titles):
         ax.plot(u, data.views[i, 0], color='#1f77b4', lw=1.4, label='rendered')
         ax.set_title(title)
         if compared:
-            ax.plot(u, data.views_truth[i, 0], color='black', lw=1, ls='--', label='measured')
+            ax.plot(u, data.views_truth[i, 0], color='black', lw=1, ls='--', label=data.reference.lower())
             grid[1, column].axhline(0, color='#999999', lw=0.8)
             grid[1, column].plot(u, data.views[i, 0] - data.views_truth[i, 0], color='#b2182b', lw=1)
         grid[-1, column].set_xlabel('u [mm]')
@@ -182,7 +188,7 @@ def _draw_lines(fig, data, chosen, titles):
         ax.grid(alpha=0.25)
     grid[0, 0].set_ylabel('ln(I0/I)')
     if compared:
-        grid[1, 0].set_ylabel('difference')
+        grid[1, 0].set_ylabel('residual')
         grid[0, 0].legend(loc='best', frameon=False)
 
 

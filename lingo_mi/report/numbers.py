@@ -29,11 +29,19 @@ QUALITY = {
     ),
     'psnr_2d': Number(
         'PSNR 2D, held-out views as they are', 'dB', '.2f',
-        'The same for views that the fit has never seen, against the largest measured line integral. More is better.',
+        'The same for views that the fit has never seen, against the largest line integral in them. More is better.',
     ),
     'ssim_2d': Number(
         'SSIM 2D, held-out views as they are', '', '.4f',
-        'How alike rendered and measured held-out views are; 1 is identical.',
+        'How alike rendered and given held-out views are; 1 is identical.',
+    ),
+    'residual_rms': Number(
+        'Residual of the held-out views, rms', '', '.4g',
+        'Rendered minus given line integrals, over all pixels of views that the fit has never seen. Less is better.',
+    ),
+    'residual_to_noise': Number(
+        'Residual of the held-out views over their noise', '', '.2f',
+        '1 would be noise alone. The noise is estimated from how neighbouring pixels scatter.',
     ),
     'psnr_3d_r2': Number(
         'PSNR 3D as in R2-Gaussian: peak 1', 'dB', '.2f',
@@ -73,6 +81,12 @@ QUALITY = {
 SETTINGS = {
     'method': Number('Method', '', '', 'The method of a fit, or the algorithm of a reconstruction.'),
     'views': Number('Views used', '', '', 'Measured projections that the result was made of.'),
+    'held_out': Number(
+        'Views held out',
+        '',
+        '',
+        'Not fitted, to measure how well such views are predicted. hold_out=0, or --hold-out 0, fits them, too.',
+    ),
     'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
     'stopping': Number(
         'Early stop', '', '', 'Views that were held out told after which step more of them no longer helped.'
@@ -98,6 +112,7 @@ HEADLINE = {
 }
 LISTED = {
     'history',
+    'residual_by_view',
     'search',
     'files',
     'settings',
@@ -110,18 +125,23 @@ LISTED = {
 
 def headline(metrics: dict) -> str:
     """The main numbers with units on one line, without missing ones and NaN."""
-    shown = [(text, as_text(key, metrics.get(key))) for key, text in HEADLINE.items()]
-    return '   ·   '.join(text.format(value) for text, value in shown if value != 'n/a')
+    known = [(text, key) for key, text in HEADLINE.items() if is_known(metrics.get(key))]
+    return '   ·   '.join(text.format(as_text(key, metrics[key])) for text, key in known)
+
+
+def is_known(value: object) -> bool:
+    """Whether there is something to show: neither None nor NaN."""
+    return not (value is None or isinstance(value, (float, np.floating)) and math.isnan(value))
 
 
 def as_text(key: str, value: object) -> str:
-    """A number as text with its unit; what is missing or NaN as 'n/a'."""
+    """A number as text with its unit; what is missing or NaN as a dash."""
     if isinstance(value, dict):
         return ', '.join(f'{k} {as_text("", v)}' for k, v in value.items())
     if isinstance(value, (list, tuple, np.ndarray)):
         return ', '.join(as_text('', v) for v in value)
-    if value is None or isinstance(value, (float, np.floating)) and math.isnan(value):
-        return 'n/a'
+    if not is_known(value):
+        return '–'
     known = QUALITY.get(key) or SETTINGS.get(key)
     unit, form = (known.unit, known.form) if known else ('', '')
     if isinstance(value, (bool, str)):

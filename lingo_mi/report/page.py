@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from os import PathLike
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from lingo_mi.report import figures, template
 from lingo_mi.report.data import ReportData
-from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, headline
+from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, headline, is_known
 from lingo_mi.report.payload import colour_maps, history, payload
 from lingo_mi.storage.file_access import replacing, write_text
 from lingo_mi.storage.output_folder import PAGE, PICTURE
@@ -35,11 +36,20 @@ def report_page(data: ReportData) -> str:
     known, arrays = payload(data)
     known |= dict(colours=colour_maps(), history=history(data.history))
     command = template.code('Make it again', data.command) if data.command else ''
-    return template.page(data.title, headline(data.metrics), _numbers(data), command, known, arrays)
+    return template.page(data.title, headline(data.metrics), _scanner(data) + _numbers(data), command, known, arrays)
+
+
+def _scanner(data: ReportData) -> str:
+    """The scanner of the fitted views, to scale."""
+    if data.scanner is None:
+        return ''
+    png = io.BytesIO()
+    data.scanner.show().savefig(png, format='png', dpi=80)
+    return template.picture('Scanner', png.getvalue(), 'The scanner from above and from the side, to scale.') + '\n'
 
 
 def _numbers(data: ReportData) -> str:
-    metrics = data.metrics
+    metrics = {key: value for key, value in data.metrics.items() if is_known(value)}
     quality = [(n.label, as_text(key, metrics[key]), n.meaning) for key, n in QUALITY.items() if key in metrics]
     settings = [(n.label, as_text(key, metrics[key]), n.meaning) for key, n in SETTINGS.items() if key in metrics]
     size = ' x '.join(str(n) for n in data.shape or ())
@@ -60,6 +70,6 @@ def _numbers(data: ReportData) -> str:
         if isinstance(metrics.get(key), dict):
             more[title] = [(str(k), as_text('', v)) for k, v in metrics[key].items()]
     for key, title in (('angles', 'Angles of the fitted views'), ('test_angles', 'Angles of the held-out views')):
-        if metrics.get(key) is not None and len(metrics[key]):
+        if key in metrics and len(metrics[key]):
             more[title] = [(f'{len(metrics[key])} views', ', '.join(f'{angle:.5g}°' for angle in metrics[key]))]
     return '\n'.join([*out, template.folded('More', more)] if more else out)

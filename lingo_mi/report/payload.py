@@ -48,10 +48,15 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
             known['slices'] |= error_maps({'Error map': data.error_map}, known['slices'], arrays)
     if data.views is not None:
         images = {'Rendered': data.views}
+        reference = None
         if data.views_truth is not None:
-            images['Measured'] = data.views_truth
-        reference = 'Measured' if len(images) == 2 else None
+            reference = data.reference
+            images[reference] = data.views_truth
         known['views'] = view_payload(images, data.views_angles, data.pixel, arrays, reference)
+        if (residuals := data.metrics.get('residual_by_view')) and data.views_angles is not None:
+            order = np.argsort(data.views_angles, kind='stable')
+            rms = [residuals[i] for i in order]
+            known['views']['residual'] = dict(angles=data.views_angles[order].tolist(), rms=rms)
     known['space'] = _space(data, arrays, surfaces)
     return known, arrays
 

@@ -70,6 +70,15 @@ def html_table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tu
     return ''.join([*out, '</table></div></section>'])
 
 
+def picture(title: str, png: bytes, text: str) -> str:
+    """A section with a still picture, and what it shows in words."""
+    embedded = base64.b64encode(png).decode('ascii')
+    return (
+        f'<section><h2>{html.escape(title)}</h2><img class="still" alt="{html.escape(text)}" '
+        f'src="data:image/png;base64,{embedded}"></section>'
+    )
+
+
 def code(title: str, text: str) -> str:
     """A section with a command, as it is."""
     return f'<section><h2>{html.escape(title)}</h2><pre>{html.escape(text)}</pre></section>'

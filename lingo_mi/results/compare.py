@@ -22,7 +22,15 @@ from lingo_mi.report.payload import colour_maps, error_maps, slice_payload, view
 from lingo_mi.scan import values_digest
 from lingo_mi.storage.file_access import as_path, parsed_json
 
-LOWER_IS_BETTER = 'ipsd', 'ipsd_reverse', 'seconds_init', 'seconds_fit', 'ms_per_iteration'
+LOWER_IS_BETTER = (
+    'residual_rms',
+    'residual_to_noise',
+    'ipsd',
+    'ipsd_reverse',
+    'seconds_init',
+    'seconds_fit',
+    'ms_per_iteration',
+)
 MOST = 6
 
 

@@ -39,7 +39,15 @@ def content(**changes):
         cloud_quaternions=rng.normal(0, 1, (300, 4)),
         scanner=Geometry.cone(angles=circular(9), **scan),
         command=f'fit {MARKUP}',
-        metrics=dict(psnr_3d=31.234, psnr_2d=40.0, gaussians=300, iterations=9, method='fast', history=history),
+        metrics=dict(
+            psnr_3d=31.234,
+            psnr_2d=40.0,
+            gaussians=300,
+            iterations=9,
+            method='fast',
+            history=history,
+            residual_by_view=[1.0, 2, 3, 4, 5, 6, 7],
+        ),
     )
     return ReportData(**{**given, **changes})
 
@@ -85,7 +93,7 @@ def test_it_opens_from_disk_and_asks_for_nothing(page, address):
     for part in ('slices', 'views', 'space', 'curves'):
         assert page.locator(f'#{part}').is_visible(), part
     assert page.title() == MARKUP and page.locator('h1').text_content() == MARKUP
-    assert page.locator('pre').text_content() == f'fit {MARKUP}' and page.locator('img').count() == 0
+    assert page.locator('pre').text_content() == f'fit {MARKUP}' and page.locator('img:not(.still)').count() == 0
 
 
 def test_a_part_that_cannot_be_shown_leaves_the_others_alone(chromium, address):
@@ -260,6 +268,13 @@ def test_views_are_sorted_and_their_values_those_given(page, data):
     values = [float(part.split()[-1]) for part in said.partition('mm:')[2].split(',')]
     rendered, measured = data.views[3, 2, 4], data.views_truth[3, 2, 4]  # the view at 20 degrees
     np.testing.assert_allclose(values, [rendered, measured, rendered - measured], atol=2e-4)
+
+
+def test_the_residual_of_each_view_is_beside_its_angle(page):
+    chart = page.locator('#views .chart')
+    chart.focus()
+    press(page, 'ArrowRight', 'ArrowRight', 'ArrowRight')
+    assert [float(value) for value in chart.locator('.u-value').all_text_contents()] == [20, 4]
 
 
 def test_curves_say_their_values(page):

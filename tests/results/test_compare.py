@@ -132,7 +132,7 @@ def test_a_volume_of_reconstruct_beside_a_fit(pair, tmp_path):
     write_volume(tmp_path / 'x <b>.nii.gz', np.ones(SHAPE, np.float32), Grid(SHAPE, 2.0), 'density per mm')
     page = compare_page([load_result(pair[0]), load_result(tmp_path / 'x <b>.nii.gz')])
     assert 'x &lt;b&gt;' in page and 'x <b>' not in page
-    assert cells(page, 'Time to fit') == ['10.0 s', 'n/a']
+    assert cells(page, 'Time to fit') == ['10.0 s', '–']
 
 
 def test_the_map_of_errors_beside_a_volume(pair, tmp_path):

@@ -25,7 +25,7 @@ function* eachValue(array) {
 
 // Numbers for people: as many digits as the step of the stored values is worth.
 function shown(value, step) {
-  if (!Number.isFinite(value)) return 'n/a';
+  if (!Number.isFinite(value)) return '–';
   if (value === 0) return '0';
   const size = Math.abs(value);
   if (size < 1e-4 || size >= 1e6) return value.toExponential(3);

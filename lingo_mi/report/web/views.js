@@ -1,4 +1,5 @@
-// Held-out views with a slider over their angles: rendered, measured, difference. Lines for a detector of one row.
+// Held-out views with a slider over their angles: rendered, measured, residual; and the residual of every view. Lines for a
+// detector of one row.
 
 class Views {
   constructor(root, known, arrays, maps) {
@@ -33,9 +34,11 @@ class Views {
     if (known.total > count) said.push(`${count} of ${known.total} are in this page.`);
     if (known.binning > 1) said.push(`Each pixel here is the mean of ${known.binning} × ${known.binning}.`);
     this.note = text('p', said.join(' '), { class: 'note' });
+    this.byView = element('div', { class: 'chart' });
+    new ResizeObserver(() => this.paintByView()).observe(this.byView);
     if (this.lines) {
       this.chart = element('div', { class: 'chart' });
-      this.root.replaceChildren(bar, this.chart, this.note);
+      this.root.replaceChildren(bar, this.chart, this.byView, this.note);
       this.draw();
       return;
     }
@@ -51,7 +54,7 @@ class Views {
     }
     this.readout = text('p', ' ', { class: 'note', 'aria-live': 'polite' });
     this.scales = element('div', { class: 'scales' });
-    this.root.replaceChildren(bar, this.grid, this.scales, this.readout, this.note);
+    this.root.replaceChildren(bar, this.grid, this.scales, this.readout, this.byView, this.note);
     new ResizeObserver(this.draw).observe(this.grid);
   }
 
@@ -99,6 +102,7 @@ class Views {
 
   paint() {
     const { known } = this;
+    this.paintByView();
     const angle = `${known.angles[this.at].toFixed(1)}°`;
     this.slider.set(this.at, `${this.at + 1} of ${known.shape[0]}, at ${angle}`);
     if (this.lines) return this.paintLines();
@@ -129,6 +133,12 @@ class Views {
     }
     this.scales.replaceChildren(scaleBar(this.maps.grey, 'ln(I0/I)', ...known.window));
     if (known.reference !== null) this.scales.append(scaleBar(this.maps.difference, 'difference', -width / 20, width / 20));
+  }
+
+  paintByView() {
+    const { residual } = this.known;
+    if (!residual || residual.rms.length < 3) return;
+    lineChart(this.byView, 'angle [°]', residual.angles, [{ name: 'Residual of the view, rms', values: residual.rms }]);
   }
 
   paintLines() {
