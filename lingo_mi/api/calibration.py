@@ -13,7 +13,7 @@ from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.inspection.air import air_of, steady
-from lingo_mi.inspection.measure import INTENSITIES, looks_like_intensities
+from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scan import Dataset, Scan
 
@@ -88,8 +88,7 @@ def calibrate(
     for name, value in dict(air=air, gain=gain, scatter=scatter).items():
         require_type(name, value, bool)
     train = scan.train if isinstance(scan, Dataset) else scan
-    if looks_like_intensities(train):
-        warnings.warn(INTENSITIES, stacklevel=2)
+    warn_of_intensities(train)
     measured, level, notes = line_integrals(train), None, ()
     if not (air or scatter):  # scattered light shows beside the object, too
         notes = (NO_AIR,) if air_of(measured) is None else ()

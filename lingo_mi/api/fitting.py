@@ -19,6 +19,7 @@ from lingo_mi.fitting.measure import few_views, quick_measure
 from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.fitting.save import result_names
+from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.results.watch import watched
 from lingo_mi.results.watchers import watchers_of
 from lingo_mi.scan import Dataset, Scan
@@ -101,6 +102,8 @@ def fit(
     require_type('live', live, bool)
     seed = parsing.seed(seed)
     dataset = with_held_out(scan, hold_out)
+    if dataset.volume is None:  # else it is simulated, as a rule
+        warn_of_intensities(dataset.train)
     chosen = method.changed(**options) if isinstance(method, Method) else method_of(method, **options)
     if resume and folder is None:
         raise InputError('resume=True needs the folder of the checkpoint to go on from: give folder=FOLDER')

@@ -20,6 +20,7 @@ from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_st
 from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
 from lingo_mi.fitting.fit import Fit
+from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.reconstruction import FDK, Algorithm, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
@@ -129,6 +130,8 @@ def reconstruct(
     scan = scan.train if isinstance(scan, Dataset) else scan
     require_rays(scan.geometry)
     require_signal(scan)
+    if truth is None:  # else it is simulated, as a rule
+        warn_of_intensities(scan)
     if slab is None:  # else the slabs are checked
         seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
         both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.inspection.measure import INTENSITIES, Findings
+from lingo_mi.inspection.measure import Findings, said_of_intensities
 from lingo_mi.scan import Scan
 
 CALIBRATE = '; lingo-mi calibrate finds an axis off centre all the same'
@@ -27,7 +27,7 @@ def facts(scan: Scan, found: Findings) -> list[str]:
         f'{len(scan)} views of {nv} x {nu} pixels of {dv:.4g} x {du:.4g} mm, {geometry.mode} beam{lengths}; '
         f'{found.invalid:.2%} of the pixels are left out'
     ]
-    if found.intensities:
+    if found.intensities is not None:
         return lines
     if (border := found.border) is not None:
         if border.air is None:
@@ -79,8 +79,8 @@ def _orbit(scan, found):
 def advice(scan: Scan, found: Findings) -> list[str]:
     """Sentences that say what to correct, and how; none for a sound scan."""
     border, lines = found.border, []
-    if found.intensities:
-        return [INTENSITIES]
+    if found.intensities is not None:
+        return [said_of_intensities(found.intensities)]
     if found.negative:
         lines.append(
             'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '

@@ -42,7 +42,7 @@ def main() -> None:
     scan = read_scan(args.scan).train
     found = measure(scan)
     measured, wrong = facts(scan, found), advice(scan, found)
-    if not found.misplaced and not found.suspects and not found.intensities:
+    if not found.misplaced and not found.suspects and found.intensities is None:
         faults, obstacle = _compare_views(scan)
         measured, wrong = measured + obstacle, wrong + faults
     print('\n'.join(measured))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,7 +12,7 @@ from lingo_mi.geometry.circle import CircularGeometry
 from lingo_mi.inspection.air import Air, steady
 from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
 from lingo_mi.inspection.jitter import outline_jitter
-from lingo_mi.raw.line_integrals import photons_of_images
+from lingo_mi.raw.line_integrals import MOST_VIEWS, photons_of_images
 from lingo_mi.scan import Scan
 
 COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
@@ -23,10 +24,6 @@ UNEQUAL_AIR = 0.01  # relative to the highest line integral
 UNSTEADY_AIR = 0.002  # likewise, where air is clear of the object in all views
 BRIGHT, FLAT = 0.85, 0.25  # air in intensities: this part of the highest, and within this part of the contrast
 DARK = 0.7  # of the air in intensities: the object lies below
-INTENSITIES = (
-    'these look like intensities, not line integrals: values are highest, and alike, at the edges; import the frames with '
-    'lingo-mi import, or give -numpy.log(I / I0), with I0 the intensity beside the object'
-)
 HALF_TURN = 175  # degrees: views of less do not tell the axis
 WIDE = 2  # half a panel over its distance from the source, which no panel has
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
@@ -112,8 +109,8 @@ class Findings:
         99.5th percentile and maximum of the line integrals.
     negative : bool
         Whether the line integrals look like ln(I / I0) instead of ln(I0 / I).
-    intensities : bool
-        Whether they look like intensities: see `looks_like_intensities`.
+    intensities : float or None
+        The intensity beside the object, if they look like intensities: see `open_beam`.
     border : Border or None
         None if no pixel at the left or right edge is valid.
     air : Air or None
@@ -140,7 +137,7 @@ class Findings:
     high: float
     highest: float
     negative: bool
-    intensities: bool
+    intensities: float | None
     border: Border | None
     air: Air | None
     photons: float | None
@@ -211,8 +208,8 @@ def measure(scan: Scan) -> Findings:
     border = _border(p, valid, high)
     given, (scan, level) = scan, steady(scan)
     p, air = scan.projections, 0.0 if level else (border and border.air) or 0.0
-    intensities = looks_like_intensities(given)
-    photons = np.inf if intensities else photons_of_images(p, scan.valid)
+    intensities = open_beam(given)
+    photons = np.inf if intensities is not None else photons_of_images(p, scan.valid)
     clipped = float((given.projections[valid] == highest).mean())
     many = clipped > 1e-3 and clipped * valid.sum() > 2 * len(scan) and highest > 0
     mass = np.array([(view[known].mean() - air) if known.any() else 0.0 for view, known in zip(p, valid)])
@@ -239,18 +236,35 @@ def measure(scan: Scan) -> Findings:
     )
 
 
-def looks_like_intensities(scan: Scan) -> bool:
-    """Whether projections are highest, and alike, at the left and right edge of the panel, as intensities of air are."""
+def said_of_intensities(I0: float) -> str:
+    """What to do with projections that are intensities, `I0` beside the object."""
+    return (
+        'these look like intensities, not line integrals: values are highest, and alike, at the edges of the panel; write '
+        f'input: intensity and I0: {I0:.4g} into the geometry file (.yml), import the frames with lingo-mi import, or give '
+        f'-numpy.log(I / {I0:.4g})'
+    )
+
+
+def warn_of_intensities(scan: Scan) -> None:
+    """Warn if the projections of a scan look like intensities."""
+    if (I0 := open_beam(scan)) is not None:
+        warnings.warn(said_of_intensities(I0), stacklevel=3)
+
+
+def open_beam(scan: Scan) -> float | None:
+    """The intensity beside the object, if projections look like intensities: highest, and alike, at the left and right edge of
+    the panel. None if they do not. Of many views, 64 are looked at."""
+    if len(scan) > MOST_VIEWS:
+        scan = scan.subset(np.arange(MOST_VIEWS) * len(scan) // MOST_VIEWS)
     p, edge = scan.projections, max(1, scan.geometry.nDetector[1] // 64)
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     sides = np.concatenate([p[:, :, part][valid[:, :, part]] for part in (slice(0, edge), slice(-edge, None))])
     if not sides.size:
-        return False
+        return None
     low, high = np.percentile(p[valid], [1, 99])
     air, spread = np.median(sides), np.ptp(np.percentile(sides, [5, 95]))
-    return bool(
-        air > 0 and low > -0.05 * air and low < DARK * air and air > BRIGHT * high and spread < FLAT * (air - low)
-    )
+    alike = air > 0 and low > -0.05 * air and low < DARK * air and air > BRIGHT * high and spread < FLAT * (air - low)
+    return float(air) if alike else None
 
 
 def _border(p, valid, high):

@@ -160,7 +160,7 @@ def draw_views(fig: Any, data: Any) -> None:
 def _residual(data, view):
     """The residual of a view, for its title."""
     rms = (data.metrics.get('residual_by_view') or {view: None})[view]
-    return '' if rms is None else f', residual {rms:.3g} rms'
+    return '' if rms is None else f'\nresidual {rms:.3g} rms'
 
 
 def _draw_lines(fig, data, chosen, titles):

@@ -29,7 +29,7 @@ QUALITY = {
     ),
     'psnr_2d': Number(
         'PSNR 2D, held-out views as they are', 'dB', '.2f',
-        'The same for views that the fit has never seen, against the largest line integral in them. More is better.',
+        'Mean squared error of views that the fit has never seen, against the largest line integral in them. More is better.',
     ),
     'ssim_2d': Number(
         'SSIM 2D, held-out views as they are', '', '.4f',
