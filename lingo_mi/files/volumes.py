@@ -19,6 +19,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -192,8 +193,8 @@ def read_volume(
     dtype
         Of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3 `foot`.
     spacing : array_like or None
-        Voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm); TIFF has it where ImageJ or OME wrote
-        it.
+        Voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm, with a warning); TIFF has it where
+        ImageJ or OME wrote it.
     hu : bool or None
         Whether the values are Hounsfield units, if that is not clear from the values.
 
@@ -247,6 +248,11 @@ def read_volume(
                 f'spacing=({x:g}, {y:g}, MM)'
             )
     if affine is None:
+        if spacing is None:
+            warnings.warn(
+                f'{path}: does not say its voxel size, and 1 mm is taken: give spacing=MM, or a format that has it',
+                stacklevel=2,
+            )
         try:
             steps = np.atleast_1d(np.asarray(1.0 if spacing is None else spacing, float))
         except (TypeError, ValueError):

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import time
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -255,7 +256,11 @@ def test_npy_and_npz(tmp_path):
     assert v.spacing == SPACING
     np.testing.assert_allclose(v.affine, centred_affine(SHAPE, SPACING))
     np.testing.assert_allclose(v.affine[:3, 3], [-0.75, -2, -6.25])
-    assert read_array(tmp_path, COUNTS).spacing == (1, 1, 1)
+    with pytest.warns(UserWarning, match='v.npy: does not say its voxel size, and 1 mm is taken: give spacing=MM'):
+        assert read_array(tmp_path, COUNTS).spacing == (1, 1, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        read_array(tmp_path, COUNTS, spacing=1)
     np.savez(tmp_path / 'v.npz', volume=COUNTS, spacing=SPACING)
     np.testing.assert_allclose(read_volume(tmp_path / 'v.npz').data, COUNTS / 119, rtol=1e-6)
 
