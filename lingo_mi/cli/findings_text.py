@@ -79,8 +79,18 @@ def _orbit(scan, found):
 def advice(scan: Scan, found: Findings) -> list[str]:
     """Sentences that say what to correct, and how; none for a sound scan."""
     border, lines = found.border, []
+    if found.text_order is not None:
+        lines.append(
+            'the views are sorted by their names as text, 10 before 2: sort them by number, as lingo-mi import does with frames; '
+            'what is said here of views is of that order'
+        )
+    if found.dead_columns:
+        lines.append(
+            f'{_named(found.dead_columns, "column")} dead, the same in all views: mark in the mask `valid`, as lingo-mi import '
+            'does with flat fields'
+        )
     if found.intensities is not None:
-        return [said_of_intensities(found.intensities)]
+        return [*lines, said_of_intensities(found.intensities)]
     if found.negative:
         lines.append(
             'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
@@ -171,6 +181,6 @@ def _cut(found):
     return [(name, views) for name, views in sides if views]
 
 
-def _named(views):
-    text = ', '.join(map(str, views[:6])) + (', ...' if len(views) > 6 else '')
-    return f'view {text} is' if len(views) == 1 else f'views {text} are'
+def _named(numbers, what='view'):
+    text = ', '.join(map(str, numbers[:6])) + (', ...' if len(numbers) > 6 else '')
+    return f'{what} {text} is' if len(numbers) == 1 else f'{what}s {text} are'

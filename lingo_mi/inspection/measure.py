@@ -11,7 +11,9 @@ import numpy as np
 from lingo_mi.geometry.circle import CircularGeometry
 from lingo_mi.inspection.air import Air, steady
 from lingo_mi.inspection.consistency import Plane, best_shift, disagreement, swapped
+from lingo_mi.inspection.dead_columns import dead_columns
 from lingo_mi.inspection.jitter import outline_jitter
+from lingo_mi.inspection.text_order import text_order
 from lingo_mi.raw.line_integrals import MOST_VIEWS, photons_of_images
 from lingo_mi.scan import Scan
 
@@ -123,6 +125,11 @@ class Findings:
         Mean line integral of every view, air subtracted.
     mass_spread : float or None
         Relative standard deviation of the masses of the views of a parallel beam; None if they need not be equal.
+    text_order : ndarray of shape (n,), or None
+        The place of every view in the order of the numbers, if the views were sorted as text; what else is said of the views is
+        of this order. None if they were not.
+    dead_columns : list of int
+        Columns that show the same in all views; they are left out of what follows.
     black, doubled : list of int
         Views without an object, and views equal to the one before.
     jitter : tuple of float
@@ -144,6 +151,8 @@ class Findings:
     clipped: float | None
     mass: np.ndarray
     mass_spread: float | None
+    text_order: np.ndarray | None
+    dead_columns: list[int]
     black: list[int]
     doubled: list[int]
     jitter: tuple[float, float]
@@ -157,9 +166,11 @@ class Findings:
 
     @property
     def misplaced(self) -> bool:
-        """Whether angles or distances are wrong."""
+        """Whether angles, order or distances are wrong."""
         o = self.orbit
-        return bool(self.wide or o.turn == 0 or o.unit or o.reversed is not None or o.off_axis)
+        return bool(
+            self.text_order is not None or self.wide or o.turn == 0 or o.unit or o.reversed is not None or o.off_axis
+        )
 
     @property
     def air_is_off(self) -> bool:
@@ -202,6 +213,12 @@ def measure(scan: Scan) -> Findings:
     >>> measure(scan).orbit.off_axis
     False
     """
+    valid = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
+    invalid, place, dead = float(1 - valid.mean()), text_order(scan), dead_columns(scan)
+    if place is not None:
+        scan = _at(scan, place)
+    if dead:
+        scan = _without(scan, dead)
     p = scan.projections
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     high, highest = float(np.percentile(p[valid], 99.5)), float(p[valid].max())
@@ -217,7 +234,7 @@ def measure(scan: Scan) -> Findings:
     suspects = [*black, *doubled]
     truncated = border is not None and (border.cut_sides or border.cut_ends)
     return Findings(
-        invalid=float(1 - valid.mean()),
+        invalid=invalid,
         high=high,
         highest=highest,
         negative=bool(-np.percentile(given.projections[valid], 0.5) > 2 * max(high, 0)),
@@ -228,12 +245,27 @@ def measure(scan: Scan) -> Findings:
         clipped=clipped if many else None,
         mass=mass,
         mass_spread=None if truncated else _mass_spread(scan, np.delete(mass, suspects)),
+        text_order=place,
+        dead_columns=dead,
         black=black,
         doubled=doubled,
         jitter=(np.nan, np.nan) if suspects else _jitter(scan, air),
         wide=_too_wide(scan),
         orbit=_orbit(scan, air, suspects),
     )
+
+
+def _at(scan, place):
+    """The scan with its views moved to these places."""
+    index = np.argsort(place)
+    valid = None if scan.valid is None else scan.valid[index]
+    return replace(scan, projections=scan.projections[index], valid=valid)
+
+
+def _without(scan, columns):
+    valid = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid.copy()
+    valid[:, :, columns] = False
+    return replace(scan, valid=valid)
 
 
 def said_of_intensities(I0: float) -> str:

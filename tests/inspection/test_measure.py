@@ -13,6 +13,7 @@ from lingo_mi.cli.findings_text import advice, facts
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import measure, open_beam
 from lingo_mi.inspection.sheet import draw
+from lingo_mi.inspection.text_order import text_order
 
 
 def advised(scan):
@@ -61,6 +62,38 @@ def test_doubled_and_black_views(foot):
     p = foot.projections.copy()
     p[7] = 0
     assert only(lm.Scan(foot.geometry, p), 'view 7 is black or empty').suspects == [7]
+
+
+@pytest.mark.parametrize('first', [0, 1])
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+def test_frames_sorted_by_name(mode, first):
+    """As text: 0, 1, 10, 11, ..."""
+    scan = scanned('chest', mode, views=60)
+    order = np.array(sorted(range(first, first + 60), key=str)) - first
+    noise = np.random.default_rng(0).normal(0, 0.002 * scan.projections.max(), scan.projections.shape)
+    found = only(lm.Scan(scan.geometry, (scan.projections + noise)[order]), 'sorted by their names as text')
+    np.testing.assert_array_equal(found.text_order, order)
+
+
+def test_views_of_any_other_order_are_not_sorted_by_name():
+    scan = scanned('foot', views=60)
+    golden = np.argsort(np.arange(60) * 137.508 % 360)
+    shuffled = np.random.default_rng(0).permutation(60)
+    for order in (np.arange(60), golden):
+        assert text_order(scan.subset(order)) is None
+    assert text_order(lm.Scan(scan.geometry, scan.projections[shuffled])) is None
+
+
+@pytest.mark.parametrize('columns', [[30], [47, 48, 49]])
+@pytest.mark.parametrize('noise', [0, 0.002])
+def test_dead_columns(foot, columns, noise):
+    p = foot.projections + noise * np.random.default_rng(0).normal(size=foot.projections.shape) * foot.projections.max()
+    assert measure(lm.Scan(foot.geometry, p)).dead_columns == []
+    p[:, :, columns] = 0.3 * p.max()
+    assert only(lm.Scan(foot.geometry, p), ' dead, the same in all views').dead_columns == columns
+    valid = np.ones(p.shape, bool)
+    valid[:, :, columns] = False
+    assert measure(lm.Scan(foot.geometry, p, valid)).dead_columns == []
 
 
 def test_sense_and_unit_of_angles(foot):
