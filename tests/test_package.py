@@ -24,11 +24,11 @@ def files(folder: Path) -> set[str]:
 @pytest.fixture(scope='module')
 def built(tmp_path_factory):
     """The tree that a wheel is packed from, built from a copy of the checkout."""
-    pytest.importorskip('setuptools', '61', reason='building needs setuptools 61 or later')
+    pytest.importorskip('setuptools', '77', reason='building needs setuptools 77 or later')
     folder = tmp_path_factory.mktemp('package')
     for name in PLACES:  # links lead from the package to the folders beside it
         shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=shutil.ignore_patterns('__pycache__'))
-    for name in ('pyproject.toml', 'README.md'):
+    for name in ('pyproject.toml', 'README.md', 'LICENSE'):
         shutil.copy(ROOT / name, folder)
     command = [sys.executable, '-c', 'from setuptools import setup; setup()', 'build_py', '--build-lib', 'built']
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
