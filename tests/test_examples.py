@@ -1,6 +1,7 @@
 """Every example runs, with short fits: the gallery of the documentation runs them in full."""
 
 import ast
+import json
 import runpy
 import warnings
 from pathlib import Path
@@ -52,3 +53,16 @@ def test_example(path, variant, monkeypatch, tmp_path):
     assert all('<figure' in display or '<svg' in display for display in (found._repr_html_() for found in shown))
     assert shown or pyplot.get_fignums(), 'an example shows something'
     pyplot.close('all')
+
+
+def test_the_notebook_is_the_first_tutorial():
+    """With its outputs, but for a first cell that installs the package; `python docs/make_notebook.py` makes it."""
+    path = EXAMPLES[0].with_name('first_fit.ipynb')
+    cells = [cell for cell in json.loads(path.read_text(encoding='utf-8'))['cells'] if cell['cell_type'] == 'code']
+    assert 'pip install' in ''.join(cells[0]['source'])
+    code = '\n'.join(''.join(cell['source']) for cell in cells[1:])
+    tutorial = ast.parse(EXAMPLES[0].read_text(encoding='utf-8'))
+    assert ast.dump(ast.parse(code)) == ast.dump(ast.Module(tutorial.body[1:], []))  # without its title
+    outputs = [output for cell in cells[1:] for output in cell['outputs']]
+    assert len(outputs) > 4 and all(output['output_type'] != 'error' for output in outputs)
+    assert path.stat().st_size < 500_000
