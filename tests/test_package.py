@@ -1,12 +1,15 @@
 """What an installation holds: every module, plugin and scene of the checkout."""
 
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import lingo_mi
 
@@ -68,3 +71,27 @@ def test_import_from_the_folder_that_holds_the_clone(tmp_path):
 def test_the_citation_has_the_package_version():
     lines = (ROOT / 'CITATION.cff').read_text().splitlines()
     assert f'version: {lingo_mi.__version__}' in lines
+
+
+def test_zenodo_is_told_what_the_citation_says():
+    cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    told = json.loads((ROOT / '.zenodo.json').read_text())
+    assert told['creators'] == cited['authors'] and 'version' not in told
+    assert {name: told[name] for name in ('title', 'license', 'keywords')} == {
+        name: cited[name] for name in ('title', 'license', 'keywords')
+    }
+
+
+CONDA = {'openexr': 'openexr-python', 'matplotlib': 'matplotlib-base'}
+
+
+def test_conda_takes_what_pip_takes():
+    """But LLVM, which conda's drjit brings."""
+    recipe = yaml.safe_load((ROOT / '.github' / 'conda' / 'recipe.yaml').read_text())
+    named = re.search(r'^dependencies = \[\n(.*?)^\]', (ROOT / 'pyproject.toml').read_text(), re.MULTILINE | re.DOTALL)[
+        1
+    ]
+    needed = set()
+    for name, versions in re.findall(r'"([\w-]+)([^";]*)"', named):
+        needed.add(f'{CONDA.get(name.lower(), name.lower())} {versions}')
+    assert {need for need in recipe['requirements']['run'] if not need.startswith('python ')} == needed
