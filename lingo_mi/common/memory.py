@@ -1,15 +1,16 @@
 """How much memory this process may take for the arrays that it computes on.
 
-psutil gives the memory of the machine, also in a container, whose limit is that of its control group.
+psutil knows the memory of the machine on every system, but in a container the limit is that of the control group.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import sys
 from os import PathLike
 from pathlib import Path
+
+import psutil
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.gpu import gpu
@@ -26,7 +27,7 @@ def room() -> float:
 def host_room() -> float:
     """Bytes: the smallest of the machine's memory, the limits of the control groups that this process is in, and what its
     limit of address space leaves; infinity where none of them is known."""
-    return min(_machine(), *_control_groups(), _address_space())
+    return min(psutil.virtual_memory().total, *_control_groups(), _address_space())
 
 
 def require_room(needed: float, where: PathLike | str) -> None:
@@ -38,15 +39,11 @@ def require_room(needed: float, where: PathLike | str) -> None:
         )
 
 
-def _machine() -> float:
-    return os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') if hasattr(os, 'sysconf') else math.inf
-
-
 def _control_groups(groups: Path = Path('/proc/self/cgroup'), mounted: Path = Path('/sys/fs/cgroup')) -> list[float]:
     """The limits of this process's control groups, v1 and v2, and of those around them, where they can be read."""
     out = []
     try:
-        lines = groups.read_text().splitlines()
+        lines = groups.read_text(encoding='utf-8').splitlines()
     except OSError:
         return out
     for line in lines:
@@ -69,11 +66,7 @@ def _address_space() -> float:
     """What is left of RLIMIT_AS (`ulimit -v`): code, and what Dr.Jit has set aside, have taken some of it."""
     try:
         import resource
-
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit == resource.RLIM_INFINITY:
-            return math.inf
-        taken = int(Path('/proc/self/statm').read_text().split()[0]) * os.sysconf('SC_PAGE_SIZE')
-    except (ImportError, OSError):  # Windows, macOS
+    except ImportError:  # Windows
         return math.inf
-    return max(limit - taken, 0)
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return math.inf if limit == resource.RLIM_INFINITY else max(limit - psutil.Process().memory_info().vms, 0)

@@ -16,10 +16,18 @@ from pathlib import Path
 
 from lingo_mi.common.errors import InputError
 
+OLDEST_LLVM = 17  # Dr.Jit 1.5 refuses LLVM 14; 15 and 16 abort the process on ordinary kernels
 LLVM_HELP = (
-    'Dr.Jit needs LLVM 17 or newer on the CPU. On Linux x86-64 `pip install karellen-llvm-core` brings one; '
-    'elsewhere install LLVM and set DRJIT_LIBLLVM_PATH to its libLLVM shared library.'
+    'On the CPU, Dr.Jit needs LLVM 17 or newer: `pip install karellen-llvm-core` on Linux x86-64, `apt install libllvm19` on '
+    'other Linux, `brew install llvm` on macOS, `winget install LLVM.LLVM` on Windows; DRJIT_LIBLLVM_PATH names the shared '
+    'library of another one.'
 )
+
+# Below the folder of an environment: pip's karellen-llvm-core, and conda's libllvm.
+_IN_ENVIRONMENT = {'darwin': ('lib/libLLVM.*dylib',), 'win32': ('Library/bin/LLVM-C*.dll',)}
+_LINUX = 'lib/libLLVM.so*', 'lib/libLLVM-*.so'
+# Where Homebrew and the installer for Windows put it, in which Dr.Jit does not look.
+_INSTALLED = {'darwin': '/opt/homebrew/opt/llvm/lib/libLLVM.dylib', 'win32': r'C:\Program Files\LLVM\bin\LLVM-C.dll'}
 
 
 _LOCK = threading.RLock()
@@ -58,23 +66,28 @@ def use_threads(number: int) -> None:
 
 
 def find_libllvm() -> str | None:
-    """Point DRJIT_LIBLLVM_PATH at the libLLVM that the environment carries, unless the user has set it.
+    """Point DRJIT_LIBLLVM_PATH at the newest LLVM that the environment carries, unless the user has set it.
 
-    The bundled library goes before a system one because Dr.Jit 1.5 refuses LLVM 14, and 15 and 16 abort the process
-    on ordinary kernels. Returns the path in use, or None where only a system search is left.
+    It goes before the system's, which may be too old for Dr.Jit. Returns the path in use, or None where only Dr.Jit's own search
+    of the system is left.
     """
     if os.environ.get('DRJIT_LIBLLVM_PATH'):
         return os.environ['DRJIT_LIBLLVM_PATH']
     packages = [Path(p) for p in sys.path if p.endswith('site-packages')]
     # Two folders above it, if there are so many.
-    for root in dict.fromkeys((sys.prefix, *(str(above) for p in packages for above in p.parents[2:3]))):
-        found = sorted(
-            glob.glob(os.path.join(root, 'lib', 'libLLVM.so*')) + glob.glob(os.path.join(root, 'lib', 'libLLVM-*.so'))
-        )
+    roots = dict.fromkeys((sys.prefix, *(str(above) for p in packages for above in p.parents[2:3])))
+    carried = ([os.path.join(root, pattern) for pattern in _IN_ENVIRONMENT.get(sys.platform, _LINUX)] for root in roots)
+    for places in *carried, [_INSTALLED.get(sys.platform, '')]:
+        found = [path for place in places for path in glob.glob(place) if _numbers(path)[:1] >= [OLDEST_LLVM]]
         if found:
-            os.environ['DRJIT_LIBLLVM_PATH'] = found[0]
-            return found[0]
+            os.environ['DRJIT_LIBLLVM_PATH'] = max(found, key=_numbers)
+            return os.environ['DRJIT_LIBLLVM_PATH']
     return None
+
+
+def _numbers(path: str) -> list[int]:
+    """The version in the name of a library; where there is none, the oldest that works."""
+    return [int(number) for number in re.findall(r'\d+', os.path.basename(path))] or [OLDEST_LLVM]
 
 
 _POLICY = 'OMP_WAIT_POLICY'
@@ -113,17 +126,17 @@ def mend_llvm() -> None:
     import drjit as dr
 
     path = os.environ.get('DRJIT_LIBLLVM_PATH')
-    if dr.detail.llvm_version()[0] >= 17 or not path:
+    if dr.detail.llvm_version()[0] >= OLDEST_LLVM or not path:
         return
-    library = ctypes.CDLL(str(next(Path(dr.__file__).parent.glob('libdrjit-core.*'))))
-    known = all(hasattr(library, name) for name in (_SHUTDOWN, _INIT, _WHOS))
+    core = next(Path(dr.__file__).parent.glob('libdrjit-core.*'), None)  # Windows has another name, and other symbols
+    library = core and ctypes.CDLL(str(core))
     alive = True
-    if known:
+    if library and all(hasattr(library, name) for name in (_SHUTDOWN, _INIT, _WHOS)):
         whos = library[_WHOS]
         whos.restype = ctypes.c_char_p
         rows = re.findall(rb'^ +\d+ +LLVM +\w+ .*? (\d+)(?: +\d+ K?i?B)? *$', whos(), re.MULTILINE)
         alive = any(int(size) not in (1, _COLOUR_SAMPLES) for size in rows)
-    if alive:
+    if not library or alive:
         warnings.warn(
             f'Dr.Jit runs on LLVM {dr.detail.llvm_version()[0]}, which cannot compile its kernels: '
             'import lingo_mi before mi.set_variant, or set DRJIT_LIBLLVM_PATH',

@@ -10,7 +10,9 @@ import re
 import secrets
 import shutil
 import stat
+import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -113,7 +115,7 @@ def _temporary(path, make, remove):
         make(temporary)
         yield temporary
         _flush(temporary)
-        os.replace(temporary, path)
+        _take_place(temporary, path)
         flush_folder(path.parent)
     except OSError as error:
         raise InputError(
@@ -122,6 +124,26 @@ def _temporary(path, make, remove):
         ) from None
     finally:
         remove(temporary)
+
+
+_WINDOWS = sys.platform == 'win32'
+
+
+def _take_place(temporary, path):
+    """Give a file or folder its name.
+
+    Windows refuses a name that an empty folder has, and, while another program reads it, that of a file.
+    """
+    if _WINDOWS:
+        if path.is_dir():
+            path.rmdir()
+        for seconds in 0.01, 0.03, 0.1, 0.3, 1.0:
+            try:
+                os.replace(temporary, path)
+                return
+            except PermissionError:
+                time.sleep(seconds)
+    os.replace(temporary, path)
 
 
 def _new_file(path):

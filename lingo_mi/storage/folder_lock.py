@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import psutil
+
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.storage.file_access import leftovers, writing
 
@@ -141,15 +143,12 @@ def _owner(file: int) -> dict:
 
 def _alive(owner: dict) -> bool:
     """Whether the owner may still be running: known for processes of this computer only."""
-    if not owner or owner['host'] != socket.gethostname() or os.name == 'nt':
+    if not owner or owner['host'] != socket.gethostname():
         return True
     try:
-        os.kill(owner['pid'], 0)
-    except (ProcessLookupError, OverflowError):
+        return psutil.pid_exists(owner['pid'])
+    except OverflowError:  # no number of a process
         return False
-    except OSError:
-        return True
-    return True
 
 
 def _refusal(path: Path, owner: dict, lasting: bool) -> InputError:

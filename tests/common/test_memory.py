@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from helpers.script import FIT, SCENE
@@ -31,7 +32,14 @@ def test_limits_of_control_groups(tmp_path):
     assert memory._control_groups(tmp_path / 'none', tmp_path) == []
 
 
-@pytest.mark.skipif(not Path('/proc/self/statm').exists(), reason='asks Linux for the address space in use')
+def test_without_control_groups_and_limits(monkeypatch):
+    """As on Windows: the memory of the machine is known."""
+    monkeypatch.setitem(sys.modules, 'resource', None)
+    monkeypatch.setattr(memory, '_control_groups', lambda: [])
+    assert memory.host_room() == psutil.virtual_memory().total
+
+
+@pytest.mark.skipif(not Path('/proc/self/statm').exists(), reason='limits the address space, as Linux can')
 def test_too_little_address_space_is_one_line(tmp_path):
     (tmp_path / 'scene.xml').write_text(SCENE.replace('value="24, 24, 24"', 'value="1000, 1000, 1000"'))
     command = [

@@ -9,14 +9,63 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from lingo_mi.common.runtime import calm_openmp, find_libllvm, use_threads, warn_of_spinning
+from lingo_mi.common import runtime
+from lingo_mi.common.runtime import calm_openmp, find_libllvm, mend_llvm, use_threads, warn_of_spinning
 
 
-def test_folders_of_packages_with_few_folders_above(monkeypatch):
-    monkeypatch.delenv('DRJIT_LIBLLVM_PATH', raising=False)
+@pytest.fixture
+def no_llvm(monkeypatch):
+    monkeypatch.setenv('DRJIT_LIBLLVM_PATH', '')  # restored afterwards
     monkeypatch.setattr(sys, 'prefix', '/there_is_no_such_folder')
     monkeypatch.setattr(sys, 'path', ['site-packages', '/site-packages', '/there/site-packages'])
+
+
+def test_folders_of_packages_with_few_folders_above(no_llvm):
     assert find_libllvm() is None
+
+
+CARRIED = {  # the last one is taken
+    'linux': ['lib/libLLVM-14.so', 'lib/libLLVM.so.16.0', 'lib/libLLVM.so', 'lib/libLLVM-19.so', 'lib/libLLVM.so.20.1'],
+    'darwin': ['lib/libLLVM.14.dylib', 'lib/libLLVM.dylib', 'lib/libLLVM.20.1.dylib'],
+    'win32': ['Library/bin/LLVM-C.dll'],
+}
+
+
+@pytest.mark.parametrize('system', CARRIED)
+def test_the_newest_llvm_of_the_environment(no_llvm, monkeypatch, tmp_path, system):
+    """Of pip's package on Linux, and of conda's on each system."""
+    monkeypatch.setattr(sys, 'platform', system)
+    monkeypatch.setattr(sys, 'prefix', str(tmp_path))
+    monkeypatch.setattr(runtime, '_INSTALLED', {})
+    for name in CARRIED[system]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_libllvm() == os.environ['DRJIT_LIBLLVM_PATH'] == str(tmp_path / CARRIED[system][-1])
+
+
+def test_no_llvm_is_better_than_one_too_old(no_llvm, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, 'prefix', str(tmp_path))
+    (tmp_path / 'lib').mkdir()
+    (tmp_path / 'lib' / 'libLLVM.so.16.0').touch()
+    assert find_libllvm() is None and not os.environ['DRJIT_LIBLLVM_PATH']
+
+
+@pytest.mark.parametrize('system', ['darwin', 'win32'])
+def test_llvm_of_an_installer(no_llvm, monkeypatch, tmp_path, system):
+    monkeypatch.setattr(sys, 'platform', system)
+    monkeypatch.setitem(runtime._INSTALLED, system, str(tmp_path / 'installed'))
+    assert find_libllvm() is None
+    (tmp_path / 'installed').touch()
+    assert find_libllvm() == str(tmp_path / 'installed')
+
+
+def test_an_old_llvm_that_cannot_be_exchanged(monkeypatch, tmp_path):
+    """Dr.Jit's library has no such name on Windows: what to do is said."""
+    monkeypatch.setenv('DRJIT_LIBLLVM_PATH', 'LLVM-C.dll')
+    monkeypatch.setattr(dr.detail, 'llvm_version', lambda: (14, 0, 0))
+    monkeypatch.setattr(dr, '__file__', str(tmp_path / '__init__.py'))
+    with pytest.warns(UserWarning, match='runs on LLVM 14, .* or set DRJIT_LIBLLVM_PATH'):
+        mend_llvm()
 
 
 @pytest.mark.thorough

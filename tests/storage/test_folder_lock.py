@@ -77,6 +77,14 @@ def test_without_locks_of_the_system(tmp_path, monkeypatch, system):
     assert not (tmp_path / LOCK).exists()
 
 
+def test_a_number_that_no_process_has(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder_lock, 'fcntl', None)
+    (tmp_path / LOCK).write_text(json.dumps(dict(pid=10**30, host=socket.gethostname())))
+    with locked(tmp_path):
+        pass
+    assert not (tmp_path / LOCK).exists()
+
+
 def test_what_is_no_lock(tmp_path):
     (tmp_path / LOCK).write_text('my notes')
     with pytest.raises(InputError, match='not a lock'), locked(tmp_path):
