@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from scipy import ndimage
 
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.geometry import Geometry, Grid
+from lingo_mi.geometry import CurvedGeometry, Geometry, Grid
 from lingo_mi.geometry.rays import Index, checked_views
 
 
@@ -137,12 +138,44 @@ class Scan:
         """The same scan with other voxels."""
         return replace(self, geometry=self.geometry.on(grid))
 
+    def to_flat(self) -> Scan:
+        """The scan on a flat panel, `CurvedGeometry.to_flat`, for what knows no curved ones; a scan with a flat panel as it is.
+
+        Line integrals are interpolated along rows and columns: by cubic splines, or linearly where some pixels are not valid. A
+        pixel with such a neighbour is not valid.
+
+        Raises
+        ------
+        InputError
+            For a scan with effects, which happened in the real pixels, and as `CurvedGeometry.to_flat`.
+
+        Examples
+        --------
+        >>> flat = scan.to_flat()
+        """
+        if not isinstance(self.geometry, CurvedGeometry):
+            return self
+        if self.effects is not None:
+            raise InputError('the effects of a detector happened in its own pixels: give line integrals without effects')
+        flat, (top, bottom, left, right) = self.geometry.to_flat(), self.geometry.flat_pixels()
+        curve = self.geometry.rays(curved=True).curve
+        x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
+        out = np.empty((len(self), *x.shape), np.float32)
+        valid = None if self.valid is None else np.empty(out.shape, bool)
+        for view, image in enumerate(self.projections):
+            column, row = curve.on_panel(x, y, view)
+            out[view] = interpolated(image, column, row, 3 if valid is None else 1)
+            if valid is not None:
+                valid[view] = interpolated(self.valid[view].astype(float), column, row, 1) > 1 - 1e-6
+        return Scan(flat, out, valid)
+
     def digest(self) -> str:
         """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""
-        geometry, rays = self.geometry, self.geometry.rays()
+        geometry, rays = self.geometry, self.geometry.rays(curved=True)
         numbers = geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre, geometry.nDetector
         found = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
-        for array in (rays.source, rays.corner, rays.u, rays.v, self.projections, self.valid):
+        bend = None if rays.curve is None else rays.curve.numbers
+        for array in (rays.source, rays.corner, rays.u, rays.v, bend, self.projections, self.valid):
             found.update(b'' if array is None else np.ascontiguousarray(array).data)
         return found.hexdigest()
 
@@ -150,6 +183,11 @@ class Scan:
     def normalised(self) -> np.ndarray:
         """Line integrals in the normalised frame, float32 [view, v, u]."""
         return self.projections * np.float32(self.geometry.grid.scale)
+
+
+def interpolated(image: np.ndarray, x: np.ndarray, y: np.ndarray, order: int = 3) -> np.ndarray:
+    """An image [v, u] at pixel positions x, y, pixel centres at i + 1/2, by splines; edge values are held."""
+    return ndimage.map_coordinates(image, [y - 0.5, x - 0.5], order=order, mode='nearest')
 
 
 def require_finite(projections: np.ndarray) -> None:

@@ -12,7 +12,7 @@ Projections are stored [view, v, u], pixel centres at (i + 1/2) pixel steps. `of
 first entry lifts the panel towards +z, against the row order. Volumes are stored [x, y, z].
 
 That is the circle, a `CircularGeometry`. Any other motion is a `PosedGeometry`, with a pose for every view. The constructors
-of `Geometry` choose between the two, and whatever projects asks `rays()`.
+of `Geometry` choose between the two, and whatever projects asks `rays()`. `Geometry.curved` bends the panel of either.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from typing_extensions import Self, Unpack
 
+    from lingo_mi.geometry.curved import CurvedGeometry
+
 
 class Placement(Motion, Voxels, total=False):
     """Where scanner and volume lie, as `Geometry.cone` describes it."""
@@ -62,7 +64,7 @@ class ConeNumbers(Placement):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry(ABC):
-    """A scan with a flat panel, and the voxels to reconstruct: what every kind of scan has.
+    """A scan, and the voxels to reconstruct: what every kind of scan has.
 
     Parameters
     ----------
@@ -116,7 +118,7 @@ class Geometry(ABC):
             numbers['DSO, DSD'] = f'{self.DSO:.6g}, {self.DSD:.6g} mm'
         numbers['panel (v, u)'] = sizes(self.nDetector, self.dDetector, 'pixels')
         numbers['volume (x, y, z)'] = sizes(self.grid.shape, self.grid.spacing, 'voxels')
-        picture = drawing(self.rays(), self.nDetector, self.grid)
+        picture = drawing(self.rays(curved=True), self.nDetector, self.grid)
         return notebook.box(type(self).__name__, picture, notebook.table(numbers))
 
     # ---- constructors: the kinds that they make build on this class, so that it imports them late ---------------
@@ -265,7 +267,8 @@ class Geometry(ABC):
         -------
         Geometry
             The `CircularGeometry`, which every file format knows, for poses that are a circle's to a thousandth of a pixel (the
-            source around z, the panel upright, rows down); a `PosedGeometry` for others.
+            source around z, the panel upright, rows down); a `PosedGeometry` for others; a `CurvedGeometry` for rays that have a
+            curve.
 
         Raises
         ------
@@ -317,8 +320,14 @@ class Geometry(ABC):
         return len(self.angles)
 
     @abstractmethod
-    def rays(self) -> Rays:
-        """The rays of all views in the world frame, mm."""
+    def rays(self, curved: bool = False) -> Rays:
+        """The rays of all views in the world frame, mm.
+
+        Parameters
+        ----------
+        curved : bool
+            Whether the caller knows curved panels, whose rays have a `Rays.curve`. Those of others are refused without it.
+        """
 
     @abstractmethod
     def subset(self, index: Index) -> Geometry:
@@ -364,11 +373,66 @@ class Geometry(ABC):
         (nv, nu), (dv, du) = self.nDetector, self.dDetector
         return nv * dv, nu * du
 
-    def normalised_rays(self) -> Rays:
-        """The rays of all views in the normalised frame of the grid."""
-        rays, centre, k = self.rays(), np.array(self.grid.centre), self.grid.scale
+    def normalised_rays(self, curved: bool = False) -> Rays:
+        """The rays of all views in the normalised frame of the grid. curved: as of `rays`."""
+        rays, centre, k = self.rays(curved), np.array(self.grid.centre), self.grid.scale
         source = rays.source if rays.parallel else (rays.source - centre) * k
-        return Rays(source, (rays.corner - centre) * k, rays.u * k, rays.v * k, rays.parallel)
+        return replace(rays, source=source, corner=(rays.corner - centre) * k, u=rays.u * k, v=rays.v * k)
+
+    def curved(self, radius: float | None = None) -> CurvedGeometry:
+        """The same scan with its panel bent towards the source on a cylinder, whose axis runs along the panel's columns.
+
+        Columns are then spaced along the arc, dDetector[1] apart. The panel touches the flat one where the perpendicular from the
+        source meets it, and offDetector[1] moves the panel along its arc.
+
+        Parameters
+        ----------
+        radius : float, optional
+            Of the cylinder, mm. Without it, DSD: the axis passes through the focal spot, as in clinical scanners, and the angle
+            between neighbouring columns is dDetector[1] / DSD.
+
+        Raises
+        ------
+        InputError
+            For a parallel beam, a radius that is not positive, an arc of 180 degrees or more, rows and columns that are not at
+            right angles, and a source that does not see the whole panel from within.
+
+        Examples
+        --------
+        A clinical scanner, its panel a quarter of a pixel off:
+
+        >>> panel = dict(nDetector=(32, 736), dDetector=(1.0947, 1.2858), offDetector=(0, 1.2858 / 4))
+        >>> flat = Geometry.cone(DSO=595, DSD=1085.6, **panel, nVoxel=(256, 256, 16), dVoxel=1.6, angles=[0, 1])
+        >>> flat.curved().radius
+        1085.6
+        """
+        from lingo_mi.geometry.curved import curved
+
+        return curved(self, radius)
+
+    def source_shifted(self, shift: ArrayLike) -> Geometry:
+        """The same panels, seen from elsewhere: a flying focal spot.
+
+        Parameters
+        ----------
+        shift : [3] or [view, 3]
+            Of the source, mm: along the rows (u), against the columns (up, for an upright panel), and away from the panel.
+
+        Raises
+        ------
+        InputError
+            For another shape, and for a parallel beam.
+
+        Examples
+        --------
+        Two places along the rows in turn:
+
+        >>> scan = Geometry.cone(DSO=595, DSD=1085.6, nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0, 0.1])
+        >>> moved = scan.source_shifted([[-0.6, 0, 0], [0.6, 0, 0]])
+        """
+        from lingo_mi.geometry.constructors import source_shifted
+
+        return source_shifted(self, shift)
 
     def show(self, views: Index | None = None) -> Figure:
         """Draw the scanner to scale: rays, panel and volume, from above and from the side of the first view.
@@ -408,9 +472,9 @@ class Geometry(ABC):
         """Projection matrices [view, 3, 4] from voxel indices (i, j, k, 1) to (x w, y w, w), float64.
 
         x, y are continuous pixel positions as in `Rays`; w is the distance from the source along the panel's
-        normal over its value at the axis (parallel: 1).
+        normal over its value at the axis (parallel: 1). Positions are those on the flat panel that a curved one touches.
         """
-        out, grid = camera_matrices(self.rays()), self.grid
+        out, grid = camera_matrices(self.rays(curved=True)), self.grid
         if self.mode == 'cone':
             out *= self.DSD / self.DSO  # w = 1 on the axis instead of the panel
         first = np.array(grid.centre) + (np.array(grid.spacing) - grid.size) / 2

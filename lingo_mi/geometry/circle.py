@@ -67,8 +67,8 @@ class CircularGeometry(Geometry):
         """All numbers by name, as the class and `Geometry.per_view` take them."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
-    def rays(self) -> Rays:
-        """The rays of all views in the world frame, mm."""
+    def rays(self, curved: bool = False) -> Rays:
+        """The rays of all views in the world frame, mm: see `Geometry.rays`."""
         return scanner_rays(
             self.angles,
             self.DSO,

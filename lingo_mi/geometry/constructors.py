@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,11 +62,40 @@ def per_view(
 
 def from_poses(rays: Rays, nDetector: Any, grid: Grid) -> Geometry:
     """The scan of `Geometry.from_poses`."""
+    if rays.curve is not None:
+        return _curved(rays, nDetector, grid)
     posed = PosedGeometry(poses=rays, nDetector=nDetector, grid=grid)
     circle = circle_of(posed.poses, posed.nDetector)
     if circle is None:
         return posed
     return CircularGeometry(mode=posed.mode, nDetector=posed.nDetector, grid=grid, **circle)
+
+
+def _curved(rays, nDetector, grid):
+    from lingo_mi.geometry.curved import CurvedGeometry  # which is made of a flat one
+
+    radius = rays.curve.radius * np.linalg.norm(rays.u, axis=1)
+    if np.ptp(radius) > 1e-6 * radius.mean():
+        raise InputError('all views of a scan have one panel, and the radius of this one differs between views')
+    return CurvedGeometry(flat=from_poses(replace(rays, curve=None), nDetector, grid), radius=float(radius[0]))
+
+
+def source_shifted(geometry: Geometry, shift: ArrayLike) -> Geometry:
+    """The scan of `Geometry.source_shifted`."""
+    rays = geometry.rays()
+    if rays.parallel:
+        raise InputError('a parallel beam has no source to shift')
+    shift = limits.lengths('shift', shift)
+    if shift.shape not in ((3,), (len(rays), 3)):
+        raise InputError(
+            f'shift must be 3 numbers, or that for each of {len(rays)} views, not an array of shape {shift.shape}'
+        )
+    along, down = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays.u, rays.v))
+    away = np.cross(along, down)
+    away *= np.sign(np.sum(away * (rays.source - rays.corner), 1, keepdims=True))
+    by_u, up, back = np.broadcast_to(shift, (len(rays), 3)).T[..., None]
+    source = rays.source + by_u * along - up * down + back * away
+    return from_poses(replace(rays, source=source), geometry.nDetector, geometry.grid)
 
 
 def _taken(numbers: dict[str, Any], names) -> dict[str, Any]:

@@ -21,16 +21,15 @@ def drawing(rays: Rays, nDetector: tuple[int, int], grid: Grid) -> str:
     grid : Grid
         The volume.
     """
-    rows, columns = nDetector
     chosen = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST)).astype(int))
     sources = rays.source[chosen]
     if rays.parallel:
         sources = np.asarray(grid.centre) - 1.3 * max(grid.size) * sources
-    corner, u, v = rays.corner[0], columns * rays.u[0], rows * rays.v[0]
-    panel = np.array([corner, corner + u, corner + u + v, corner + v])
-    starts = panel - np.dot(panel - sources[0], rays.source[0])[:, None] * rays.source[0] if rays.parallel else None
+    panel = rays.outline(0, nDetector)
+    corners = panel[[0, len(panel) // 2 - 1, len(panel) // 2, -1]]
+    starts = corners - np.dot(corners - sources[0], rays.source[0])[:, None] * rays.source[0] if rays.parallel else None
     parts = [
-        _seen(across, up, sources, panel, starts, grid.low, grid.high, WIDTH * i)
+        _seen(across, up, sources, panel, corners, starts, grid.low, grid.high, WIDTH * i)
         for i, (across, up) in enumerate(((0, 1), (0, 2)))
     ]
     return (
@@ -40,9 +39,8 @@ def drawing(rays: Rays, nDetector: tuple[int, int], grid: Grid) -> str:
     )
 
 
-def _seen(across, up, sources, panel, starts, low, high, left) -> str:
-    corners = np.stack([low, high])
-    points = np.concatenate([sources, panel, corners])[:, [across, up]]
+def _seen(across, up, sources, panel, corners, starts, low, high, left) -> str:
+    points = np.concatenate([sources, panel, [low, high]])[:, [across, up]]
     least, most = points.min(0), points.max(0)
     room = np.array([WIDTH - 2 * MARGIN, HEIGHT - 2 * MARGIN - 14])
     scale = float(np.min(room / np.maximum(most - least, 1e-9)))
@@ -60,7 +58,7 @@ def _seen(across, up, sources, panel, starts, low, high, left) -> str:
     box[2, up], box[3, up] = high[up], high[up]
     box[1, up] = low[up]
     begin = [sources[0]] * 4 if starts is None else starts
-    rays = ''.join(line(INK, 0.6, begin[i], panel[i]) for i in range(4))
+    rays = ''.join(line(INK, 0.6, begin[i], corners[i]) for i in range(4))
     dots = ''.join('<circle cx="{}" cy="{}" r="2" fill="{}"/>'.format(*place(s).split(','), SOURCE) for s in sources)
     title = f'{"from above" if up == 1 else "from the side"}: {"xyz"[across]} right, {"xyz"[up]} up'
     return (

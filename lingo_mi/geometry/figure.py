@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull, QhullError
 
+from lingo_mi.geometry.curved import CurvedGeometry
 from lingo_mi.geometry.drawing import INK, PANEL, SOURCE, VOLUME
 
 if TYPE_CHECKING:
@@ -49,11 +50,12 @@ def figure(geometry: Geometry, views: np.ndarray) -> Figure:
     above.plot(0, 0, '+', color=INK, markersize=9, zorder=5)
     (rows, columns), (step_v, step_u) = geometry.nDetector, geometry.dDetector
     place = f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else ''
+    bend = f', bent by a radius of {geometry.radius:.5g} mm' if isinstance(geometry, CurvedGeometry) else ''
     count = f'{len(geometry)} view{"s" * (len(geometry) > 1)}'
     sides = ' x '.join(f'{size:.4g}' for size in geometry.grid.size)
     out.suptitle(
         f'{geometry.mode} beam, {count}{place}; panel {columns} x {rows} pixels, {columns * step_u:.4g} x '
-        f'{rows * step_v:.4g} mm; volume {sides} mm',
+        f'{rows * step_v:.4g} mm{bend}; volume {sides} mm',
         fontsize='medium',
     )
     out.legend(handles=_handles(geometry), loc='outside lower center', ncols=5, frameon=False)
@@ -62,7 +64,7 @@ def figure(geometry: Geometry, views: np.ndarray) -> Figure:
 
 def _sources(geometry: Geometry) -> np.ndarray:
     """Where the beams of all views are drawn from, [n, 3]: of a parallel beam, before the volume."""
-    rays = geometry.rays()
+    rays = geometry.rays(curved=True)
     if geometry.mode == 'cone':
         return rays.source
     return np.asarray(geometry.grid.centre) - 0.8 * np.linalg.norm(geometry.grid.size) * rays.source
@@ -70,7 +72,7 @@ def _sources(geometry: Geometry) -> np.ndarray:
 
 def _across(geometry: Geometry, view: int) -> np.ndarray:
     """The horizontal direction across a view's panel, away from its source; x where the panel lies flat."""
-    rays = geometry.rays()
+    rays = geometry.rays(curved=True)
     normal = np.cross(rays.u[view], rays.v[view])
     normal *= np.sign(normal @ (_panel(geometry, view).mean(0) - _sources(geometry)[view]))
     level = normal * [1, 1, 0]
@@ -78,10 +80,8 @@ def _across(geometry: Geometry, view: int) -> np.ndarray:
 
 
 def _panel(geometry: Geometry, view: int) -> np.ndarray:
-    """The corners of a view's panel, [4, 3]."""
-    rays, (rows, columns) = geometry.rays(), geometry.nDetector
-    u, v = columns * rays.u[view], rows * rays.v[view]
-    return rays.corner[view] + np.array([0 * u, u, u + v, v])
+    """The edge of a view's panel, [m, 3]: see `Rays.outline`."""
+    return geometry.rays(curved=True).outline(view, geometry.nDetector)
 
 
 def _draw(axes: Any, geometry: Geometry, labelled: np.ndarray, plane: np.ndarray) -> None:
@@ -104,14 +104,15 @@ def _draw(axes: Any, geometry: Geometry, labelled: np.ndarray, plane: np.ndarray
 
 def _draw_view(axes: Any, geometry: Geometry, view: int, plane: np.ndarray, opacity: float) -> None:
     """A view's source, its panel, and the rays to the panel's corners and centre, on a plane."""
-    source, panel = _sources(geometry)[view], _panel(geometry, view)
-    ends = np.array([*panel, panel.mean(0)])
+    source, panel, (rows, columns) = _sources(geometry)[view], _panel(geometry, view), geometry.nDetector
+    x, y = np.array([[0, 1, 1, 0, 0.5], [0, 0, 1, 1, 0.5]]) * [[columns], [rows]]
+    ends = geometry.rays(curved=True).points(view, x, y)
     starts = np.broadcast_to(source, ends.shape)
     if geometry.mode == 'parallel':
-        beam = geometry.rays().source[view]
+        beam = geometry.rays(curved=True).source[view]
         starts = ends - ((ends - source) @ beam)[:, None] * beam
     starts, ends, outline = starts @ plane.T, ends @ plane.T, panel @ plane.T
-    fan = np.concatenate([starts, ends])
+    fan = np.concatenate([starts, ends, outline])
     axes.add_patch(_hull(fan, facecolor=SOURCE, alpha=0.08 * opacity, linewidth=0, zorder=0))
     for i, (start, end) in enumerate(zip(starts, ends)):
         axes.plot(*zip(start, end), '--' if i == 4 else '-', color=INK, linewidth=0.8, alpha=opacity, zorder=1)

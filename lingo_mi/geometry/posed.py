@@ -61,8 +61,8 @@ class PosedGeometry(Geometry):
         nearest = float(np.linalg.norm(toward, axis=1).min())
         self._require_proportions(nearest, self.DSO, self.DSD, np.abs(rays.corner).max())
 
-    def rays(self) -> Rays:
-        """The rays of all views in the world frame, mm."""
+    def rays(self, curved: bool = False) -> Rays:
+        """The rays of all views in the world frame, mm: see `Geometry.rays`."""
         return self.poses
 
     def subset(self, index: Index) -> PosedGeometry:

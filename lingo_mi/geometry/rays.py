@@ -1,4 +1,4 @@
-"""The rays of flat-panel views: pure NumPy, no Mitsuba.
+"""The rays of views: pure NumPy, no Mitsuba.
 
 `Rays` is what every projector knows of a scan: nothing in it says that a source moves on a circle.
 """
@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, shown
+from lingo_mi.geometry.curve import Curve
 from lingo_mi.geometry.limits import LEAST_LENGTH, MOST_LENGTH, numbers
 
 Index: TypeAlias = slice | np.ndarray | list[int]  # of some views: integers [m]
@@ -43,17 +44,21 @@ def checked_views(index: Index, count: int) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """The rays of n flat-panel views.
+    """The rays of n views.
 
     The ray through the continuous pixel position (x, y), pixel centres at (i + 1/2, j + 1/2), is
 
     - `cone`: from `source` along  corner + x u + y v - source
     - `parallel`: from  corner + x u + y v  along `source`, which then holds the unit beam direction
 
+    With a `curve`, these are the flat panels that the curved ones touch, and x, y the position `curve.on_plane` of a pixel.
+
     Parameters
     ----------
     source, corner, u, v : float64 [n, 3]
         Corner is the outer corner of pixel (0, 0), u and v are one pixel long steps.
+    curve : Curve or None
+        How the panels are bent; None: they are flat.
 
     Examples
     --------
@@ -66,6 +71,7 @@ class Rays:
     u: np.ndarray
     v: np.ndarray
     parallel: bool
+    curve: Curve | None = None
 
     @classmethod
     def from_vectors(cls, vectors: ArrayLike, parallel: bool) -> Rays:
@@ -102,7 +108,8 @@ class Rays:
 
     def __getitem__(self, index: Index) -> Rays:
         """The views selected by a slice or an integer array; one view stays [1, 3] when given as a list."""
-        return Rays(self.source[index], self.corner[index], self.u[index], self.v[index], self.parallel)
+        curve = self.curve and self.curve[index]
+        return Rays(self.source[index], self.corner[index], self.u[index], self.v[index], self.parallel, curve)
 
     def centre(self, nDetector: tuple[int, int]) -> np.ndarray:
         """The panels' centres [n, 3]; nDetector is (v, u) pixels."""
@@ -113,12 +120,15 @@ class Rays:
         rotation = np.eye(3) if rotation is None else np.asarray(rotation, float)
         shift = np.zeros(3) if shift is None else np.asarray(shift, float)
         source, corner, u, v = ((rotation @ x[..., None])[..., 0] for x in (self.source, self.corner, self.u, self.v))
-        return Rays(source if self.parallel else source + shift, corner + shift, u, v, self.parallel)
+        source = source if self.parallel else source + shift
+        return replace(self, source=source, corner=corner + shift, u=u, v=v)
 
     def joined(self, other: Rays) -> Rays:
         """These views, then the other's, of the same kind of beam."""
         if self.parallel != other.parallel:
             raise InputError('views of a parallel and of a cone beam cannot be one scan')
+        if self.curve is not None or other.curve is not None:
+            raise InputError('views of curved panels are joined as geometries: see CurvedGeometry.joined')
         pairs = zip(self._arrays(), other._arrays())
         return Rays(*(np.concatenate(pair) for pair in pairs), parallel=self.parallel)
 
@@ -148,6 +158,8 @@ class Rays:
 
     def through(self, view: int, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Origins and (unnormalised) directions [..., 3] of the rays of one view at pixel positions x, y."""
+        if self.curve is not None:
+            x, y = self.curve.on_plane(x, y, view)
         x, y = np.asarray(x, float)[..., None], np.asarray(y, float)[..., None]
         point = self.corner[view] + x * self.u[view] + y * self.v[view]
         if self.parallel:
@@ -155,7 +167,10 @@ class Rays:
         return np.broadcast_to(self.source[view], point.shape), point - self.source[view]
 
     def project(self, points: ArrayLike, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Continuous pixel positions (x, y) of `points` [N, 3], NaN where a point is not in front of the source."""
+        """Continuous pixel positions (x, y) of `points` [N, 3], NaN where a point is not in front of the source.
+
+        NaN also where the ray through a point passes a curved panel's cylinder.
+        """
         points = np.asarray(points, float)
         a, b, c = self.u[view], self.v[view], self.corner[view]
         d = np.broadcast_to(self.source[view], points.shape) if self.parallel else points - self.source[view]
@@ -169,7 +184,21 @@ class Rays:
         if not self.parallel:
             hit[~(t > 0)] = np.nan
         nn = n @ n
-        return np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn
+        x, y = np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn
+        return (x, y) if self.curve is None else self.curve.on_panel(x, y, view)
+
+    def points(self, view: int, x: ArrayLike, y: ArrayLike) -> np.ndarray:
+        """Where the pixel positions x, y of a view's panel are in space, [..., 3]."""
+        start, direction = self.through(view, x, y)
+        if self.parallel:
+            return start
+        return start + direction * (1 if self.curve is None else self.curve.share(x, view)[..., None])
+
+    def outline(self, view: int, nDetector: tuple[int, int]) -> np.ndarray:
+        """The edge of a view's panel, [m, 3]: its corners, from corner along the first row; of a curved one, 16 points a side."""
+        rows, columns = nDetector
+        x = np.linspace(0, columns, 2 if self.curve is None else 16)
+        return np.concatenate([self.points(view, x, 0 * x), self.points(view, x[::-1], 0 * x + rows)])
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         return self.source, self.corner, self.u, self.v
