@@ -24,6 +24,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.bent import on_plane, tables
 
 GAUSS = 0.5 / 3**0.5  # abscissae of the two-point rule on [-1/2, 1/2]
 
@@ -264,14 +265,15 @@ def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, l
 # ------------------------------------------------------------------------------------------------------------
 
 
-def view_table(geometry: Geometry) -> np.ndarray:
+def view_table(geometry: Geometry, curved: bool = False) -> np.ndarray:
     """The rays of every view as origin and direction, each affine in the pixel position: float32 [view, 19].
 
     Lengths in mm, relative to the centre of the volume. The columns, in threes: the origin and its steps per
     pixel along u and v; the direction and its steps; last, the smallest t. The origins lie on a plane through
-    the volume's centre and are computed in float64, so a distant source costs no float32 precision.
+    the volume's centre and are computed in float64, so a distant source costs no float32 precision. Of curved panels, which are
+    refused unless `curved`, positions are those on the flat ones that they touch (`bent.on_plane`).
     """
-    rays, centre = geometry.rays(), np.array(geometry.grid.centre)
+    rays, centre = geometry.rays(curved), np.array(geometry.grid.centre)
     corner, source = rays.corner - centre, rays.source
     normal = np.cross(rays.u, rays.v)
     zero = np.zeros_like(corner)
@@ -287,15 +289,16 @@ def view_table(geometry: Geometry) -> np.ndarray:
     return np.concatenate(rows, 1).astype(np.float32)
 
 
-def view_rays(row: Any, n_v: int, n_u: int) -> tuple[Any, Any, Any]:
+def view_rays(row: Any, n_v: int, n_u: int, bend: tuple[Any, Any] = (None, None)) -> tuple[Any, Any, Any]:
     """Rays through the pixel centres of a view, v fastest: (origin, direction, t_min).
 
-    row is one row of `view_table` as an evaluated mi.Float [19]. Neighbouring lanes are neighbours along v, so
-    they cross the same columns of a volume that is stored z fastest. This is twice as fast as the other order.
+    row is one row of `view_table` as an evaluated mi.Float [19]; bend the `bent.tables` of that view. Neighbouring lanes are
+    neighbours along v, so they cross the same columns of a volume that is stored z fastest. This is twice as fast as the other
+    order.
     """
     index = dr.arange(mi.UInt, n_v * n_u)
     column = index // n_v
-    return pixel_rays(row, mi.Float(column) + 0.5, mi.Float(index - column * n_v) + 0.5)
+    return pixel_rays(row, *on_plane(bend, (n_v, n_u), mi.UInt(0), column, index - column * n_v))
 
 
 def pixel_rays(rows: Any, x: Any, y: Any, view: Any = 0) -> tuple[Any, Any, Any]:
@@ -329,13 +332,15 @@ def pixel_walk(geometry: Geometry, rows: Any, x: Any, y: Any, view: Any = 0) -> 
     )
 
 
-def view_walk(geometry: Geometry, row: Any, low: Any, high: Any) -> tuple[Walk, Any]:
+def view_walk(
+    geometry: Geometry, row: Any, low: Any, high: Any, bend: tuple[Any, Any] = (None, None)
+) -> tuple[Walk, Any]:
     """The `Walk` along the rays of a view between `low` and `high`, and the length of a unit of t.
 
-    row is one row of `view_table` as an evaluated mi.Float [19].
+    row is one row of `view_table` as an evaluated mi.Float [19]; bend the `bent.tables` of that view.
     """
     half = mi.Vector3f(*(s / 2 for s in geometry.grid.size))
-    return walk_along(geometry.grid.shape, -half, half, Lines(*view_rays(row, *geometry.nDetector)), low, high)
+    return walk_along(geometry.grid.shape, -half, half, Lines(*view_rays(row, *geometry.nDetector, bend)), low, high)
 
 
 def project_volume(
@@ -376,8 +381,10 @@ def project_volume(
     low, high = (dr.opaque(mi.Float, x) for x in occupied[0]), (dr.opaque(mi.Float, x) for x in occupied[1])
     low, high = mi.Vector3f(*low), mi.Vector3f(*high)
     data = mi.Float(volume.ravel())
-    for i, row in enumerate(view_table(geometry)):
-        walk, length = view_walk(geometry, mi.Float(row), low, high)
+    curve = geometry.rays(curved=True).curve
+    for i, row in enumerate(view_table(geometry, curved=True)):
+        bend = tables(curve and curve[[i]], geometry.nDetector[1])
+        walk, length = view_walk(geometry, mi.Float(row), low, high, bend)
         out[i] = (length * gather(data, geometry.grid.shape, walk)).numpy().reshape(geometry.nDetector[::-1]).T
         if progress:
             progress(i + 1, len(geometry))

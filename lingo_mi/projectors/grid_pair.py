@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors.bent import on_plane, tables
 from lingo_mi.projectors.grid import gather, pixel_walk, scatter, view_table
 from lingo_mi.projectors.stack import Block, Stack, Views
 from lingo_mi.projectors.upload import uploaded
@@ -30,12 +31,13 @@ class GridPair(Stack):
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry, valid)
-        self._rays = uploaded(view_table(geometry))
+        self._rays = uploaded(view_table(geometry, curved=True))
+        self._bend = tables(geometry.rays(curved=True).curve, self.panel[1])
 
     def of_slab(self, slab: Geometry) -> GridPair:
         """The matrix of the same scan for other slices of its voxels. slab: see `Geometry.slab`."""
         out = copy(self)
-        out.geometry, out.size, out._rays = slab, slab.grid.shape, uploaded(view_table(slab))
+        out.geometry, out.size, out._rays = slab, slab.grid.shape, uploaded(view_table(slab, curved=True))
         return out
 
     def forward(self, volume: Any, views: Views) -> tuple[Any, Any]:
@@ -66,5 +68,5 @@ class GridPair(Stack):
     def _walk(self, block):
         """The `Walk`s of the pixels of some views, and the length of a unit of t, in mm; zero for invalid pixels."""
         view, u, v = self.pixels_of(block)
-        walk, length = pixel_walk(self.geometry, self._rays, mi.Float(u) + 0.5, mi.Float(v) + 0.5, view)
+        walk, length = pixel_walk(self.geometry, self._rays, *on_plane(self._bend, self.panel, view, u, v), view)
         return walk, dr.select(self.used(view, u, v), length, 0)

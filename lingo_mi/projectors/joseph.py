@@ -10,7 +10,8 @@ with L the path per slice. As in `grid`, the edge value is held in the outer hal
 columns are parallel to z, so y depends on the column alone, and the few pixels with hats that cover a given voxel can be listed.
 So both directions are gathers with the same weights.
 
-Source and panel may lie anywhere else, and differ from view to view: circles, helices, shifts. `tilted_joseph` is for all others.
+Source and panel may lie anywhere else, and differ from view to view: circles, helices, shifts. The panel may be curved, since its
+columns are still parallel to z. `tilted_joseph` is for all others.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.projectors import bent
 from lingo_mi.projectors.stack import Gathered, hat, lanes, sampled, span
 from lingo_mi.projectors.upload import uploaded
 
@@ -41,12 +43,15 @@ def column_table(geometry: Geometry) -> np.ndarray:
     panel is `c + e m` (parallel: 1). The path per slice is sqrt(g + h dz^2) mm, with dz the height of the pixel above the
     source, in voxels. The columns are a, b, c, e, g, h, whether the main axis is y, and 0.
     """
-    rays, n_u = geometry.rays(), geometry.nDetector[1]
+    rays, n_u = geometry.rays(curved=True), geometry.nDetector[1]
     voxel = np.array(geometry.grid.spacing[:2])
     first = np.array(geometry.grid.centre[:2]) + (voxel - geometry.grid.size[:2]) / 2
     column = np.arange(n_u)[:, None] + 0.5
-    pixel = rays.corner[:, None, :2] + column * rays.u[:, None, :2]  # [view, u, 2], mm
+    X = column if rays.curve is None else rays.curve.columns(column[:, 0])[..., None]
+    pixel = rays.corner[:, None, :2] + X * rays.u[:, None, :2]  # [view, u, 2], mm
     source = rays.source[:, None, :2]
+    if rays.curve is not None:
+        pixel = source + rays.curve.share(column[:, 0])[..., None] * (pixel - source)
     direction = np.broadcast_to(source, pixel.shape) if rays.parallel else pixel - source
     start = pixel if rays.parallel else source
     index, step = (start - first) / voxel, direction / voxel
@@ -71,7 +76,7 @@ def column_table(geometry: Geometry) -> np.ndarray:
 
 def row_table(geometry: Geometry) -> np.ndarray:
     """Heights of the source, of the first row over it, and between rows, in voxels: float32 [view, 3]."""
-    rays, voxel = geometry.rays(), geometry.grid.spacing[2]
+    rays, voxel = geometry.rays(curved=True), geometry.grid.spacing[2]
     first = geometry.grid.centre[2] + (voxel - geometry.grid.size[2]) / 2
     source = 0.0 * rays.v[:, 2] if rays.parallel else (rays.source[:, 2] - first) / voxel
     top = (rays.corner[:, 2] + rays.v[:, 2] / 2 - first) / voxel
@@ -80,7 +85,7 @@ def row_table(geometry: Geometry) -> np.ndarray:
 
 def _is_upright(geometry: Geometry) -> bool:
     """Whether every view's columns are parallel to z and its rows, and a parallel beam, perpendicular to it."""
-    rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
+    rays, (n_v, n_u) = geometry.rays(curved=True), geometry.nDetector
     pixel = np.minimum(np.linalg.norm(rays.u, axis=1), np.linalg.norm(rays.v, axis=1))
     off = np.abs(rays.u[:, 2]) * n_u + np.linalg.norm(rays.v[:, :2], axis=1) * n_v
     if rays.parallel:
@@ -89,8 +94,11 @@ def _is_upright(geometry: Geometry) -> bool:
 
 
 def _rows_of_voxel(geometry):
-    """The largest number of rows with hats that cover a voxel; infinity where a voxel lies beside the source or behind it."""
-    rays = geometry.rays()
+    """The largest number of rows with hats that cover a voxel; infinity where a voxel lies beside the source or behind it.
+
+    A curved panel stands before the flat one that it touches, where its rows are no further apart in voxels.
+    """
+    rays = geometry.rays(curved=True)
     nearest = _nearest(rays, geometry)
     if nearest <= 0:
         return np.inf
@@ -111,8 +119,8 @@ def _nearest(rays: Rays, geometry):
 class Joseph(Gathered):
     """The matrix A of a scan with an upright panel: see `Gathered`.
 
-    On the device: `columns` and `rows`, see `column_table` and `row_table`; `matrices`, see `_column_matrix`. `margin`
-    rows of zeros above and below images are at least as many as the rows with hats that cover a voxel.
+    On the device: `columns` and `rows`, see `column_table` and `row_table`; `matrices`, see `_column_matrix`; `bends`, see
+    `bent.tables`. `margin` rows of zeros above and below images are at least as many as the rows with hats that cover a voxel.
 
     Parameters
     ----------
@@ -125,7 +133,7 @@ class Joseph(Gathered):
         For a scan that it does not serve (see `serves`), or a volume of 2^32 voxels or more.
     """
 
-    ARRAYS = ('columns', 'rows', 'matrices', 'valid')
+    ARRAYS = ('columns', 'rows', 'matrices', 'bends', 'valid')
     SETTINGS = (*Gathered.SETTINGS, 'margin')
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
@@ -138,6 +146,7 @@ class Joseph(Gathered):
         self.margin = rows if rows <= ROWS else -(-rows // ROWS) * ROWS
         self.columns, self.rows = (uploaded(table(geometry)) for table in (column_table, row_table))
         self.matrices = uploaded(self._column_matrix())
+        _, self.bends = bent.tables(geometry.rays(curved=True).curve, self.panel[1])
 
     @classmethod
     def serves(cls, geometry: Geometry) -> bool:
@@ -222,6 +231,11 @@ def _weighted(images, chosen, A: Joseph, ones):
     return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
 
+def _on_arc(low, high, numbers):
+    """Ends of a shadow along u, on the curved panel. numbers: see `bent.numbers_of`."""
+    return bent.column_of(numbers, low), bent.column_of(numbers, high)
+
+
 @dr.syntax
 def _collect(weighted, chosen, n_views, A: Joseph, ones):
     """See `Gathered`. A lane computes only once what does not depend on z."""
@@ -243,6 +257,7 @@ def _collect(weighted, chosen, n_views, A: Joseph, ones):
         spots = [(top_u + s * r[i]) * dr.rcp(dr.maximum(bottom + s * r[i + 3], 1e-6)) for i in (0, 1) for s in (-1, 1)]
         low = dr.minimum(dr.minimum(spots[0], spots[1]), dr.minimum(spots[2], spots[3]))
         high = dr.maximum(dr.maximum(spots[0], spots[1]), dr.maximum(spots[2], spots[3]))
+        low, high = (low, high) if A.bends is None else _on_arc(low, high, bent.numbers_of(A.bends, view))
         u = dr.ceil(dr.clip(low - 0.501, 0, n_u))
         u_last = dr.floor(dr.clip(high - 0.499, -1, n_u - 1))
         while u <= u_last:

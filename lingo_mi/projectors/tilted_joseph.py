@@ -1,8 +1,8 @@
-"""Joseph's projector and its exact transpose for any flat panel: turned, tilted, laminography (Dr.Jit, llvm or cuda).
+"""Joseph's projector and its exact transpose for any panel: turned, tilted, laminography (Dr.Jit, llvm or cuda).
 
 The model is that of `joseph`, but the main axis of a ray may also be z. Nothing is scattered here either: a voxel gathers from
-the pixels within the shadow of its neighbours, a rectangle, and computes the weight of each. Before an upright panel, `joseph`
-is faster, since a voxel's weights in a column have much in common.
+the pixels within the shadow of its neighbours, a rectangle on a flat panel, and computes the weight of each. Before an upright
+panel, `joseph` is faster, since a voxel's weights in a column have much in common.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.projectors import bent
 from lingo_mi.projectors.grid import view_table
 from lingo_mi.projectors.stack import Gathered, hat, lanes, sampled, span
 from lingo_mi.projectors.upload import uploaded
@@ -30,7 +31,7 @@ def ray_table(geometry: Geometry) -> np.ndarray:
     In threes: the origin and its steps per pixel along u and v; the direction and its steps; the size of a voxel, mm. See
     `grid.view_table`, whose rays these are.
     """
-    threes = view_table(geometry)[:, :18].astype(float).reshape(-1, 6, 3) / geometry.grid.spacing
+    threes = view_table(geometry, curved=True)[:, :18].astype(float).reshape(-1, 6, 3) / geometry.grid.spacing
     threes[:, 0] += (np.array(geometry.grid.shape) - 1) / 2
     voxel = np.broadcast_to(geometry.grid.spacing, (len(threes), 1, 3))
     return np.concatenate([threes, voxel], 1).reshape(-1, RAY).astype(np.float32)
@@ -39,7 +40,7 @@ def ray_table(geometry: Geometry) -> np.ndarray:
 class TiltedJoseph(Gathered):
     """The matrix A of a scan: see `Gathered`.
 
-    On the device: `rays`, see `ray_table`; `matrices`, see `Geometry.voxel_matrices`.
+    On the device: `rays`, see `ray_table`; `matrices`, see `Geometry.voxel_matrices`; `columns` and `bends`, see `bent.tables`.
 
     Parameters
     ----------
@@ -52,12 +53,13 @@ class TiltedJoseph(Gathered):
         For a source beside or inside the volume (see `serves`), or a volume of 2^32 voxels or more.
     """
 
-    ARRAYS = ('rays', 'matrices', 'valid')
+    ARRAYS = ('rays', 'matrices', 'columns', 'bends', 'valid')
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None = None):
         super().__init__(geometry, valid)
         if not self.serves(geometry):
             raise InputError('this projector needs a source that is not beside or inside the volume')
+        self.columns, self.bends = bent.tables(geometry.rays(curved=True).curve, self.panel[1])
         self._place(geometry)
 
     @classmethod
@@ -65,7 +67,7 @@ class TiltedJoseph(Gathered):
         """Whether it can project a scan: all of the volume, and a voxel around it, must lie before the source."""
         if geometry.mode == 'parallel':
             return True
-        rays, half = geometry.rays(), np.array(geometry.grid.size) / 2 + geometry.grid.spacing
+        rays, half = geometry.rays(curved=True), np.array(geometry.grid.size) / 2 + geometry.grid.spacing
         signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(-1, 1, 3)
         normal = np.cross(rays.u, rays.v)
         ahead = ((geometry.grid.centre + half * signs - rays.source) * normal).sum(-1)
@@ -82,12 +84,16 @@ class TiltedJoseph(Gathered):
         self.rays = uploaded(ray_table(geometry))
         self.matrices = uploaded(geometry.voxel_matrices())
 
+    def _ray(self, view, u, v):
+        """The rays through the centres of pixels."""
+        return Ray.through(self.rays, view, *bent.on_plane((self.columns, self.bends), self.panel, view, u, v))
+
     def _integrate(self, volume, view, u, v):
-        return _integrate(volume, self.size, Ray.through(self.rays, view, u, v))
+        return _integrate(volume, self.size, self._ray(view, u, v))
 
     def _weighted(self, images, block, ones):
         pixels = self.pixels_of(block)
-        path = dr.select(self.used(*pixels), Ray.through(self.rays, *pixels).path, 0)
+        path = dr.select(self.used(*pixels), self._ray(*pixels).path, 0)
         value = dr.select(path > 0, path * images, 0)  # whatever stands in invalid pixels
         return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
@@ -140,11 +146,10 @@ class Ray:
         self.path = dr.norm(direction * voxel) * dr.abs(inv)
 
     @classmethod
-    def through(cls, rays, view, u, v):
-        """Through the centres of pixels. rays: see `ray_table`."""
+    def through(cls, rays, view, x, y):
+        """Through positions on the (flat) panel. rays: see `ray_table`."""
         o, o_u, o_v, d, d_u, d_v, voxel = _threes(rays, view)
-        u, v = mi.Float(u) + 0.5, mi.Float(v) + 0.5
-        return cls(_affine(_affine(o, o_u, u), o_v, v), _affine(_affine(d, d_u, u), d_v, v), voxel)
+        return cls(_affine(_affine(o, o_u, x), o_v, y), _affine(_affine(d, d_u, x), d_v, y), voxel)
 
     def weight(self, point, size):
         """Of the voxel with the indices `point`, but for the path."""
@@ -174,8 +179,8 @@ def _integrate(data, size, ray: Ray):
     return ray.path * total, ray.path * count
 
 
-def _shadow(r, point, counts):
-    """The pixels with rays that may pass within a voxel of `point` in its slice: first and last (u, v), as floats.
+def _shadow(r, point):
+    """The positions of rays that may pass within a voxel of `point` in its slice, on the (flat) panel: middle and reach of both.
 
     A shift by s moves the shadow along u by (p - u w) s / (w0 + w s), with p and w rows of the projection matrix r and w0 the
     point's value of w. One entry of s, that along the main axis, is zero.
@@ -185,11 +190,27 @@ def _shadow(r, point, counts):
     w, inv = rows[2], dr.rcp(w0)
     scale = dr.rcp(dr.maximum(w0 - dr.abs(w[0]) - dr.abs(w[1]) - dr.abs(w[2]), 1e-6))
     out = []
-    for row, top, count in ((rows[0], u0 * inv, counts[0]), (rows[1], v0 * inv, counts[1])):
+    for row, top in ((rows[0], u0 * inv), (rows[1], v0 * inv)):
         x, y, z = (dr.abs(row[i] - top * w[i]) for i in range(3))
-        reach = (x + y + z - dr.minimum(dr.minimum(x, y), z)) * scale + (SLACK - 0.5)
-        out += [dr.ceil(dr.clip(top - 1 - reach, 0, count)), dr.floor(dr.clip(top + reach, -1, count - 1))]
+        out += [(top, (x + y + z - dr.minimum(dr.minimum(x, y), z)) * scale + (SLACK - 0.5))]
     return out
+
+
+def _pixels(middle, reach, count):
+    """The first and the last pixel whose centres are within `reach` and half a pixel of a position, as floats."""
+    return dr.ceil(dr.clip(middle - 1 - reach, 0, count)), dr.floor(dr.clip(middle + reach, -1, count - 1))
+
+
+def _on_arc(middle, reach, numbers):
+    """Middle and reach of a shadow along u, on the curved panel. numbers: see `bent.numbers_of`."""
+    low, high = (bent.column_of(numbers, middle + s * (reach + 0.5)) for s in (-1, 1))
+    return 0.5 * (low + high), 0.5 * (high - low) + (SLACK - 0.5)
+
+
+def _at_column(middle, reach, numbers, scale):
+    """Middle and reach of a shadow along v, in a column of the curved panel whose s is `scale`."""
+    foot, inv = numbers[3], dr.rcp(scale)
+    return dr.fma(middle - foot, inv, foot), (reach + 0.5) * inv + (SLACK - 0.5)
 
 
 @dr.syntax
@@ -198,21 +219,28 @@ def _collect(weighted, chosen, n_views, A: TiltedJoseph, ones):
     (nx, ny, nz), (n_v, n_u), rays, matrices = A.size, A.panel, A.rays, A.matrices
     (voxels, exists), (x, y, z0), stride = lanes(A.size, RUN)
     run = len(voxels)
+    curved = A.columns is not None
     sums = [[mi.Float(0) for _ in range(2 if ones else 1)] for _ in range(run)]
     block = mi.UInt(0)
     while block < n_views:
         view = dr.gather(mi.UInt, chosen, block)
         r = [dr.gather(mi.Float, matrices, view * 12 + i) for i in range(12)]
         o, o_u, o_v, d, d_u, d_v, voxel = _threes(rays, view)
+        numbers = bent.numbers_of(A.bends, view) if curved else None
         for s in range(run):
             z = z0 + s * stride
-            u, u_last, v_first, v_last = _shadow(r, (x, y, z), (n_u, n_v))
+            along_u, along_v = _shadow(r, (x, y, z))
+            u, u_last = _pixels(*(_on_arc(*along_u, numbers) if curved else along_u), n_u)
+            v_first, v_last = _pixels(*along_v, n_v)
             while u <= u_last:
-                origin, direction = _affine(o, o_u, u + 0.5), _affine(d, d_u, u + 0.5)
-                v = mi.Float(v_first)
+                X, scale = bent.column(A.columns, A.panel, view, mi.UInt(u)) if curved else (u + 0.5, None)
+                first, last = _pixels(*_at_column(*along_v, numbers, scale), n_v) if curved else (v_first, v_last)
+                origin, direction = _affine(o, o_u, X), _affine(d, d_u, X)
+                v = mi.Float(first)
                 column = (block * n_u + mi.UInt(u)) * n_v
-                while v <= v_last:
-                    ray = Ray(_affine(origin, o_v, v + 0.5), _affine(direction, d_v, v + 0.5), voxel)
+                while v <= last:
+                    Y = dr.fma(scale, (v + 0.5) - numbers[3], numbers[3]) if curved else v + 0.5
+                    ray = Ray(_affine(origin, o_v, Y), _affine(direction, d_v, Y), voxel)
                     w = ray.weight((x, y, z), (nx, ny, nz))
                     here = column + mi.UInt(v)
                     p = dr.gather(mi.Vector2f, weighted, here) if ones else [dr.gather(mi.Float, weighted, here)]

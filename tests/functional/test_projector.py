@@ -14,7 +14,7 @@ import pytest
 from scipy.sparse.linalg import lsqr
 
 from helpers.grids import scan
-from helpers.motions import climbing, posed, reversed_panel, rolled, shaken, tilted, turned
+from helpers.motions import climbing, curved, posed, reversed_panel, rolled, shaken, tilted, turned
 from lingo_mi.common.errors import InputError
 from lingo_mi.functional import Projector
 from lingo_mi.geometry import Geometry
@@ -29,6 +29,12 @@ GEOMETRIES = {
     **{motion.__name__: posed(motion) for motion in (climbing, shaken, turned, reversed_panel, rolled)},
     'tilted': posed(tilted(0.6, 0.0, 0.0)),
     'tilted parallel': posed(tilted(1.3, 0.2, 0.0), 'parallel'),
+    'curved': curved(),
+    'curved, another radius': curved(radius=170.0),
+    'curved, climbing': curved(climbing),
+    'curved, tilted': curved(tilted(0.6, 0.0, 0.0)),
+    'curved, flying spot': curved().source_shifted([[-5.0, 2.0, 1.0], [5.0, -2.0, -1.0], [0.0, 0.0, 4.0]]),
+    'curved, source in the volume': curved(DSO=10.0, DSD=300.0),
 }
 KINDS = 'numpy', 'drjit', 'torch', 'jax'
 

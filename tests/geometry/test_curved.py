@@ -143,7 +143,7 @@ BAD = {
     'radius must be one finite number': lambda: flat().curved(np.nan),
     'arc of 180 degrees': lambda: flat(nDetector=(4, 100)).curved(600 / np.pi),
     'parallel beam has no curved': lambda: Geometry.parallel(angles=ANGLES, grid=GRID, **PANEL).curved(),
-    'does not see the whole panel': lambda: flat().curved(300.0).source_shifted([900.0, 0, 0]),
+    'does not see the whole panel': lambda: flat().curved(300.0).source_shifted([1800.0, 0, 0]),
     'right angles': lambda: CurvedGeometry(
         flat=Geometry.from_poses(replace(flat().rays(), u=flat().rays().u + [0, 0, 1.0]), (4, 30), grid=GRID), radius=450.0
     ),

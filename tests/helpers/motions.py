@@ -57,3 +57,11 @@ def rolled(rays, _):
     u, v = (np.stack([turn.apply(x) for turn, x in zip(turns, steps)]) for steps in (rays.u, rays.v))
     centre = rays.corner + 21 / 2 * rays.u + 17 / 2 * rays.v
     return dict(u=u, v=v, corner=centre - 21 / 2 * u - 17 / 2 * v)
+
+
+def curved(motion=None, radius=None, **changes):
+    """The scan with its panel bent, an arc of 60 degrees."""
+    geo = scan(n=3, nDetector=(17, 41), dDetector=(3.0, 7.6), **changes)
+    if motion:
+        geo = Geometry.from_poses(replace(geo.rays(), **motion(geo.rays(), None)), geo.nDetector, grid=geo.grid)
+    return geo.curved(radius)

@@ -1,0 +1,74 @@
+"""Where the pixels of curved panels lie on the flat ones that they touch, on the device (Dr.Jit): see `geometry.curve`.
+
+A ray through a pixel of a curved panel is the ray through (X, Y) of the flat one, so the projectors of voxels need no more.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from lingo_mi.geometry.curve import Curve
+from lingo_mi.projectors.upload import uploaded
+
+NUMBERS = 5  # of a view, see `Curve.numbers`
+
+
+def tables(curve: Curve | None, columns: int) -> tuple[Any, Any]:
+    """X and s of all columns, mi.Float [view * u * 2], and `Curve.numbers`, mi.Float [view * 5]; None for flat panels."""
+    if curve is None:
+        return None, None
+    return uploaded(column_table(curve, columns)), uploaded(curve.numbers)
+
+
+def column_table(curve: Curve, columns: int) -> np.ndarray:
+    """X and s of the centres of all columns, float64 [view, u, 2]."""
+    x = np.arange(columns) + 0.5
+    return np.stack([curve.columns(x), 1 / curve.share(x)], -1)
+
+
+def on_plane(tables: tuple[Any, Any], panel: tuple[int, int], view: Any, u: Any, v: Any) -> tuple[Any, Any]:
+    """(X, Y) of the centres of pixels, mi.Float; of a flat panel these are u + 1/2 and v + 1/2.
+
+    Parameters
+    ----------
+    tables
+        See the function `tables`.
+    panel : tuple[int, int]
+        Rows and columns.
+    view, u, v
+        mi.UInt.
+    """
+    if tables[0] is None:
+        return mi.Float(u) + 0.5, mi.Float(v) + 0.5
+    x, scale = column(tables[0], panel, view, u)
+    foot = dr.gather(mi.Float, tables[1], view * NUMBERS + 3)
+    return x, dr.fma(scale, (mi.Float(v) + 0.5) - foot, foot)
+
+
+def column(table: Any, panel: tuple[int, int], view: Any, u: Any) -> tuple[Any, Any]:
+    """X and s of columns u of views, from the first of `tables`."""
+    found = dr.gather(mi.Vector2f, table, view * panel[1] + u)
+    return found.x, found.y
+
+
+def numbers_of(table: Any, view: Any) -> list[Any]:
+    """radius, middle, foot_u, foot_v and distance of a view, from the second of `tables`."""
+    return [dr.gather(mi.Float, table, view * NUMBERS + i) for i in range(NUMBERS)]
+
+
+def column_of(numbers: list[Any], x: Any) -> Any:
+    """The column position on the curved panel of a position X on the flat one: that of `Curve.on_panel`.
+
+    Where the ray passes the cylinder, the end of its half circle.
+    """
+    radius, middle, foot, _, distance = numbers
+    inv = 1 / distance
+    r, p, q = radius * inv, (foot - middle) * inv, (x - middle) * inv
+    a, b, c = dr.fma(q - p, q - p, 1), p * (q - p) - (1 - r), p * p + 1 - 2 * r
+    root = dr.sqrt(dr.maximum(b * b - a * c, 0))
+    k = dr.select(b < 0, (root - b) / a, -c / (b + root))
+    return dr.fma(radius, dr.atan2(dr.fma(k, q - p, p), r - (1 - k)), middle)
