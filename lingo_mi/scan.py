@@ -156,7 +156,9 @@ class Scan:
         if not isinstance(self.geometry, CurvedGeometry):
             return self
         if self.effects is not None:
-            raise InputError('the effects of a detector happened in its own pixels: give line integrals without effects')
+            raise InputError(
+                'the effects of a detector happened in its own pixels: give line integrals without effects'
+            )
         flat, (top, bottom, left, right) = self.geometry.to_flat(), self.geometry.flat_pixels()
         curve = self.geometry.rays(curved=True).curve
         x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)

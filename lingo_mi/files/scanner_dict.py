@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.geometry import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry
 from lingo_mi.geometry.grid import Grid, grid_of
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix
@@ -333,7 +333,7 @@ def check_one_scanner(dataset: Dataset, where: PathLike | str) -> None:
     if len(circles) == len(geometries):
         known = [from_geometry(g) for g in circles]
     else:
-        known = [(g.mode, g.nDetector, g.grid) for g in geometries]
+        known = [(g.mode, g.nDetector, g.grid, g.radius if isinstance(g, CurvedGeometry) else None) for g in geometries]
     if known[0] != known[-1]:
         raise InputError(
             f'{where}: this format holds one scanner, but the training and test views have '

@@ -22,6 +22,9 @@ degrees:
     poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
+    radius                 of a panel that is bent on a cylinder, mm: DSD where its axis passes through the focal spot.
+                           dDetector is then a pixel's height and width along the arc, offDetector's second number a shift along
+                           the arc; poses say where the panel's middle is, and u and v there
     valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
     history                how the projections were made, for people: `lingo-mi import` writes it
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
@@ -69,7 +72,7 @@ from lingo_mi.files.scanner_dict import (
 )
 from lingo_mi.files.slices import by_number
 from lingo_mi.files.volumes import read_volume, write_volume
-from lingo_mi.geometry import CircularGeometry, Geometry, astra
+from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, astra
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.storage.file_access import beside, new_folder, reading, replacing
@@ -96,6 +99,7 @@ _KEYS = {
     'filter',
     'poses',
     'test_poses',
+    'radius',
     'valid',
     'history',
     *MOTION,
@@ -146,7 +150,8 @@ def posed_geometry(values: dict, n: int, where: PathLike | str, test: bool = Fal
     prefix = 'test_' if test else ''
     poses = values.get(prefix + 'poses')
     if poses is None:
-        return to_geometry(values, _angles(values, prefix + 'angles', n, where), where)
+        flat = to_geometry(values, _angles(values, prefix + 'angles', n, where), where)
+        return _bent(flat, values, where, lambda radius: flat.curved(radius))
 
     def views(n_detector, step, parallel, origin):
         if isinstance(poses, str):
@@ -157,7 +162,20 @@ def posed_geometry(values: dict, n: int, where: PathLike | str, test: bool = Fal
             raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
         return found
 
-    return to_posed(values, views, where)
+    flat = to_posed(values, views, where)
+    return _bent(flat, values, where, lambda radius: CurvedGeometry(flat=flat, radius=radius))
+
+
+def _bent(geometry, values, where, curved):
+    """The scan with its panel bent by the radius of `values`, or as it is."""
+    if values.get('radius') is None:
+        return geometry
+    try:
+        if isinstance(geometry, CurvedGeometry):
+            raise InputError('radius and poses both bend the panel; remove radius')
+        return curved(_number(values, 'radius', None, where))
+    except InputError as error:
+        raise error if str(error).startswith(str(where)) else InputError(f'{where}: {error}') from None
 
 
 def _angles(values, key, n, where):
@@ -217,17 +235,29 @@ def _line_integrals(projections, values, where, projections_path):
 
 def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
     """Writes a geometry file. poses: the name of a file that holds them; None: they are lines of this one."""
-    if isinstance(geometry, CircularGeometry) and (test is None or isinstance(test, CircularGeometry)):
-        values = {**from_geometry(geometry), 'angles': np.degrees(geometry.angles).tolist()}
+    bend = {'radius': geometry.radius} if isinstance(geometry, CurvedGeometry) else {}
+    if _on_circle(geometry) and (test is None or _on_circle(test)):
+        values = {**from_geometry(_flat(geometry)), 'angles': np.degrees(geometry.angles).tolist()}
         if test is not None:
             values['test_angles'] = np.degrees(test.angles).tolist()
     else:
         values = {'mode': geometry.mode, 'nDetector': list(geometry.nDetector), **of_grid(geometry.grid)}
-        values['poses'] = poses or astra.to_vectors(geometry.rays(), geometry.nDetector).tolist()
+        values['poses'] = poses or astra.to_vectors(_flat(geometry).rays(), geometry.nDetector).tolist()
         if test is not None:
-            values['test_poses'] = astra.to_vectors(test.rays(), test.nDetector).tolist()
-    values |= more
+            values['test_poses'] = astra.to_vectors(_flat(test).rays(), test.nDetector).tolist()
+    values |= bend | more
     path.write_text(yaml.safe_dump(values, sort_keys=False, default_flow_style=None), encoding='utf-8')
+
+
+def _flat(geometry):
+    """The scan with the flat panel that a curved one touches along its middle; one with a flat panel as it is."""
+    return geometry.flat if isinstance(geometry, CurvedGeometry) else geometry
+
+
+def _on_circle(geometry):
+    """Whether the numbers of a circle describe a scan: a curved panel off the central ray is turned, too."""
+    flat = _flat(geometry)
+    return isinstance(flat, CircularGeometry) and (flat is geometry or not flat.offDetector[1])
 
 
 def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
@@ -306,9 +336,9 @@ def _write_npy(path, dataset, history=None):
         more['valid'] = path.stem + VALID
         content[path.with_name(more['valid'])] = dataset.train.valid
     geometry = dataset.train.geometry
-    if len(geometry) > MOST_LISTED and not isinstance(geometry, CircularGeometry):
+    if len(geometry) > MOST_LISTED and not _on_circle(geometry):
         more['poses'] = path.stem + POSES
-        content[path.with_name(more['poses'])] = astra.to_vectors(geometry.rays(), geometry.nDetector)
+        content[path.with_name(more['poses'])] = astra.to_vectors(_flat(geometry).rays(), geometry.nDetector)
     # An earlier scan stays whole until all of the new one is on the disk.
     with ExitStack() as files:
         for file, values in content.items():

@@ -2,6 +2,8 @@
 
 - `cone_vec`: source, panel's centre, u, v
 - `parallel3d_vec`: direction of the beam, panel's centre, u, v
+- `cyl_cone_vec` (ASTRA 2.4 and later): source, centre of a panel that is bent on a cylinder, u and v there, and its radius: 13
+  numbers. Seen along - u x v, the panel lies behind the cylinder's axis
 
 each (x, y, z), u and v one pixel long: from pixel (0, 0) to its neighbour in the row, and in the column. ASTRA's world is
 this package's, in mm. Its arrays are [v, view, u] and volumes [z, y, x]: transpose them. `to_vectors` and `from_vectors` assume
@@ -15,6 +17,7 @@ ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.cre
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +27,7 @@ from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.circle import CircularGeometry
+from lingo_mi.geometry.curved import CurvedGeometry, bent
 from lingo_mi.geometry.grid import Grid, Voxels, grid_of
 from lingo_mi.geometry.rays import Rays
 
@@ -31,7 +35,11 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 CIRCLES = {'cone': 'cone', 'parallel3d': 'parallel'}  # ASTRA's types of scans on a circle, and their beams
-VECTORS = {'cone_vec': 'cone', 'parallel3d_vec': 'parallel'}  # of scans with a pose for every view
+VECTORS = {
+    'cone_vec': 'cone',
+    'parallel3d_vec': 'parallel',
+    'cyl_cone_vec': 'cone',
+}  # of scans with a pose for every view
 
 
 def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]) -> Geometry:
@@ -43,7 +51,7 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     Parameters
     ----------
     proj_geom : dict
-        Of the type 'cone', 'cone_vec', 'parallel3d' or 'parallel3d_vec'; lengths as they are.
+        Of the type 'cone', 'cone_vec', 'cyl_cone_vec', 'parallel3d' or 'parallel3d_vec'; lengths as they are.
     vol_geom : dict
         Of `astra.create_vol_geom` in three dimensions.
     **voxels
@@ -88,6 +96,32 @@ def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool)
     return Rays(source, corner, u, v, parallel).checked()
 
 
+def to_cylinder_vectors(geometry: CurvedGeometry) -> np.ndarray:
+    """ASTRA's vectors of the views of a curved panel for its `cyl_cone_vec`, float64 [n, 13].
+
+    ASTRA's rows run up: `projections[:, ::-1].transpose(1, 0, 2)` goes with them.
+
+    Examples
+    --------
+    ::
+
+        rows, columns = geometry.nDetector
+        astra.create_proj_geom('cyl_cone_vec', rows, columns, to_cylinder_vectors(geometry))
+    """
+    rays = geometry.flat.rays()
+    vectors = to_vectors(
+        replace(rays, corner=rays.corner + geometry.nDetector[0] * rays.v, v=-rays.v), geometry.nDetector
+    )
+    if not _bent_towards_source(replace(rays, v=-rays.v)).all():
+        raise InputError('ASTRA has no curved panel whose columns run the other way: reverse u and the columns')
+    return np.concatenate([vectors, np.full((len(rays), 1), geometry.radius)], 1)
+
+
+def _bent_towards_source(rays):
+    """Whether ASTRA bends the panels of `rays`, its own, towards their sources, [n]."""
+    return np.sum(np.cross(rays.u, rays.v) * (rays.source - rays.corner), 1) > 0
+
+
 def circle(proj_geom: dict) -> dict[str, Any]:
     """The scanner of a dict of the types `CIRCLES`, as the numbers of a `CircularGeometry`; ASTRA's rows reversed.
 
@@ -124,12 +158,23 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     kind = kind_of(proj_geom)
     if kind not in VECTORS:
         raise InputError(f'an ASTRA geometry must be of the type {", ".join(CIRCLES | VECTORS)}, not {shown(kind)}')
-    nDetector = _panel(proj_geom)
-    rays = from_vectors(_given(proj_geom, 'Vectors'), nDetector, VECTORS[kind] == 'parallel')
+    nDetector, vectors, radius = _panel(proj_geom), _given(proj_geom, 'Vectors'), None
+    if kind == 'cyl_cone_vec':
+        vectors = limits.lengths('Vectors', vectors)
+        if vectors.ndim != 2 or vectors.shape[1] != 13 or len(set(vectors[:, 12])) != 1:
+            raise InputError(
+                'the Vectors of cyl_cone_vec must be 13 numbers for every view, and the last of them, the radius, the same for all'
+            )
+        vectors, radius = vectors[:, :12], float(vectors[0, 12])
+    rays = from_vectors(vectors, nDetector, VECTORS[kind] == 'parallel')
+    if radius is not None:
+        if not _bent_towards_source(rays).all():
+            raise InputError('a panel of cyl_cone_vec is bent away from its source: swap the sign of u or of v')
     source, v = rays.source, -rays.v
     if rays.parallel:
         source = source * np.sign(np.sum(source * np.cross(rays.u, v), 1, keepdims=True))
-    return Rays(source, rays.corner - nDetector[0] * v, rays.u, v, rays.parallel), nDetector
+    down = Rays(source, rays.corner - nDetector[0] * v, rays.u, v, rays.parallel)
+    return down if radius is None else bent(down, nDetector, radius), nDetector
 
 
 def grid(vol_geom: dict) -> Grid:

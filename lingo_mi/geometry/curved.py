@@ -71,10 +71,8 @@ class CurvedGeometry(Geometry):
         for name in ('mode', 'nDetector', 'dDetector', 'grid', 'angles', 'DSO', 'DSD'):
             object.__setattr__(self, name, getattr(self.flat, name))
         object.__setattr__(self, 'radius', limits.sizes('radius', self.radius, 1)[0])
-        rays = self.flat.rays()
-        require_bendable(rays)
         limits.require_proportions((self.radius,), self.dDetector)
-        object.__setattr__(self, '_curve', curve_of(rays, self.nDetector, self.radius))
+        object.__setattr__(self, '_curve', bent(self.flat.rays(), self.nDetector, self.radius).curve)
 
     def rays(self, curved: bool = False) -> Rays:
         """The rays of all views in the world frame, mm.
@@ -188,6 +186,18 @@ def require_bendable(rays: Rays) -> None:
     cosine = np.sum(rays.u * rays.v, 1) / np.linalg.norm(rays.u, axis=1) / np.linalg.norm(rays.v, axis=1)
     if np.abs(cosine).max() > RIGHT_ANGLE:
         raise InputError('a curved panel needs rows and columns at right angles')
+
+
+def bent(rays: Rays, nDetector: tuple[int, int], radius: float) -> Rays:
+    """The rays of curved panels that touch the flat ones of `rays` along their middle.
+
+    Raises
+    ------
+    InputError
+        As `CurvedGeometry`.
+    """
+    require_bendable(rays)
+    return replace(rays, curve=curve_of(rays, nDetector, limits.sizes('radius', radius, 1)[0]))
 
 
 def slid(rays: Rays, nDetector: tuple[int, int], radius: float, by: np.ndarray) -> Rays:

@@ -12,6 +12,9 @@ with x, y the position in the image of projections. The image's spacing and orig
 dDetector, and the image is taken as centred, its origin at minus half of (pixels - 1) spacings. RTK's rows run up, this
 package's down: the rows of RTK's stacks must be reversed, `stack[:, ::-1]`, to go with the poses read here.
 
+RadiusCylindricalDetector, once for all views and 0 for flat panels, bends them about their middle x = 0 towards the source, as
+`curved.CurvedGeometry` does.
+
 Rit et al., "The Reconstruction Toolkit (RTK)", J. Phys.: Conf. Ser. 489 (2014), and RTK's documentation, "Geometry".
 """
 
@@ -30,6 +33,7 @@ from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
+from lingo_mi.geometry.curved import bent
 from lingo_mi.geometry.grid import Voxels
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import rotation
@@ -51,6 +55,7 @@ _NUMBERS = (
     'SourceOffsetY',
 )
 _ANGLES = slice(2, 5)  # of _NUMBERS
+RADIUS = 'RadiusCylindricalDetector'
 _IGNORED = ('Matrix', 'CollimationUInf', 'CollimationUSup', 'CollimationVInf', 'CollimationVSup')
 _AXES = [2, 0, 1]  # our x, y, z in RTK's
 
@@ -75,7 +80,7 @@ def scan(
     Raises
     ------
     InputError
-        If the file is missing, damaged or another one, and for cylindrical panels.
+        If the file is missing, damaged or another one.
 
     Examples
     --------
@@ -100,11 +105,11 @@ def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, fl
     Raises
     ------
     InputError
-        If the file is missing, damaged or another one, for cylindrical detectors, and for elements that are not known. The
-        matrices, which follow from the numbers, and collimation are passed over.
+        If the file is missing, damaged or another one, and for elements that are not known. The matrices, which follow from the
+        numbers, and collimation are passed over.
     """
     where = source if isinstance(source, (str, PathLike)) else "RTK's geometry"
-    columns = _from_file(source) if where is source else _from_object(source)
+    columns, radius = _from_file(source) if where is source else _from_object(source)
     sid, sdd, gantry, out, turn, px, py, sx, sy = columns
     if not len(sid):
         raise InputError(f'{where}: holds no projections')
@@ -119,13 +124,16 @@ def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, fl
     x, y, z = (a[:, None] for a in (px - nu / 2 * du, py + nv / 2 * dv, sid - sdd if not parallel else 0 * sid))
     start = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
     try:
-        return Rays(start, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
+        rays = Rays(start, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
+        return bent(rays, nDetector, radius) if radius else rays
     except InputError as error:
         raise InputError(f'{where}: {error}') from None
 
 
 def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> None:
     """Writes views, rows down, as RTK's geometry for images whose rows run up, spaced like the panels and centred.
+
+    Curved panels have one radius: `CurvedGeometry.rays` of `curved=True` are such.
 
     Raises
     ------
@@ -156,6 +164,8 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
     px, py = (np.sum(centre * e, 1) for e in (e1, e2))
     columns = dict(zip(_NUMBERS, (sid, sdd, np.mod(gantry, 360), out, turn, px, py, sx, sy)))
     root = ElementTree.Element(ROOT, version='3')
+    if rays.curve is not None:
+        ElementTree.SubElement(root, RADIUS).text = repr(float(np.mean(rays.curve.radius * step_u)))
     for view, matrix in enumerate(_matrices(rays, nDetector, sdd, step_u, step_v)):
         node = ElementTree.SubElement(root, 'Projection')
         for name, values in columns.items():
@@ -169,20 +179,22 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
         temporary.write_text(text, encoding='utf-8')
 
 
-def _from_file(path) -> np.ndarray:
-    """The columns of `_NUMBERS` of all views, [9, n], angles in radians."""
-    views = [[view[name] for name in _NUMBERS] for view in _views(path)]
-    columns = np.array(views, float).reshape(-1, len(_NUMBERS)).T
+def _from_file(path) -> tuple[np.ndarray, float]:
+    """The columns of `_NUMBERS` of all views, [9, n], angles in radians, and the radius of the panel, 0 where it is flat."""
+    views = [[view[name] for name in (*_NUMBERS, RADIUS)] for view in _views(path)]
+    *columns, radius = np.array(views, float).reshape(-1, len(_NUMBERS) + 1).T
+    columns = np.array(columns)
     columns[_ANGLES] = np.radians(columns[_ANGLES])
-    return columns
+    if len(set(radius)) > 1:
+        raise InputError(f'{path}: {RADIUS} must be the same for all views')
+    return columns, float(radius[0]) if len(radius) else 0.0
 
 
-def _from_object(geometry) -> np.ndarray:
+def _from_object(geometry) -> tuple[np.ndarray, float]:
     """The same of RTK's object, which keeps its angles in radians."""
-    if geometry.GetRadiusCylindricalDetector():
-        raise InputError("RTK's geometry: RadiusCylindricalDetector is not supported")
     plural = [name + 's' if not name.endswith(('X', 'Y')) else f'{name[:-1]}s{name[-1]}' for name in _NUMBERS]
-    return np.array([getattr(geometry, 'Get' + name)() for name in plural], float)
+    columns = np.array([getattr(geometry, 'Get' + name)() for name in plural], float)
+    return columns, float(geometry.GetRadiusCylindricalDetector())
 
 
 def _views(path):
@@ -205,7 +217,7 @@ def _views(path):
         raise InputError(f'{path}: is no XML ({one_line(error)})') from None
     if root.tag != ROOT or root.get('version') not in ('2', '3'):
         raise InputError(f'{path}: is no {ROOT} of version 2 or 3')
-    shared = dict.fromkeys(_NUMBERS, 0.0)
+    shared = dict.fromkeys((*_NUMBERS, RADIUS), 0.0)
     for node in root:
         if node.tag != 'Projection':
             shared.update(_number(node, path))
@@ -226,9 +238,7 @@ def _number(node, path) -> dict:
             raise ValueError
     except (TypeError, ValueError):
         raise InputError(f'{path}: {node.tag} must be a finite number, not {shown(node.text)}') from None
-    if node.tag == 'RadiusCylindricalDetector' and value == 0:
-        return {}
-    if node.tag not in _NUMBERS:
+    if node.tag not in (*_NUMBERS, RADIUS):
         raise InputError(f'{path}: {node.tag} = {value:g} is not supported')
     return {node.tag: value}
 

@@ -44,8 +44,7 @@ def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
 
 def _geometry(axes, scan):
     """Sources (or directions), panels of the first and the middle view, and the volume; mm."""
-    geometry, rays = scan.geometry, scan.geometry.rays()
-    nv, nu = geometry.nDetector
+    geometry, rays = scan.geometry, scan.geometry.rays(curved=True)
     size = np.array(geometry.grid.size) / 2
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size + geometry.grid.centre
     for a in range(8):
@@ -56,9 +55,8 @@ def _geometry(axes, scan):
     axes.plot(*source.T, '.', color='#d1495b', markersize=3)
     axes.plot(*source[:1].T, 'o', color='#d1495b')
     for k, colour in ((0, '#1f77b4'), (len(scan) // 3, '#9ec5e5')):
-        a = rays.corner[k]
-        panel = np.array([a, a + nu * rays.u[k], a + nu * rays.u[k] + nv * rays.v[k], a + nv * rays.v[k], a])
-        axes.plot(*panel.T, color=colour)
+        panel = rays.outline(k, geometry.nDetector)
+        axes.plot(*np.vstack([panel, panel[:1]]).T, color=colour)
     axes.set(xlabel='x', ylabel='y', zlabel='z')
     axes.set_aspect('equal')
     axes.set_title('sources (first: large), panels of two views, volume; mm', fontsize=10)

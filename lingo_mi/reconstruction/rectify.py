@@ -1,23 +1,24 @@
-"""Rectification: resamples a scan with a turned, tilted or offset panel to an upright panel behind the same source.
+"""Rectification: resamples a scan with a turned, tilted, offset or curved panel to an upright flat one behind the same source.
 
 The same rays cross both planes, so a homography maps positions on one to positions on the other (Hartley and Zisserman,
-"Multiple View Geometry", 2nd edition, 2004, section 2.3). Line integrals stay the same; no weights are needed.
+"Multiple View Geometry", 2nd edition, 2004, section 2.3); from the plane that a curved panel touches, `geometry.curve` goes on.
+Line integrals stay the same; no weights are needed.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.circle import SAME, CircularGeometry
+from lingo_mi.geometry.curved import CurvedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import scanner_rays
 from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.preconditions import require_pixels
-from lingo_mi.scan import Scan
+from lingo_mi.scan import Scan, interpolated
 
 MOVES = 0.1  # share of its size by which the panel's shadow may move between views
 
@@ -47,12 +48,15 @@ def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in geometry.nDetector[::-1]))
     there = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
     out = np.empty((len(scan), *geometry.nDetector), np.float32)
-    for view, to_real in enumerate(_homographies(geometry.rays(), scan.geometry.rays())):
+    real = scan.geometry.rays(curved=True)
+    for view, to_real in enumerate(_homographies(geometry.rays(), real)):
         x, y, w = to_real @ there
         x, y = x / w, y / w
+        if real.curve is not None:
+            x, y = real.curve.on_panel(x, y, view)
         # Half a pixel of margin: a single row that is slightly turned lies between two new rows.
         seen = (w > 0) & (x > -0.5) & (x < n_u + 0.5) & (y > -0.5) & (y < n_v + 0.5)
-        value = ndimage.map_coordinates(scan.projections[view], [y - 0.5, x - 0.5], order=3, mode='nearest')
+        value = interpolated(scan.projections[view], x, y)
         out[view] = np.where(seen, value, 0).reshape(geometry.nDetector)
     return Scan(geometry, out)
 
@@ -70,6 +74,8 @@ def can_rectify(scan: Scan) -> bool:
 def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> CircularGeometry:
     """The geometry of an upright panel that contains the real panel's shadow in all views, with pixels no coarser.
 
+    Of a curved panel these are the rows that are seen from side to side, with pixels as fine as in its middle.
+
     With an offset panel on a closed circle, the new panel is cut on the short side where its last row begins to see, because
     `fdk.ray_weights` treats all rows alike. Otherwise, on a closed circle, it is symmetric.
 
@@ -81,6 +87,10 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
     """
     if isinstance(geometry, CircularGeometry):
         return geometry
+    if isinstance(geometry, CurvedGeometry):
+        geometry = geometry.to_flat()
+        if isinstance(geometry, CircularGeometry):
+            return geometry
     rays, (n_v, n_u) = geometry.rays(), geometry.nDetector
     DSO, DSD, angles = _circle(geometry, what)
     # Positions on this plane: mm from the central ray, along the circle and downwards.

@@ -214,9 +214,9 @@ def colour_maps() -> dict[str, str]:
 def scanner(geometry: Geometry, most: int = 400) -> dict:
     """Sources and panels of the views, mm: of a parallel beam, where its rays come from at the volume's distance."""
     index = np.unique(np.linspace(0, len(geometry) - 1, min(len(geometry), most)).astype(int))
-    rays = geometry.rays()[index]
-    (nv, nu), corner = geometry.nDetector, rays.corner
-    panels = np.stack([corner, corner + nu * rays.u, corner + nu * rays.u + nv * rays.v, corner + nv * rays.v], 1)
+    rays = geometry.rays(curved=True)[index]
+    x, y = np.array([[0, 1, 1, 0], [0, 0, 1, 1]]) * np.array(geometry.nDetector)[::-1, None]
+    panels = np.stack([rays.points(view, x, y) for view in range(len(rays))])
     sources = rays.source
     if rays.parallel:
         reach = max(geometry.grid.size)

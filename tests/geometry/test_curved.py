@@ -7,8 +7,9 @@ import pytest
 
 from helpers.bodies import BODIES
 from lingo_mi.common.errors import InputError
-from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, Grid, PosedGeometry, circular
-from lingo_mi.scan import Scan
+from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, Grid, PosedGeometry, astra, circular, rtk
+from lingo_mi.scan import Dataset, Scan
 
 GRID = Grid((16, 18, 14), (2.0, 2.2, 1.8), (1.0, -2.0, 0.5))
 PANEL = dict(nDetector=(12, 30), dDetector=(2.5, 6.0))  # an arc of 23 degrees at 450 mm
@@ -25,9 +26,7 @@ def shaken():
     rng = np.random.default_rng(3)
     g = flat(tilt=0.2, rotDetector=(0.05, -0.08, 0.2), COR=3.0, offDetector=(4.0, -9.0))
     rays = g.rays()
-    return Geometry.from_poses(
-        replace(rays, source=rays.source + rng.normal(size=(5, 3)) * 6), g.nDetector, grid=GRID
-    )
+    return Geometry.from_poses(replace(rays, source=rays.source + rng.normal(size=(5, 3)) * 6), g.nDetector, grid=GRID)
 
 
 KINDS = {
@@ -36,7 +35,9 @@ KINDS = {
     'far off': flat(offDetector=(-3.0, 40.0)).curved(),
     'another radius': flat().curved(300.0),
     'a wide radius': flat(offDetector=(3.0, 10.0)).curved(2000.0),
-    'helix': Geometry.helix(DSO=300, DSD=450, angles=ANGLES, pitch=20, grid=GRID, offDetector=(0, 1.5), **PANEL).curved(),
+    'helix': Geometry.helix(
+        DSO=300, DSD=450, angles=ANGLES, pitch=20, grid=GRID, offDetector=(0, 1.5), **PANEL
+    ).curved(),
     'flying spot': flat(offDetector=(0, 1.5)).curved().source_shifted(np.outer([-1, 1, -1, 1, -1], [2.0, 1.0, 0.5])),
     'shaken': CurvedGeometry(flat=shaken(), radius=430.0),
 }
@@ -56,7 +57,9 @@ def test_pixels_lie_on_the_arc_about_the_focal_spot(shift):
         out, u, z = np.array([np.cos(a), np.sin(a), 0]), np.array([-np.sin(a), np.cos(a), 0]), np.array([0, 0, 1.0])
         fan = ((x - 15) * 6 + shift) / 450
         height = 4.0 - (y - 6) * 2.5
-        expected = (300 - 450 * np.cos(fan))[..., None] * out + (450 * np.sin(fan))[..., None] * u + height[..., None] * z
+        expected = (
+            (300 - 450 * np.cos(fan))[..., None] * out + (450 * np.sin(fan))[..., None] * u + height[..., None] * z
+        )
         rays = g.rays(curved=True)
         np.testing.assert_allclose(rays.points(view, x, y), expected, atol=1e-9)
         start, direction = rays.through(view, x, y)
@@ -145,7 +148,8 @@ BAD = {
     'parallel beam has no curved': lambda: Geometry.parallel(angles=ANGLES, grid=GRID, **PANEL).curved(),
     'does not see the whole panel': lambda: flat().curved(300.0).source_shifted([1800.0, 0, 0]),
     'right angles': lambda: CurvedGeometry(
-        flat=Geometry.from_poses(replace(flat().rays(), u=flat().rays().u + [0, 0, 1.0]), (4, 30), grid=GRID), radius=450.0
+        flat=Geometry.from_poses(replace(flat().rays(), u=flat().rays().u + [0, 0, 1.0]), (4, 30), grid=GRID),
+        radius=450.0,
     ),
     'curved already': lambda: flat().curved().curved(),
     'different radius': lambda: flat().curved().joined(flat().curved(500.0)),
@@ -159,6 +163,107 @@ BAD = {
 def test_bad_input(message):
     with pytest.raises(InputError, match=message):
         BAD[message]()
+
+
+# ---- other packages --------------------------------------------------------------------------------------------
+
+
+def astra_pixels(vectors, view, x, y):
+    """Where ASTRA's `cyl_cone_vec` has the pixel positions x, y: a restatement of `getCylConeAxes` and its kernels."""
+    d, u, v, radius = vectors[view, 3:6], vectors[view, 6:9], vectors[view, 9:12], vectors[view, 12]
+    along = -np.cross(u, v) * (radius / (np.linalg.norm(u) * np.linalg.norm(v)))
+    across, axis = u * (radius / np.linalg.norm(u)), d - along
+    angle = (x - 15) * np.linalg.norm(u) / radius
+    return axis + np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * across + (y - 6)[:, None] * v
+
+
+def test_astra(curved):
+    """The pixels are where ASTRA has them, rows reversed, and come back."""
+    vectors, rays = astra.to_cylinder_vectors(curved), curved.rays(curved=True)
+    x, y = np.random.default_rng(1).uniform(0, 1, (2, 50)) * [[30], [12]]
+    for view in range(len(curved)):
+        np.testing.assert_allclose(astra_pixels(vectors, view, x, 12 - y), rays.points(view, x, y), atol=1e-9)
+    dictionary = dict(type='cyl_cone_vec', DetectorRowCount=12, DetectorColCount=30, Vectors=vectors)
+    again = Geometry.from_astra(dictionary, grid=GRID)
+    assert isinstance(again, CurvedGeometry)
+    for view in range(len(curved)):
+        np.testing.assert_allclose(again.rays(curved=True).points(view, x, y), rays.points(view, x, y), atol=5e-3)
+        # of a pixel of 2.5 mm: within its thousandth, poses become a circle
+    for message, bad in {
+        'bent away': vectors * ([1] * 9 + [-1] * 3 + [1]),
+        '13 numbers for every view': vectors[:, :12],
+        'the same for all': vectors + np.eye(13)[12] * np.arange(5)[:, None],
+        'radius must be positive': vectors * ([1] * 12 + [-1]),
+    }.items():
+        with pytest.raises(InputError, match=message):
+            Geometry.from_astra(dictionary | dict(Vectors=bad), grid=GRID)
+
+
+def test_rtk(curved, tmp_path):
+    path, rays = tmp_path / 'geometry.xml', curved.rays(curved=True)
+    rtk.write_rtk(path, rays, curved.nDetector)
+    again = Geometry.from_rtk(path, nDetector=curved.nDetector, dDetector=curved.dDetector, grid=GRID)
+    assert isinstance(again, CurvedGeometry) and again.radius == pytest.approx(curved.radius, rel=1e-12)
+    for view in range(len(curved)):
+        np.testing.assert_allclose(again.rays(curved=True).project(POINTS, view), rays.project(POINTS, view), atol=1e-3)
+    path.write_text(
+        path.read_text().replace(
+            '<Projection>', '<Projection><RadiusCylindricalDetector>7</RadiusCylindricalDetector>', 1
+        )
+    )
+    with pytest.raises(InputError, match='the same for all views'):
+        Geometry.from_rtk(path, nDetector=curved.nDetector, dDetector=curved.dDetector, grid=GRID)
+
+
+def test_scan_files(curved, tmp_path):
+    scan = Scan(curved, np.random.default_rng(0).random((5, 12, 30), np.float32))
+    for name, kind in (('scan.npy', 'npy'), ('folder', 'exr')):
+        write_scan(
+            tmp_path / name, Dataset(scan.subset([0, 2, 3, 4]), scan.subset([1])) if kind == 'exr' else scan, kind
+        )
+        found = read_scan(tmp_path / name)
+        again = found.train.geometry.joined(found.test.geometry) if found.test else found.train.geometry
+        order = [0, 2, 3, 4, 1] if found.test else range(5)
+        assert isinstance(again, CurvedGeometry) and again.radius == curved.radius
+        for i, view in enumerate(order):
+            np.testing.assert_allclose(
+                again.rays(curved=True).project(POINTS, i), curved.rays(curved=True).project(POINTS, view), atol=1e-3
+            )
+    for kind in ('naf', 'r2'):
+        with pytest.raises(InputError, match="write it as 'npy' or 'exr'"):
+            write_scan(tmp_path / kind, scan, kind)
+
+
+CLINICAL = """
+DSO: 300
+DSD: 450
+nDetector: [12, 30]
+dDetector: [2.5, 6]
+nVoxel: 16
+dVoxel: 2
+angles: [0, 50]
+offDetector: [0, 1.5]
+"""
+
+
+def test_the_name_in_a_geometry_file(tmp_path):
+    np.save(tmp_path / 'scan.npy', np.zeros((2, 12, 30), np.float32))
+    (tmp_path / 'scan.yml').write_text(CLINICAL + 'radius: 450\n')
+    found = read_scan(tmp_path / 'scan.npy').train.geometry
+    expected = flat(angles=np.radians([0, 50]), offDetector=(0, 1.5)).curved()
+    np.testing.assert_allclose(
+        found.rays(curved=True).project(POINTS, 1), expected.rays(curved=True).project(POINTS, 1)
+    )
+    for line, message in {
+        'radius: -450': 'radius must be positive',
+        'radius: wide': 'radius must be one number',
+        'radius: 50': 'arc of 206.3 degrees',
+        'radius: 450\nmode: parallel': 'a parallel beam has no curved panel',
+    }.items():
+        (tmp_path / 'scan.yml').write_text(CLINICAL + line + '\n')
+        with pytest.raises(InputError, match=message) as error:
+            read_scan(tmp_path / 'scan.npy')
+        assert 'scan.yml' in str(error.value)
 
 
 # ---- on a flat panel ------------------------------------------------------------------------------------------
@@ -204,7 +309,9 @@ def test_resampling_keeps_flat_scans_and_masks():
     np.testing.assert_array_equal(found.valid[0, 0], np.abs(x - 14.5) >= 1)
     there = bodies(flat())
     assert there.to_flat() is there
-    assert scan.digest() != replace(scan, geometry=flat()).digest() != replace(scan, geometry=flat().curved(400)).digest()
+    assert (
+        scan.digest() != replace(scan, geometry=flat()).digest() != replace(scan, geometry=flat().curved(400)).digest()
+    )
 
 
 def test_rows_that_all_columns_see():

@@ -1,4 +1,4 @@
-"""Projections against RTK's on the CPU: cone, parallel, offset, turned, tilted, helical.
+"""Projections against RTK's on the CPU: cone, parallel, offset, turned, tilted, helical, curved.
 
 Three comparisons, each for every geometry:
 
@@ -51,11 +51,19 @@ GEOMETRIES = {
     'tilted': dict(tilt=np.radians(28.0)),
     'parallel, tilted': dict(tilt=np.radians(28.0), mode='parallel'),
     'helical': dict(height=helix(3 * ANGLES - 9.0, 11.0)),
+    'curved': {},
+    'curved, offset': dict(offDetector=(9.0, -17.0)),
+    'curved, another radius': dict(offDetector=(9.0, 0.35)),
 }
+RADII = {'curved': 450.0, 'curved, offset': 450.0, 'curved, another radius': 90.0}
 
 
 def geometry(name, n=40, side=40.0):
-    return Geometry.per_view(**{**PLAIN, **GEOMETRIES[name]}, nVoxel=(n, n + 4, n - 6), dVoxel=side / n)
+    return bent(name, Geometry.per_view(**{**PLAIN, **GEOMETRIES[name]}, nVoxel=(n, n + 4, n - 6), dVoxel=side / n))
+
+
+def bent(name, g):
+    return g.curved(RADII[name]) if name in RADII else g
 
 
 @pytest.fixture(params=GEOMETRIES)
@@ -68,7 +76,7 @@ class RTK:
 
     def __init__(self, g, folder):
         self.g = g
-        write_rtk(folder / 'geometry.xml', g.rays(), g.nDetector)
+        write_rtk(folder / 'geometry.xml', g.rays(curved=True), g.nDetector)
         reader = rtk.ThreeDCircularProjectionGeometryXMLFileReader.New(Filename=str(folder / 'geometry.xml'))
         reader.GenerateOutputInformation()
         self.reader, self.geometry = reader, reader.GetOutputObject()
@@ -116,7 +124,7 @@ def test_rtk_reads_the_geometry(name, tmp_path):
         pytest.skip('a parallel beam has no source')
     known = RTK(g, tmp_path).geometry
     found = [np.array(known.GetSourcePosition(view))[[2, 0, 1]] for view in range(len(g))]
-    np.testing.assert_allclose(found, g.rays().source, atol=1e-9)
+    np.testing.assert_allclose(found, g.rays(curved=True).source, atol=1e-9)
 
 
 def test_ellipsoids_are_exact(name, tmp_path):
@@ -128,7 +136,7 @@ def test_ellipsoids_are_exact(name, tmp_path):
     ):
         body = Ellipsoids([(centre, rotation('z', np.radians(angle))[0] @ np.diag(axes), density)])
         expected = expected + reference.ellipsoid(centre, axes, density, angle)
-        total = total + np.stack([body.image(g.rays(), view, SHAPE) for view in range(len(g))])
+        total = total + np.stack([body.image(g.rays(curved=True), view, SHAPE) for view in range(len(g))])
     assert expected.max() > 0.3
     assert np.abs(total - expected).max() < 1.2e-7 * expected.max()  # two images, each rounded to float32
 
@@ -177,22 +185,22 @@ def wide(name):
 
 
 def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
-    image = project_volume(abdomen, Geometry.per_view(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0))
+    image = project_volume(abdomen, bent(name, Geometry.per_view(**wide(name), nVoxel=abdomen.shape, dVoxel=6.0)))
     errors = []
     for finer in (1, 2, 4):
         shape = tuple(finer * (n - 1) + 1 for n in abdomen.shape)
         volume = zoom(abdomen, np.divide(shape, abdomen.shape), order=1) if finer > 1 else abdomen
         np.testing.assert_allclose(volume[::finer, ::finer, ::finer], abdomen, atol=1e-5)
-        g = Geometry.per_view(**wide(name), nVoxel=shape, dVoxel=6.0 / finer)
+        g = bent(name, Geometry.per_view(**wide(name), nVoxel=shape, dVoxel=6.0 / finer))
         expected = RTK(g, tmp_path).volume(volume)
         errors.append(np.linalg.norm(image - expected) / np.linalg.norm(expected))
     assert errors[0] < 0.003
     assert errors[1] < 0.26 * errors[0] and errors[2] < 0.26 * errors[1]
 
 
-@pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, offset', 'parallel, offset'])
+@pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, offset', 'parallel, offset', 'curved', 'curved, offset'])
 def test_joseph_is_rtks(name, tmp_path, abdomen):
-    g = CircularGeometry(**wide(name), grid=Grid(abdomen.shape, 6.0))
+    g = bent(name, CircularGeometry(**wide(name), grid=Grid(abdomen.shape, 6.0)))
     expected = RTK(g, tmp_path).volume(abdomen)
     found = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
     found = found.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)

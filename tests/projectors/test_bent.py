@@ -108,4 +108,4 @@ def test_a_clinical_scanner():
     assert isinstance(g, CurvedGeometry) and Projector(g)._kind is Joseph
     for found in (project_volume(volume, g), Projector(g)(volume)):
         assert np.linalg.norm(found - expected) / np.linalg.norm(expected) < 0.01  # of the voxels
-    assert np.linalg.norm(project_volume(volume, flat) - expected) / np.linalg.norm(expected) > 0.5
+    assert np.linalg.norm(project_volume(volume, flat) - expected) / np.linalg.norm(expected) > 0.1
