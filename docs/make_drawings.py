@@ -1,7 +1,7 @@
 """Draw what the pages on concepts explain, without data: `python docs/make_drawings.py`, two seconds.
 
-Writes docs/figures/geometry.svg (frame, distances and axes of a scan) and docs/figures/closed_form.svg (a ray through a
-Gaussian, and its projection).
+Writes docs/figures/geometry.svg (frame, distances and axes of a scan), docs/figures/closed_form.svg (a ray through a
+Gaussian, and its projection) and docs/figures/curved.png (a clinical scanner).
 """
 
 from pathlib import Path
@@ -12,6 +12,8 @@ matplotlib.use('agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
+
+import lingo_mi as lm
 
 FIGURES = Path(__file__).resolve().parent / 'figures'
 BLUE, RED, GREY, GREEN = '#2563a8', '#c0392b', '#777777', '#2e7d4f'
@@ -133,6 +135,14 @@ def closed_form():
     save(figure, 'closed_form')
 
 
+def curved():
+    """Two views of a helical scanner whose panel is bent about its focal spot."""
+    panel = dict(nDetector=(64, 736), dDetector=(1.0947, 1.2858), offDetector=(0, 1.2858 / 4))
+    turns = dict(pitch=38.4, angles=lm.circular(1440, total=720, start=-360))
+    flat = lm.Geometry.helix(DSO=595, DSD=1085.6, **panel, **turns, nVoxel=(512, 512, 64), dVoxel=(0.8, 0.8, 1))
+    flat.curved().show(views=[0, 500]).savefig(FIGURES / 'curved.png', dpi=80)
+
+
 def save(figure, name: str):
     figure.tight_layout()
     figure.savefig(FIGURES / f'{name}.svg', metadata=dict(Date=None), bbox_inches='tight', pad_inches=0.1)
@@ -143,3 +153,4 @@ if __name__ == '__main__':
     plt.rcParams['svg.hashsalt'] = 'lingo_mi'  # the same file every time
     geometry()
     closed_form()
+    curved()

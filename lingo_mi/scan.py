@@ -160,14 +160,14 @@ class Scan:
                 'the effects of a detector happened in its own pixels: give line integrals without effects'
             )
         flat, (top, bottom, left, right) = self.geometry.to_flat(), self.geometry.flat_pixels()
-        curve = self.geometry.rays(curved=True).curve
+        real = self.geometry.rays(curved=True)
         x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
         out = np.empty((len(self), *x.shape), np.float32)
         valid = None if self.valid is None else np.empty(out.shape, bool)
         for view, image in enumerate(self.projections):
-            column, row = curve.on_panel(x, y, view)
+            column, row = real.on_panel(x, y, view)
             out[view] = interpolated(image, column, row, 3 if valid is None else 1)
-            if valid is not None:
+            if valid is not None and self.valid is not None:
                 valid[view] = interpolated(self.valid[view].astype(float), column, row, 1) > 1 - 1e-6
         return Scan(flat, out, valid)
 

@@ -163,13 +163,12 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
         vectors = limits.lengths('Vectors', vectors)
         if vectors.ndim != 2 or vectors.shape[1] != 13 or len(set(vectors[:, 12])) != 1:
             raise InputError(
-                'the Vectors of cyl_cone_vec must be 13 numbers for every view, and the last of them, the radius, the same for all'
+                'the Vectors of cyl_cone_vec must be 13 numbers for every view, the last of them, a radius, the same for all'
             )
         vectors, radius = vectors[:, :12], float(vectors[0, 12])
     rays = from_vectors(vectors, nDetector, VECTORS[kind] == 'parallel')
-    if radius is not None:
-        if not _bent_towards_source(rays).all():
-            raise InputError('a panel of cyl_cone_vec is bent away from its source: swap the sign of u or of v')
+    if radius is not None and not _bent_towards_source(rays).all():
+        raise InputError('a panel of cyl_cone_vec is bent away from its source: swap the sign of u or of v')
     source, v = rays.source, -rays.v
     if rays.parallel:
         source = source * np.sign(np.sum(source * np.cross(rays.u, v), 1, keepdims=True))

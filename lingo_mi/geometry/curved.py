@@ -25,7 +25,7 @@ class CurvedGeometry(Geometry):
     """A cone beam before a panel that is bent on a cylinder: rows run along the arc, columns along the cylinder's axis.
 
     `Geometry.curved` makes one in a clinical scanner's terms. Here the panel touches a flat one along its middle, on the side of
-    the source, and its columns are spaced along the arc as the flat one's along u (as in ASTRA's `cyl_cone_vec` and in RTK).
+    the source, and its columns are spaced along the arc as the flat one's along u, as in ASTRA's `cyl_cone_vec`.
 
     Voxels are projected along the exact rays, and so are Gaussians. What only a flat panel serves says so; `Scan.to_flat`
     resamples.
@@ -166,9 +166,7 @@ def curved(geometry: Geometry, radius: float | None) -> CurvedGeometry:
     """The scan of `Geometry.curved`."""
     rays = geometry.rays()
     require_bendable(rays)
-    if radius is None:
-        radius = geometry.DSD
-    radius = limits.sizes('radius', radius, 1)[0]
+    radius = float(limits.sizes('radius', geometry.DSD if radius is None else radius, 1)[0])
     # The source's foot along u from the panel's middle. There the flat panel is touched; what is left is gone along the arc.
     step = np.linalg.norm(rays.u, axis=1)
     off = np.sum((rays.source - rays.centre(geometry.nDetector)) * rays.u, 1) / step
@@ -203,7 +201,7 @@ def bent(rays: Rays, nDetector: tuple[int, int], radius: float) -> Rays:
 def slid(rays: Rays, nDetector: tuple[int, int], radius: float, by: np.ndarray) -> Rays:
     """The flat panels that curved ones touch after a slide along their arcs by `by`, mm [n], towards growing columns."""
     turn, step = (by / radius)[:, None], np.linalg.norm(rays.u, axis=1, keepdims=True)
-    along, up = rays.u / step, _towards_source(rays)
+    along, up = rays.u / step, towards_source(rays)
     middle = rays.centre(nDetector) + radius * (np.sin(turn) * along + (1 - np.cos(turn)) * up)
     u = step * (np.cos(turn) * along + np.sin(turn) * up)
     return replace(rays, u=u, corner=middle - nDetector[1] / 2 * u - nDetector[0] / 2 * rays.v)
@@ -228,7 +226,7 @@ def curve_of(rays: Rays, nDetector: tuple[int, int], radius: float) -> Curve:
         radius / step,
         np.sum(to_source * rays.u, 1) / step**2,
         np.sum(to_source * rays.v, 1) / np.sum(rays.v**2, 1),
-        np.abs(np.sum(to_source * _towards_source(rays), 1)) / step,
+        np.abs(np.sum(to_source * towards_source(rays), 1)) / step,
     )
     # A ray leaves the cylinder at the panel if it runs away from the axis there.
     angle = np.array([[-0.5], [0.5]]) * nDetector[1] / curve.radius
@@ -241,7 +239,7 @@ def curve_of(rays: Rays, nDetector: tuple[int, int], radius: float) -> Curve:
     return curve
 
 
-def _towards_source(rays: Rays) -> np.ndarray:
+def towards_source(rays: Rays) -> np.ndarray:
     """The panels' unit normals, [n, 3]."""
     normal = np.cross(rays.u, rays.v)
     normal *= np.sign(np.sum(normal * (rays.source - rays.corner), 1, keepdims=True))

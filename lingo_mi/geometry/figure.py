@@ -50,12 +50,12 @@ def figure(geometry: Geometry, views: np.ndarray) -> Figure:
     above.plot(0, 0, '+', color=INK, markersize=9, zorder=5)
     (rows, columns), (step_v, step_u) = geometry.nDetector, geometry.dDetector
     place = f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else ''
-    bend = f', bent by a radius of {geometry.radius:.5g} mm' if isinstance(geometry, CurvedGeometry) else ''
+    bend = f', bent by a radius of {geometry.radius:.5g} mm\n' if isinstance(geometry, CurvedGeometry) else '; '
     count = f'{len(geometry)} view{"s" * (len(geometry) > 1)}'
     sides = ' x '.join(f'{size:.4g}' for size in geometry.grid.size)
     out.suptitle(
         f'{geometry.mode} beam, {count}{place}; panel {columns} x {rows} pixels, {columns * step_u:.4g} x '
-        f'{rows * step_v:.4g} mm{bend}; volume {sides} mm',
+        f'{rows * step_v:.4g} mm{bend}volume {sides} mm',
         fontsize='medium',
     )
     out.legend(handles=_handles(geometry), loc='outside lower center', ncols=5, frameon=False)

@@ -184,7 +184,11 @@ class Rays:
         if not self.parallel:
             hit[~(t > 0)] = np.nan
         nn = n @ n
-        x, y = np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn
+        return self.on_panel(np.cross(hit, b) @ n / nn, np.cross(a, hit) @ n / nn, view)
+
+    def on_panel(self, x: ArrayLike, y: ArrayLike, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel positions of the rays through positions x, y of the flat panel: those positions, unless there is a `curve`."""
+        x, y = np.asarray(x, float), np.asarray(y, float)
         return (x, y) if self.curve is None else self.curve.on_panel(x, y, view)
 
     def points(self, view: int, x: ArrayLike, y: ArrayLike) -> np.ndarray:

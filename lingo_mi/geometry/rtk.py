@@ -12,14 +12,15 @@ with x, y the position in the image of projections. The image's spacing and orig
 dDetector, and the image is taken as centred, its origin at minus half of (pixels - 1) spacings. RTK's rows run up, this
 package's down: the rows of RTK's stacks must be reversed, `stack[:, ::-1]`, to go with the poses read here.
 
-RadiusCylindricalDetector, once for all views and 0 for flat panels, bends them about their middle x = 0 towards the source, as
-`curved.CurvedGeometry` does.
+RadiusCylindricalDetector, once for all views and 0 for flat panels, bends them towards the source: x + ProjectionOffsetX is then
+a length along the arc, from the line of the panel where e3 through the axis of rotation meets it.
 
 Rit et al., "The Reconstruction Toolkit (RTK)", J. Phys.: Conf. Ser. 489 (2014), and RTK's documentation, "Geometry".
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +34,7 @@ from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices
-from lingo_mi.geometry.curved import bent
+from lingo_mi.geometry.curved import bent, slid, towards_source
 from lingo_mi.geometry.grid import Voxels
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import rotation
@@ -125,7 +126,10 @@ def read_rtk(source: Any, nDetector: tuple[int, int], dDetector: tuple[float, fl
     start = -e3 if parallel else sx[:, None] * e1 + sy[:, None] * e2 + sid[:, None] * e3
     try:
         rays = Rays(start, x * e1 + y * e2 + z * e3, du * e1, -dv * e2, parallel).checked()
-        return bent(rays, nDetector, radius) if radius else rays
+        if not radius:
+            return rays
+        touching = replace(rays, corner=rays.corner - px[:, None] * e1)
+        return bent(slid(touching, nDetector, radius, px), nDetector, radius)
     except InputError as error:
         raise InputError(f'{where}: {error}') from None
 
@@ -142,6 +146,9 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
         askew to a parallel beam; and where the file cannot be written.
     """
     step_u, step_v = (np.linalg.norm(a, axis=1) for a in (rays.u, rays.v))
+    radius = 0.0 if rays.curve is None else float(np.mean(rays.curve.radius * step_u))
+    if radius:
+        rays = _facing_the_axis(rays, nDetector, radius)
     e1, e2 = rays.u / step_u[:, None], -rays.v / step_v[:, None]
     e3 = np.cross(e1, e2)
     if np.abs(np.sum(e1 * e2, 1)).max() > 1e-6:
@@ -164,8 +171,8 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
     px, py = (np.sum(centre * e, 1) for e in (e1, e2))
     columns = dict(zip(_NUMBERS, (sid, sdd, np.mod(gantry, 360), out, turn, px, py, sx, sy)))
     root = ElementTree.Element(ROOT, version='3')
-    if rays.curve is not None:
-        ElementTree.SubElement(root, RADIUS).text = repr(float(np.mean(rays.curve.radius * step_u)))
+    if radius:
+        ElementTree.SubElement(root, RADIUS).text = repr(radius)
     for view, matrix in enumerate(_matrices(rays, nDetector, sdd, step_u, step_v)):
         node = ElementTree.SubElement(root, 'Projection')
         for name, values in columns.items():
@@ -177,6 +184,17 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
     text = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n' + ElementTree.tostring(root, encoding='unicode') + '\n'
     with replacing(path) as temporary:
         temporary.write_text(text, encoding='utf-8')
+
+
+def _facing_the_axis(rays: Rays, nDetector, radius) -> Rays:
+    """Flat panels that touch the same cylinders where RTK's do, moved in their planes by what the panel's middle is off there."""
+    along, up = rays.u / np.linalg.norm(rays.u, axis=1, keepdims=True), towards_source(rays)
+    axis = rays.centre(nDetector) + radius * up
+    aside, ahead = (np.sum(axis * a, 1) for a in (along, up))
+    by = radius * np.arctan2(-aside * np.where(ahead < 0, -1, 1), np.abs(ahead))
+    there = slid(rays, nDetector, radius, by)
+    step = there.u / np.linalg.norm(there.u, axis=1, keepdims=True)
+    return replace(there, corner=there.corner - by[:, None] * step)
 
 
 def _from_file(path) -> tuple[np.ndarray, float]:

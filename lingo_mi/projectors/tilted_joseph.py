@@ -8,6 +8,7 @@ panel, `joseph` is faster, since a voxel's weights in a column have much in comm
 from __future__ import annotations
 
 from copy import copy
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -179,8 +180,8 @@ def _integrate(data, size, ray: Ray):
     return ray.path * total, ray.path * count
 
 
-def _shadow(r, point):
-    """The positions of rays that may pass within a voxel of `point` in its slice, on the (flat) panel: middle and reach of both.
+def _shadow(r, point) -> Any:
+    """Where rays that pass within a voxel of `point` in its slice meet the (flat) panel, along u and v: shadows as of `_pixels`.
 
     A shift by s moves the shadow along u by (p - u w) s / (w0 + w s), with p and w rows of the projection matrix r and w0 the
     point's value of w. One entry of s, that along the main axis, is zero.
@@ -196,19 +197,22 @@ def _shadow(r, point):
     return out
 
 
-def _pixels(middle, reach, count):
-    """The first and the last pixel whose centres are within `reach` and half a pixel of a position, as floats."""
+def _pixels(spot, count):
+    """The first and the last pixel whose centres are in a shadow, as floats. spot: its middle, and its reach less half a pixel."""
+    middle, reach = spot
     return dr.ceil(dr.clip(middle - 1 - reach, 0, count)), dr.floor(dr.clip(middle + reach, -1, count - 1))
 
 
-def _on_arc(middle, reach, numbers):
-    """Middle and reach of a shadow along u, on the curved panel. numbers: see `bent.numbers_of`."""
+def _on_arc(spot, numbers):
+    """A shadow along u, as of `_pixels`, on the curved panel. numbers: see `bent.numbers_of`."""
+    middle, reach = spot
     low, high = (bent.column_of(numbers, middle + s * (reach + 0.5)) for s in (-1, 1))
     return 0.5 * (low + high), 0.5 * (high - low) + (SLACK - 0.5)
 
 
-def _at_column(middle, reach, numbers, scale):
-    """Middle and reach of a shadow along v, in a column of the curved panel whose s is `scale`."""
+def _at_column(spot, numbers, scale):
+    """A shadow along v, as of `_pixels`, in a column of the curved panel whose s is `scale`."""
+    middle, reach = spot
     foot, inv = numbers[3], dr.rcp(scale)
     return dr.fma(middle - foot, inv, foot), (reach + 0.5) * inv + (SLACK - 0.5)
 
@@ -226,15 +230,15 @@ def _collect(weighted, chosen, n_views, A: TiltedJoseph, ones):
         view = dr.gather(mi.UInt, chosen, block)
         r = [dr.gather(mi.Float, matrices, view * 12 + i) for i in range(12)]
         o, o_u, o_v, d, d_u, d_v, voxel = _threes(rays, view)
-        numbers = bent.numbers_of(A.bends, view) if curved else None
+        numbers: Any = bent.numbers_of(A.bends, view) if curved else None
         for s in range(run):
             z = z0 + s * stride
             along_u, along_v = _shadow(r, (x, y, z))
-            u, u_last = _pixels(*(_on_arc(*along_u, numbers) if curved else along_u), n_u)
-            v_first, v_last = _pixels(*along_v, n_v)
+            u, u_last = _pixels(_on_arc(along_u, numbers) if curved else along_u, n_u)
+            v_first, v_last = _pixels(along_v, n_v)
             while u <= u_last:
                 X, scale = bent.column(A.columns, A.panel, view, mi.UInt(u)) if curved else (u + 0.5, None)
-                first, last = _pixels(*_at_column(*along_v, numbers, scale), n_v) if curved else (v_first, v_last)
+                first, last = _pixels(_at_column(along_v, numbers, scale), n_v) if curved else (v_first, v_last)
                 origin, direction = _affine(o, o_u, X), _affine(d, d_u, X)
                 v = mi.Float(first)
                 column = (block * n_u + mi.UInt(u)) * n_v

@@ -40,13 +40,13 @@ def require_pixels(scan: Scan, what: str) -> None:
 
 def require_rays(geometry: Geometry) -> None:
     """Raises InputError if a source is inside the volume, or if no ray of any view meets the volume."""
-    rays, centre, half = geometry.rays(), np.array(geometry.grid.centre), np.array(geometry.grid.size) / 2
+    rays, centre, half = geometry.rays(curved=True), np.array(geometry.grid.centre), np.array(geometry.grid.size) / 2
     if not rays.parallel and (np.abs(rays.source - centre) < half).all(1).any():
         raise InputError('the source lies within the volume: check DSO, nVoxel and dVoxel')
     corners, (rows, columns) = centre + half * list(product((-1, 1), repeat=3)), geometry.nDetector
     for view in range(len(geometry)):
         x, y = rays.project(corners, view)
-        # NaN: corners behind the source. The extent of the shadow is then unknown.
+        # NaN: corners behind the source, or beside a curved panel. The extent of the shadow is then unknown.
         if 0 < np.isnan(x).sum() < len(x) or x.max() > 0 and x.min() < columns and y.max() > 0 and y.min() < rows:
             return
     raise InputError('no ray meets the volume: check offOrigin, offDetector and the poses')

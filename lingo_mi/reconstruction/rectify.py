@@ -51,9 +51,7 @@ def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
     real = scan.geometry.rays(curved=True)
     for view, to_real in enumerate(_homographies(geometry.rays(), real)):
         x, y, w = to_real @ there
-        x, y = x / w, y / w
-        if real.curve is not None:
-            x, y = real.curve.on_panel(x, y, view)
+        x, y = real.on_panel(x / w, y / w, view)
         # Half a pixel of margin: a single row that is slightly turned lies between two new rows.
         seen = (w > 0) & (x > -0.5) & (x < n_u + 0.5) & (y > -0.5) & (y < n_v + 0.5)
         value = interpolated(scan.projections[view], x, y)

@@ -53,9 +53,9 @@ GEOMETRIES = {
     'helical': dict(height=helix(3 * ANGLES - 9.0, 11.0)),
     'curved': {},
     'curved, offset': dict(offDetector=(9.0, -17.0)),
-    'curved, another radius': dict(offDetector=(9.0, 0.35)),
+    'curved, another radius': dict(offDetector=(9.0, 0.35), COR=5.0),
 }
-RADII = {'curved': 450.0, 'curved, offset': 450.0, 'curved, another radius': 90.0}
+RADII = {'curved': 450.0, 'curved, offset': 450.0, 'curved, another radius': 400.0}
 
 
 def geometry(name, n=40, side=40.0):

@@ -25,7 +25,7 @@ def geometry(mode='cone', angles=None, **changes):
 
 def ellipsoids(geo, *bodies):
     """Scan of ellipsoids (centre, semi-axes, density) by the closed form of the chord."""
-    frames, out = geo.rays(), np.zeros((len(geo), *geo.nDetector))
+    frames, out = geo.rays(curved=True), np.zeros((len(geo), *geo.nDetector))
     x, y = np.meshgrid(np.arange(geo.nDetector[1]) + 0.5, np.arange(geo.nDetector[0]) + 0.5)
     for view in range(len(geo)):
         o, d = frames.through(view, x, y)

@@ -91,7 +91,7 @@ def test_columns_of_positions(geometry):
 
 
 def test_a_clinical_scanner():
-    """736 columns about the focal spot, a quarter of a pixel off, against the line integrals of a Gaussian near the fan's edge."""
+    """736 columns about the focal spot, a quarter of a pixel off, against line integrals of a Gaussian near the fan's edge."""
     centre, width, side = np.array([120.0, 110.0, 0.0]), 4.0, 64
     flat = Geometry.helix(
         DSO=595, DSD=1085.6, nDetector=(16, 736), dDetector=(1.2, 1.2858), offDetector=(0, 1.2858 / 4), pitch=12,
