@@ -198,7 +198,7 @@ def _shadow(r, point) -> Any:
 
 
 def _pixels(spot, count):
-    """The first and the last pixel whose centres are in a shadow, as floats. spot: its middle, and its reach less half a pixel."""
+    """The first and the last pixel with a centre in a shadow, as floats. spot: its middle, and its reach less half a pixel."""
     middle, reach = spot
     return dr.ceil(dr.clip(middle - 1 - reach, 0, count)), dr.floor(dr.clip(middle + reach, -1, count - 1))
 
