@@ -379,7 +379,7 @@ def test_bad_scanners(values, match):
         (
             'a.xml',
             RTK.replace('<Proj', '<RadiusCylindricalDetector>9</RadiusCylindricalDetector><Proj', 1),
-            'not supported',
+            'must be one of less than 180',
         ),
         (
             'a.xml',

@@ -444,7 +444,7 @@ def test_rtk_object_and_file(tmp_path):
 
 def test_bad_rtk(tmp_path):
     for source, match in (
-        (Gantry(radius=900.0), 'RadiusCylindricalDetector is not supported'),
+        (Gantry(radius=-900.0), 'radius must be positive'),
         (Gantry(0), 'holds no projections'),
         (tmp_path / 'gone.xml', 'no such file'),
     ):
