@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,8 @@ def pytest_collection_modifyitems(config, items):
         skips['slow'] = 'full size: run with --slow'
     if STAND_IN and VARIANT.startswith('cuda'):
         skips['traces_rays'] = 'a stand-in for the CUDA driver has no OptiX'
+    if sys.platform == 'win32':
+        skips['posix'] = 'Windows has no such pipes, devices, fork or signals'
     for item in items:
         for name, reason in skips.items():
             if name in item.keywords:

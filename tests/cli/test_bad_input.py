@@ -57,6 +57,7 @@ def test_not_a_scene(tmp_path, text, says):
     assert says in refused(tmp_path, tmp_path / 'scene.xml')
 
 
+@pytest.mark.posix
 def test_missing_scene(tmp_path):
     assert 'none.xml' in refused(tmp_path, tmp_path / 'none.xml')
     assert f'{tmp_path}: has neither meta_data.json' in refused(tmp_path, tmp_path)  # as a scan in the place of a scene

@@ -232,6 +232,7 @@ def wait_for(process, condition, seconds=300):
         time.sleep(0.005)
 
 
+@pytest.mark.posix
 def test_resume_after_kill(result, scene, tmp_path):
     """`kill -9` in the middle, then --resume: the same numbers as without the interruption."""
     _, whole, _ = result
@@ -251,6 +252,7 @@ def test_resume_after_kill(result, scene, tmp_path):
     assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in whole['history']]
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_resume_after_kills_in_a_search(scene, tmp_path):
     """`kill -9` while the fit searches for the step to stop at, --resume, `kill -9` while it goes there, and --resume."""

@@ -20,6 +20,7 @@ from helpers.script import SCENE
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.storage.output_folder import CHECKPOINT, METRICS, digest
 
+pytestmark = pytest.mark.posix
 SHARE = 16
 KINDS = 'kill', 'full', 'denied'
 KEYS = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians'

@@ -3,7 +3,6 @@
 import hashlib
 import os
 import shutil
-import signal
 from unittest import mock
 
 import numpy as np
@@ -114,7 +113,7 @@ def test_a_killed_fit_holds_no_lock(scene, tmp_path):
         assert process.poll() is None
     code, _, err = fit(*long, '--force')
     refused(code, err.splitlines(True)[-1], f'process {process.pid} on', 'is writing there')
-    process.send_signal(signal.SIGKILL)
+    process.kill()
     process.communicate()
     code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--force')
     assert code == 0, err

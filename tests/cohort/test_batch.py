@@ -231,6 +231,7 @@ def test_lists_that_spreadsheets_write(home, content):
     ('file\nä\n'.encode('latin-1'), 'line 2: is not UTF-8'), ('file\na\n'.encode('utf-16'), 'UTF-16'),
     (b'file\n"a\n', 'no CSV'), (b'file\na\0b\n', ''), (b'\x00\x01\x02', ''),
 ])  # fmt: skip
+@pytest.mark.posix
 def test_files_that_are_no_list(home, content, message):
     (home / 'list.csv').write_bytes(content)
     code, _, err = batch(home)

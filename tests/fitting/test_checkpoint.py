@@ -316,6 +316,7 @@ def test_entries_twice(whole, tmp_path):
     assert 'twice' in line(path)
 
 
+@pytest.mark.posix
 def test_files_that_are_no_files(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for path in (tmp_path, tmp_path / 'pipe', '/dev/zero'):

@@ -66,6 +66,7 @@ def test_a_case_is_made_again_from_its_number(tmp_path):
     assert files[0] == files[1] and 'why' in (first / 'what.txt').read_text()
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(
     'program, match',
     [

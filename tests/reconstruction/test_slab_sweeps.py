@@ -1,7 +1,6 @@
 """SART, OS-SART and SIRT in slabs: the volume of the whole, in the memory of a slab, and work that is stopped and goes on."""
 
 import json
-import signal
 import subprocess
 import sys
 import time
@@ -208,7 +207,7 @@ def test_the_command(tmp_path):
     while not state.exists() or json.loads(state.read_text())['updates'] < 2:
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
+    process.kill()
     process.wait()
     assert not out.exists()
     code, text, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--out', out)

@@ -74,6 +74,7 @@ def test_bytes(refused):
         assert 'not a scene' in refused(content)
 
 
+@pytest.mark.posix
 def test_devices_and_pipes(refused, tmp_path):
     os.mkfifo(tmp_path / 'pipe.xml')
     os.symlink('/dev/zero', tmp_path / 'link.xml')

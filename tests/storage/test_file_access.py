@@ -29,6 +29,7 @@ def test_not_beside(name):
 NAMES = ('v.npy', 'v.npz', 'v.nii', 'v.nii.gz', 'v.hdr', 'v.mha', 'v.nrrd', 'v.tif', 'v.raw', 's.pickle', 'c.ply')
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize('name', NAMES)
 @pytest.mark.parametrize('kind', ['pipe', 'device', 'folder'])
 def test_no_reader_waits_for_a_pipe_or_reads_a_device(tmp_path, name, kind):
@@ -88,6 +89,7 @@ def test_links_are_not_followed_for_writing(tmp_path):
     assert (tmp_path / 'other').read_text() == 'mine' and (tmp_path / 'a').read_text() == 'new'
 
 
+@pytest.mark.posix
 def test_names_of_any_length_and_bytes(tmp_path):
     for name in ('a' * 251 + '.txt', 'ä' * 127, os.fsdecode(b'\xff' * 200)):
         write_text(tmp_path / name, 'x')

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -31,7 +30,7 @@ def test_the_second_is_told_who_writes(tmp_path):
         with pytest.raises(InputError, match=f'process {process.pid} on .* is writing there'), locked(tmp_path / 'a'):
             pass
     finally:
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         process.communicate()
     assert (tmp_path / 'a' / LOCK).exists()
     with locked(tmp_path / 'a'):
@@ -53,7 +52,7 @@ def test_folders_are_removed_again(tmp_path):
     assert not (tmp_path / 'a').exists()
 
 
-@pytest.mark.parametrize('system', [None, 'refuses'])
+@pytest.mark.parametrize('system', [None, pytest.param('refuses', marks=pytest.mark.posix)])
 def test_without_locks_of_the_system(tmp_path, monkeypatch, system):
     """The file itself is the lock, and that of a dead process of this computer is taken over."""
 

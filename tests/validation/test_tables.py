@@ -244,6 +244,7 @@ def _stop_at(iteration):
     return update
 
 
+@pytest.mark.posix
 @pytest.mark.thorough
 def test_killed(tmp_path):
     """`kill -9` in the middle of the second cell: the first stays, and the same command ends the table."""

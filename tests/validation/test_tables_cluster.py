@@ -45,6 +45,7 @@ def tables(out, *more):
 
 
 @pytest.mark.thorough
+@pytest.mark.posix
 def test_a_worker_is_killed(tmp_path):
     out, cells = tmp_path / 'out', Cells(tmp_path / 'out', TINY)
     killed = []
