@@ -18,9 +18,10 @@ from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
 from lingo_mi.effects.forward import effects_of
-from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
+from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map, require_whole_chunks
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.inspection.measure import warn_of_intensities
+from lingo_mi.jobs.cluster import workers
 from lingo_mi.reconstruction import FDK, Algorithm, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
@@ -53,7 +54,8 @@ def reconstruct(
     start: Fit | None = None,
     views: int | None = None,
     out: str | PathLike,
-    slab: int,
+    slab: int | None = None,
+    cluster: Any = None,
     force: bool = False,
     progress: bool = True,
 ) -> Path: ...
@@ -68,6 +70,7 @@ def reconstruct(
     views: int | None = None,
     out: str | PathLike | None = None,
     slab: int | None = None,
+    cluster: Any = None,
     force: bool = False,
     progress: bool = True,
 ) -> Reconstruction | Path:
@@ -94,6 +97,10 @@ def reconstruct(
         Make the volume in slabs of so many slices, and write each to `out`, so that it need not fit into memory: by `FDK`,
         `SART`, `OSSART` and `SIRT`. Iterative ones hold the volume in a folder beside `out`, whose name ends in .slabs, until it
         is written. If they are stopped, the same call goes on.
+    cluster : str or Client, optional
+        Let the workers of a Dask cluster make the slabs (default: of 64 slices), and write them to `out`, an .ome.zarr: the
+        scheduler's address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see
+        the folder of `out`. The volume is that of one process. The slab of a worker that dies is made again by another one.
     force : bool
         Replace an earlier file.
     progress : bool
@@ -103,7 +110,7 @@ def reconstruct(
     -------
     Reconstruction or Path
         `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|, NaN for passes where it was not computed;
-        `seconds`. It can be used as an array. With `slab`: the path of the volume.
+        `seconds`. It can be used as an array. With `slab` or `cluster`: the path of the volume.
 
     Raises
     ------
@@ -120,6 +127,8 @@ def reconstruct(
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
     views = None if views is None else whole_number('views', views, 1)
+    if cluster is not None and slab is None:
+        slab = THICKNESS
     slab = None if slab is None else whole_number('slab', slab, 1)
     path = None if out is None else as_path('out', out)
     start = _start(start)
@@ -132,6 +141,8 @@ def reconstruct(
     require_signal(scan)
     if truth is None:  # else it is simulated, as a rule
         warn_of_intensities(scan)
+    if cluster is not None and path is not None and slab is not None:
+        require_whole_chunks(path, scan.geometry.grid, slab)
     if slab is None:  # else the slabs are checked
         seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
         both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them
@@ -140,8 +151,11 @@ def reconstruct(
         scan, algorithm, inputs = _prepared(scan, algorithm, start, views)
         if path is not None and slab is not None:
             assert isinstance(algorithm, FDK | Sweeps)  # see `_check`
-            with progress_bar(algorithm, scan, steps=algorithm.slab_steps(scan, slab), shown=progress) as bar:
-                run_in_slabs(scan, algorithm, path, slab, bar)
+            with (
+                nullcontext() if cluster is None else workers(cluster, path) as runner,
+                progress_bar(algorithm, scan, steps=algorithm.slab_steps(scan, slab), shown=progress) as bar,
+            ):
+                run_in_slabs(scan, algorithm, path, slab, bar, runner)
             return path
         with progress_bar(algorithm, scan, shown=progress) as bar:
             found = run_algorithm(scan, algorithm, progress=bar, **inputs)

@@ -7,6 +7,7 @@
     lingo-mi reconstruct x3d_foot --algorithm refined --complete out/x3d_foot --views 100
     lingo-mi reconstruct x3d_foot --algorithm refined --start out/x3d_foot
     lingo-mi reconstruct large.npy --algorithm fdk --slab 64 --out large.ome.zarr
+    lingo-mi reconstruct large.npy --algorithm fdk --cluster local:3 --out large.ome.zarr
     lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
 The input is what `lingo-mi fit` takes. With --complete, the views that were fitted are used, those missing to --views are
@@ -23,7 +24,7 @@ with --complete and --start, those that the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
 ones hold it in a folder beside it, whose name is that of the volume and .slabs, until it is written. If they are stopped, the
-same command goes on.
+same command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its folder.
 """
 
 import argparse
@@ -48,7 +49,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import parse
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.completion.prepare import require_volume
-from lingo_mi.files.slabs import check_volume_name, plan_and_error_map
+from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map
 from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.fitting.measure import volume_quality
 from lingo_mi.geometry import Geometry, Grid
@@ -98,6 +99,12 @@ def parser() -> Parser:
         help=f'hold N slices of the volume in memory at once ({", ".join(IN_SLABS)}; default: all)',
     )
     p.add_argument(
+        '--cluster',
+        metavar='ADDRESS|local:N',
+        help="let a Dask cluster make the slabs and write them to an .ome.zarr: its scheduler's address or file, or N processes "
+        'of this machine',
+    )
+    p.add_argument(
         '--report',
         type=Path,
         metavar='F.html',
@@ -129,10 +136,14 @@ def check_arguments(args: argparse.Namespace) -> None:
     if args.seed is not None:
         check_seed(args.seed)
     name, fit = args.algorithm, args.complete or args.start
+    if args.cluster is not None and args.slab is None:
+        args.slab = THICKNESS
     if args.slab is not None and args.report is not None:
-        raise InputError('--report needs the whole volume: leave out --slab')
+        raise InputError('--report needs the whole volume: leave out --slab and --cluster')
     if args.slab is not None and (args.slab < 1 or name not in IN_SLABS):
-        raise InputError(f'--slab is a number of slices from 1 on, for --algorithm {", ".join(IN_SLABS)}')
+        raise InputError(
+            f'--slab is a number of slices from 1 on, and goes, as --cluster, with --algorithm {", ".join(IN_SLABS)}'
+        )
     if args.slab is not None and args.start:
         raise InputError('--slab starts from an empty volume: leave out --start, or --slab')
     if name == 'best' and fit:
@@ -218,7 +229,9 @@ def main() -> None:
         found = voxelized(fit, dataset.train.geometry.grid, out, args)
     else:
         total = args.views if args.complete else None
-        found = reconstruct(dataset, algorithm, start=fit, views=total, out=out, slab=args.slab, force=args.force)
+        found = reconstruct(
+            dataset, algorithm, start=fit, views=total, out=out, slab=args.slab, cluster=args.cluster, force=args.force
+        )
     if isinstance(found, Path):
         shape = ' x '.join(map(str, dataset.train.geometry.grid.shape))
         seconds = time.perf_counter() - began
@@ -235,7 +248,7 @@ def voxelized(fit: Fit, grid: Grid, out: Path, args: argparse.Namespace) -> Reco
     """Write the fit's own volume on the scan's voxels."""
     with writing_file(out):
         if args.slab:
-            return fit.save_volume(out, grid, slab=args.slab, force=args.force)
+            return fit.save_volume(out, grid, slab=args.slab, cluster=args.cluster, force=args.force)
         began = time.perf_counter()
         found = Reconstruction(fit.volume(grid), [], time.perf_counter() - began, grid)
         found.save(out, force=args.force)

@@ -6,8 +6,9 @@ Both keep slices along z together, so that a slab is appended to a NIfTI file, a
 from __future__ import annotations
 
 import gzip
+import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.volumes import volume_header
 from lingo_mi.geometry.grid import Grid
-from lingo_mi.storage.file_access import new_folder, optional, replacing
+from lingo_mi.storage.file_access import new_folder, optional, replacing, writing
 
 NIFTI, ZARR = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr')
 THICKNESS = 64  # slices of a slab, unless the caller chooses
 AXES = 'z', 'y', 'x'
+HALVES = 'halves'  # folder of slabs at half the resolution, while workers fill a `shared_zarr`
 CHUNK = 64  # voxels a side of an OME-Zarr's chunks, at most
 LEAST = 64  # voxels along the longest side of the coarsest level of a pyramid
 
@@ -104,22 +106,73 @@ def _write_nifti(path, grid, slabs, description):
 
 
 def _write_zarr(path, grid, slabs, description):
+    with new_folder(path) as temporary:
+        levels = _new_zarr(temporary, grid, description)
+        for begin, slab in _grouped(_checked(path, grid, slabs), 2 ** (len(levels) - 1)):
+            _add(levels, begin, slab.transpose(2, 1, 0))
+
+
+def _new_zarr(folder: Path, grid: Grid, description: str) -> list[Any]:
+    """The arrays of an OME-Zarr's levels, still empty, the finest first."""
     zarr, writer = optional('zarr', 'ome-zarr'), optional('ome_zarr.writer', 'ome-zarr')
     shapes = [grid.shape[::-1]]
     while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
         shapes.append(tuple(n // 2 for n in shapes[-1]))
+    group = zarr.open_group(str(folder), mode='w', zarr_format=3)
+    levels = [
+        group.create_array(
+            str(i), shape=s, chunks=tuple(min(n, CHUNK) for n in s), dtype='float32', dimension_names=AXES
+        )
+        for i, s in enumerate(shapes)
+    ]
+    _describe(writer, group, grid, len(levels))
+    group.attrs['lingo_mi'] = description
+    return levels
+
+
+def require_whole_chunks(path: Path, grid: Grid, thickness: int) -> None:
+    """Raises InputError unless slabs are whole chunks of an OME-Zarr, which several processes may then write at once."""
+    if not path.name.endswith(ZARR):
+        raise InputError(f'{path}: workers of a cluster write parts of one .ome.zarr; give such a name')
+    if thickness % CHUNK and thickness < grid.shape[2]:
+        raise InputError(
+            f'slabs must have a multiple of {CHUNK} slices on a cluster, not {thickness}: give slab={CHUNK}'
+        )
+
+
+@contextmanager
+def shared_zarr(path: Path, grid: Grid, description: str = 'density per mm') -> Iterator[Path]:
+    """A new OME-Zarr that several processes fill by `write_chunks`, see `require_whole_chunks`.
+
+    Yields a temporary folder, which becomes `path` with its coarser levels when the block ends without an error.
+    """
     with new_folder(path) as temporary:
-        group = zarr.open_group(str(temporary), mode='w', zarr_format=3)
-        levels = [
-            group.create_array(
-                str(i), shape=s, chunks=tuple(min(n, CHUNK) for n in s), dtype='float32', dimension_names=AXES
-            )
-            for i, s in enumerate(shapes)
-        ]
-        for begin, slab in _grouped(_checked(path, grid, slabs), 2 ** (len(levels) - 1)):
-            _add(levels, begin, slab.transpose(2, 1, 0))
-        _describe(writer, group, grid, len(levels))
-        group.attrs['lingo_mi'] = description
+        levels, halves = _new_zarr(temporary, grid, description), temporary / HALVES
+        halves.mkdir()
+        yield temporary
+        half = (np.load(file) for file in sorted(halves.iterdir()))
+        if len(levels) > 1:
+            for begin, slab in _grouped(((0, slab) for slab in half), 2 ** (len(levels) - 2)):
+                _add(levels[1:], begin, slab.transpose(2, 1, 0))
+        shutil.rmtree(halves)
+
+
+def write_chunks(folder: Path, begin: int, slab: np.ndarray) -> None:
+    """Write a slab [x, y, z] from the slice `begin` on to a `shared_zarr`, and its means for the next level."""
+    with writing(folder):
+        array = optional('zarr', 'ome-zarr').open_group(str(folder), mode='r+')['0']
+        array[begin : begin + slab.shape[2]] = slab.transpose(2, 1, 0)
+        with replacing(folder / HALVES / f'{begin:08d}.npy') as temporary, open(temporary, 'wb') as file:
+            np.save(file, _halved(slab.transpose(2, 1, 0)).transpose(2, 1, 0))
+
+
+def _halved(slab: np.ndarray) -> np.ndarray:
+    """Means of 2 x 2 x 2 voxels [z, y, x]; a voxel left over is in none of them."""
+    for axis in range(3):  # pair by pair, so that rounding does not depend on how the slab lies in memory
+        pairs = np.moveaxis(slab, axis, 0)
+        whole = len(pairs) // 2 * 2
+        slab = np.moveaxis((pairs[0:whole:2] + pairs[1:whole:2]) / 2, 0, axis)
+    return slab
 
 
 def _grouped(slabs: Iterable[tuple[int, np.ndarray]], step: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -139,8 +192,7 @@ def _add(levels: list[Any], begin: int, slab: np.ndarray) -> None:
     """Write a slab [z, y, x] to every level."""
     for i, level in enumerate(levels):
         if i:
-            z, y, x = (n // 2 * 2 for n in slab.shape)  # a voxel left over is in no coarser one
-            slab = slab[:z, :y, :x].reshape(z // 2, 2, y // 2, 2, x // 2, 2).mean((1, 3, 5), dtype=np.float32)
+            slab = _halved(slab)
             begin //= 2
         end = min(begin + len(slab), level.shape[0])
         level[begin:end] = slab[: end - begin]

@@ -16,13 +16,15 @@ from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.effects.forward import Effects, find_effects
-from lingo_mi.files.slabs import THICKNESS, write_slabs
+from lingo_mi.files.slabs import THICKNESS, require_whole_chunks, write_slabs
 from lingo_mi.fitting import average
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.fitting.measure import comparable, fit_metrics
 from lingo_mi.fitting.save import description, result_names, write_fit
+from lingo_mi.fitting.slab_cluster import voxelize_on
 from lingo_mi.geometry.grid import Grid
+from lingo_mi.jobs.cluster import workers
 from lingo_mi.report.data import ReportData
 from lingo_mi.report.figures import overview
 from lingo_mi.report.numbers import headline
@@ -137,7 +139,13 @@ class Fit(FittedModel):
     # ---- files and pages ----
 
     def save_volume(
-        self, path: str | PathLike, grid: Grid | None = None, *, slab: int = THICKNESS, force: bool = False
+        self,
+        path: str | PathLike,
+        grid: Grid | None = None,
+        *,
+        slab: int = THICKNESS,
+        cluster: Any = None,
+        force: bool = False,
     ) -> Path:
         """Write `volume` slab by slab, so that it need not fit into memory.
 
@@ -149,6 +157,8 @@ class Fit(FittedModel):
             Of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
         slab : int
             Slices that are in memory at once.
+        cluster : str or Client, optional
+            Let the workers of a Dask cluster write the slabs of an .ome.zarr, as `lm.reconstruct` does.
         force : bool
             Replace an earlier file.
 
@@ -170,7 +180,12 @@ class Fit(FittedModel):
         voxels = self._grid(grid)
         with writing(path):
             new_file(path, force)
-        write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
+        if cluster is None:
+            write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
+        else:
+            require_whole_chunks(path, voxels, slab)
+            with workers(cluster, path) as runner:
+                voxelize_on(runner, self, voxels, slab, path.absolute())
         return path
 
     def save(self, folder: str | PathLike, *, title: str = '', force: bool = False, note: dict | None = None) -> Path:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,24 @@ TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 
 
 @contextmanager
-def opened(address: str, folder: Path, threads: int = 0, variant: str | None = None) -> Iterator[Cluster]:
+def opened(
+    address: Any, folder: Path, threads: int = 0, variant: str | None = None, bar: bool = True
+) -> Iterator[Cluster]:
     """A cluster, connected to; workers that were started here end with the block.
 
     Parameters
     ----------
-    address : str
-        'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine.
+    address : str or Client
+        'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine; or a client of
+        `distributed`, which stays open.
     folder : Path
         That all workers must see; it exists.
     threads : int
         Of Dr.Jit a worker, on the CPU (0: all that a worker has; of local:N, its share).
     variant : str or None
         Of Mitsuba on the workers; None: each chooses.
+    bar : bool
+        Show how far the jobs are.
 
     Raises
     ------
@@ -48,6 +54,12 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
         If nobody answers there, and for workers that cannot do the jobs.
     """
     distributed = optional('distributed', 'cluster')
+    if isinstance(address, distributed.Client):
+        yield Cluster(address, Path(folder).resolve(), threads, variant, bar)
+        return
+    if not isinstance(address, str | PathLike):
+        raise InputError(f'cluster must be an address, local:N or a client of distributed, not {address!r}')
+    address = str(address)
     local = re.fullmatch(r'local:(\d{1,9})', address)
     if re.match('local(:|$)', address) and not (local and 1 <= int(local[1]) <= MOST_LOCAL):
         raise InputError(f'cluster={address}: write local:N, with N workers from 1 to {MOST_LOCAL}')
@@ -70,14 +82,24 @@ def opened(address: str, folder: Path, threads: int = 0, variant: str | None = N
             client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
         except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
             raise InputError(f'cluster={address}: no scheduler answers ({brief(error, 120)}); check it') from None
-        yield Cluster(client, Path(folder).resolve(), threads, variant)
+        yield Cluster(client, Path(folder).resolve(), threads, variant, bar)
+
+
+@contextmanager
+def workers(address: Any, path: Path) -> Iterator[Cluster]:
+    """The workers that write a file together, with this process's variant: see `opened`."""
+    import mitsuba as mi
+
+    with opened(address, path.parent, variant=mi.variant(), bar=False) as cluster:
+        yield cluster
 
 
 class Cluster:
     """A `Runner` on the workers of a Dask client."""
 
-    def __init__(self, client: Any, folder: Path, threads: int, variant: str | None):
+    def __init__(self, client: Any, folder: Path, threads: int, variant: str | None, bar: bool = True):
         self.client, self.folder, self.threads, self.variant = client, str(folder), threads, variant
+        self._bar = bar
         self._require_workers()
 
     @property
@@ -97,7 +119,7 @@ class Cluster:
                 future = self.client.submit(work, *arguments, key=key, pure=False, priority=-i)
                 futures[job.name] = future
                 future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
-            with Progress('Jobs', sum(job.steps for job in jobs)) as bar:
+            with Progress('Jobs', sum(job.steps for job in jobs), shown=self._bar) as bar:
                 _follow(by_name, events, tell, bar)
             if self.client.status != 'running':
                 raise InputError('the scheduler has gone; start one, and run the same command again')

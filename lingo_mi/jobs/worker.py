@@ -70,7 +70,8 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
     try:
         require_fit(describe_worker(folder, worker), folder)
         _prepare(threads, variant)
-        return attempt(job, report, lambda event: worker.log_event(topic, event))
+        event = attempt(job, report, lambda event: worker.log_event(topic, event))
+        return event._replace(value=f'{event.value} (worker {worker.address})') if event.kind == 'failed' else event
     except InputError as error:
         return Event(job.name, 'failed', str(error))
     except KeyboardInterrupt:

@@ -273,7 +273,7 @@ class FDK(Algorithm):
         def images(first):
             return filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
 
-        volume = _backprojected(geometry, images, progress)
+        volume = backprojected(geometry, images, progress)
         return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry.grid)
 
     def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
@@ -298,12 +298,8 @@ class FDK(Algorithm):
         """
         parts = scan.geometry.grid.slabs(thickness)
         check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))
-        projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
+        found, geometry = self.filtered_views(scan)
         n = len(geometry)
-        found = np.empty((n, *geometry.nDetector[::-1]), np.float32)  # filtered once, for all slabs
-        for first in range(0, n, BATCH):
-            found[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
-        del projections
         for k, part in enumerate(parts):
 
             def report(done, *_):
@@ -311,7 +307,29 @@ class FDK(Algorithm):
                     progress(k * n + done, len(parts) * n, None)
 
             slab = geometry.on(geometry.grid.slab(*part))
-            yield _backprojected(slab, lambda first: found[first : first + BATCH], report)
+            yield backprojected(slab, lambda first: found[first : first + BATCH], report)
+
+    def filtered_views(
+        self, scan: Scan, empty: Callable[[tuple[int, int, int]], np.ndarray] | None = None
+    ) -> tuple[np.ndarray, CircularGeometry]:
+        """All views, weighted and filtered once, for any number of slabs.
+
+        Parameters
+        ----------
+        empty : callable, optional
+            Makes the array for them from its shape (default: one in memory).
+
+        Returns
+        -------
+        tuple[ndarray, CircularGeometry]
+            Float32 [view, u, v], and their geometry.
+        """
+        projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
+        shape = len(geometry), *geometry.nDetector[::-1]
+        found = np.empty(shape, np.float32) if empty is None else empty(shape)
+        for first in range(0, len(geometry), BATCH):
+            found[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
+        return found, geometry
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""
@@ -343,7 +361,7 @@ def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry
     return projections, geometry
 
 
-def _backprojected(
+def backprojected(
     geometry: CircularGeometry, images: Callable[[int], np.ndarray], progress: Progress | None
 ) -> np.ndarray:
     """The volume [x, y, z] of filtered projections. images: gives those of a batch, [view, u, v], by its first view."""

@@ -15,11 +15,13 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import write_slabs
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.jobs.job import Runner
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.memory_needs import memory_needed
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.sart import Sweeps
+from lingo_mi.reconstruction.slab_cluster import fdk_on, sweep_on
 from lingo_mi.reconstruction.slab_sweeps import discard
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
@@ -66,7 +68,12 @@ def run_algorithm(
 
 
 def run_in_slabs(
-    scan: Scan, algorithm: FDK | Sweeps, path: Path, thickness: int, progress: Progress | None = None
+    scan: Scan,
+    algorithm: FDK | Sweeps,
+    path: Path,
+    thickness: int,
+    progress: Progress | None = None,
+    runner: Runner | None = None,
 ) -> None:
     """Reconstruct a scan in slabs of `thickness` slices, and write each to a file of the volume, which need not fit into memory.
 
@@ -77,13 +84,21 @@ def run_in_slabs(
     ----------
     progress : Progress or None
         Called as progress(steps done, `algorithm.slab_steps`, residual or None).
+    runner : Runner or None
+        Of workers that make the slabs and write them, see `slab_cluster` (None: this process).
     """
     require_signal(scan)
-    if isinstance(algorithm, FDK):
-        write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress))
-        return
+    path = path.absolute()  # workers have other working directories
     work = path.with_name(path.name + '.slabs')
-    write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress))
+    if runner is not None and isinstance(algorithm, FDK):
+        fdk_on(runner, algorithm, scan, thickness, work, path, progress)
+    elif runner is not None:
+        assert isinstance(algorithm, Sweeps)
+        sweep_on(runner, scan, *algorithm.updates(scan), thickness, work, path, progress)
+    elif isinstance(algorithm, FDK):
+        return write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress))
+    else:
+        write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress))
     discard(work)  # not before the volume is safe
 
 

@@ -43,7 +43,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.sart_update import update
-from lingo_mi.reconstruction.slab_sweeps import swept
+from lingo_mi.reconstruction.slab_sweeps import Update, swept
 from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
@@ -177,6 +177,16 @@ class Sweeps(Algorithm):
         >>> for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
         ...     ...
         """
+        return swept(scan, *self.updates(scan), thickness, as_path('folder', folder), progress)
+
+    def updates(self, scan: Scan) -> tuple[list[Update], bool]:
+        """All updates of the volume in slabs, the relaxation and the views of each; whether negative densities become zero.
+
+        Raises
+        ------
+        InputError
+            If tol is above 0.
+        """
         how = self._by_blocks(len(scan))
         if how.tol:
             raise InputError(
@@ -184,7 +194,7 @@ class Sweeps(Algorithm):
             )
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
         updates = [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
-        return swept(scan, updates, how.noneg, thickness, as_path('folder', folder), progress)
+        return updates, how.noneg
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""

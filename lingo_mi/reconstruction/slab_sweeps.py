@@ -17,16 +17,19 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from math import prod
 from pathlib import Path
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry.grid import Grid
 from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.preconditions import require_rays
@@ -44,6 +47,20 @@ SLABS, IMAGES = (
     7,
     10,
 )  # peak memory, in slabs and in images of a view of an update: tests/reconstruction/test_slab_sweeps.py
+
+
+class Share(Protocol):
+    """Does the same work for every slab of a volume, here or elsewhere."""
+
+    def __call__(self, work: str, *arguments: Any, slab_done: Callable[[], object] = lambda: None) -> Iterable[Any]:
+        """What `SlabSystem.work(part, *arguments)` returns of each slab, from the first on: an array, or None.
+
+        Parameters
+        ----------
+        slab_done : callable
+            Called when a slab is done.
+        """
+        ...
 
 
 def swept(
@@ -65,6 +82,22 @@ def swept(
         For pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two volumes, for a
         folder that holds other work, and if the volume is not finite.
     """
+    grid = require_slabs(scan, thickness, updates)
+    with locked(folder), Volume(scan, thickness, folder, digest_of(scan, updates, noneg, thickness)) as volume:
+        system = SlabSystem(scan.geometry, scan.valid, volume)
+        complete(system, here(system), scan.projections, updates, noneg, progress)
+        for part in range(len(grid.slabs(thickness))):
+            yield finite(volume.read(part))
+
+
+def require_slabs(scan: Scan, thickness: int, updates: Sequence[Update]) -> Grid:
+    """The voxels of a scan that can be updated in slabs.
+
+    Raises
+    ------
+    InputError
+        For a scan without rays, pixels so wide that rays leave voxels out, and too little memory.
+    """
     require_rays(scan.geometry)
     if leave_voxels_out(scan.geometry):
         raise InputError('pixels are two or more voxels wide: make the volume without slabs, or of larger voxels')
@@ -73,14 +106,14 @@ def swept(
     check_memory(
         scan.geometry.on(grid.slab(*grid.slabs(thickness)[0])), needed=sweep_memory(scan, thickness, blocksize)
     )
-    with locked(folder), _Volume(scan, thickness, folder, _digest(scan, updates, noneg, thickness)) as volume:
-        if volume.done < len(updates):
-            _complete(_Slabs(scan, volume), updates, noneg, progress)
-        for part in range(len(volume.parts)):
-            slab = volume.read(part)
-            if not np.isfinite(slab).all():
-                raise InputError(DIVERGED)
-            yield slab
+    return grid
+
+
+def finite(slab: np.ndarray) -> np.ndarray:
+    """The slab; raises InputError if it is not finite."""
+    if not np.isfinite(slab).all():
+        raise InputError(DIVERGED)
+    return slab
 
 
 def sweep_memory(scan: Scan, thickness: int, blocksize: int) -> int:
@@ -100,23 +133,72 @@ def discard(folder: Path) -> None:
         folder.rmdir()
 
 
-def _complete(system: _Slabs, updates: Sequence[Update], noneg: bool, progress: Progress | None) -> None:
+def complete(
+    system: SlabSystem,
+    share: Share,
+    projections: np.ndarray,
+    updates: Sequence[Update],
+    noneg: bool,
+    progress: Progress | None,
+) -> None:
     """The updates that are left."""
-    volume, lengths = system.volume, system.lengths()
-    parts, ax = len(volume.parts), system.project(updates[volume.done][1])
+    volume = system.volume
+    assert isinstance(volume, Volume)  # of which this process keeps the state
+    if volume.done == len(updates):
+        return
+    parts, pixels = len(volume.parts), system.A.pixels
+    lengths = np.zeros((len(projections), pixels), np.float32)
+    for images in share('lengths'):
+        for view, image in enumerate(images):
+            lengths[view] += image
+    ax = system.nothing(updates[volume.done][1])
+    if volume.done:
+        ax = _added(share('project', updates[volume.done][1]), ax)
     for done in range(volume.done, len(updates)):
         lmbda, views = updates[done]
-        error, relative = system.error(ax, views, lengths)
+        error, relative = _error(system, ax, projections[views], lengths[views])
         following = updates[done + 1][1] if done + 1 < len(updates) else None
+        slabs = iter(range(done * parts + 1, (done + 1) * parts + 1))
 
-        def report(slabs, done=done, relative=relative):
+        def report(slabs=slabs, relative=relative):
             if progress:
-                progress(done * parts + slabs, len(updates) * parts, relative)
+                progress(next(slabs), len(updates) * parts, relative)
 
-        ax = system.update(error, views, lmbda, noneg, following, report)
+        images = share('update', error, views, lmbda, noneg, following, slab_done=report)
+        ax = _added(images, None if following is None else system.nothing(following))
+        volume.turn()
 
 
-class _Slabs:
+def here(system: SlabSystem) -> Share:
+    """The work in this process, slab by slab."""
+
+    def share(work, *arguments, slab_done=lambda: None):
+        for part in range(len(system.volume.parts)):
+            yield getattr(system, work)(part, *arguments)
+            slab_done()
+
+    return share
+
+
+def _added(images: Iterable[Any], total: Any) -> Any:
+    """The sum of all slabs' images in their order, so that the same bits come whoever made them."""
+    for image in images:
+        if total is not None:
+            total = evaluated(total + mi.Float(image))
+    return total
+
+
+def _error(system: SlabSystem, ax: mi.Float, projections: np.ndarray, lengths: np.ndarray) -> tuple[mi.Float, float]:
+    """The normalised error of A x in some views, and |A x - b| / |b|."""
+    b = system.A.images(projections)
+    error = evaluated(b - ax)
+    relative = norm(error) / (norm(b) or 1.0)
+    if not np.isfinite(relative):
+        raise InputError(DIVERGED)
+    return evaluated(normalised(error, mi.Float(lengths.ravel()))), relative
+
+
+class SlabSystem:
     """The matrix A of a scan, by slabs of a volume on a disk. Images are mi.Float [view, u, v].
 
     Attributes
@@ -125,64 +207,35 @@ class _Slabs:
         That of one slice, for what does not depend on the voxels.
     """
 
-    def __init__(self, scan: Scan, volume: _Volume):
-        self.scan, self.volume = scan, volume
-        one = scan.geometry.on(scan.geometry.grid.slab(0, 1))
-        self.A = projector_class(scan.geometry)(one, scan.valid)
+    def __init__(self, geometry: Geometry, valid: np.ndarray | None, volume: SlabFiles):
+        self.geometry, self.volume = geometry, volume
+        self.A = projector_class(geometry)(geometry.on(geometry.grid.slab(0, 1)), valid)
 
-    def lengths(self) -> np.ndarray:
-        """A 1, float32 [view, pixel]."""
-        out = np.zeros((len(self.scan), self.A.pixels), np.float32)
-        for part in range(len(self.volume.parts)):
-            A, inside = self._projector(part)
-            ones = evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0))
-            for view in range(len(out)):
-                out[view] += A.forward(ones, [view])[0].numpy()
-        return out
+    def lengths(self, part: int) -> Iterator[np.ndarray]:
+        """A 1 of a slab, view by view, float32 [pixel]."""
+        A, inside = self._projector(part)
+        ones = evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0))
+        for view in range(len(self.geometry)):
+            yield A.forward(ones, [view])[0].numpy()
 
-    def project(self, views: np.ndarray) -> mi.Float:
-        """A x of some views."""
-        ax = self._nothing(views)
-        if self.volume.done:
-            for part in range(len(self.volume.parts)):
-                A, _ = self._projector(part)
-                ax = evaluated(ax + A.forward(self._load(part), views)[0])
-        return ax
-
-    def error(self, ax: mi.Float | None, views: np.ndarray, lengths: np.ndarray) -> tuple[mi.Float, float]:
-        """The normalised error of A x in some views, and |A x - b| / |b|. lengths: of all views, see `lengths`."""
-        b = self.A.images(self.scan.projections[views])
-        error = evaluated(b - ax)
-        relative = norm(error) / (norm(b) or 1.0)
-        if not np.isfinite(relative):
-            raise InputError(DIVERGED)
-        return evaluated(normalised(error, mi.Float(lengths[views].ravel()))), relative
+    def project(self, part: int, views: np.ndarray) -> mi.Float:
+        """A x of a slab in some views."""
+        A, _ = self._projector(part)
+        return A.forward(self._load(part), views)[0]
 
     def update(
-        self,
-        error: mi.Float,
-        views: np.ndarray,
-        lmbda: float,
-        noneg: bool,
-        following: np.ndarray | None,
-        report: Callable[[int], None],
+        self, part: int, error: mi.Float, views: np.ndarray, lmbda: float, noneg: bool, following: np.ndarray | None
     ) -> mi.Float | None:
-        """Update the volume by the normalised error of some views, and return A x of the following ones.
+        """Update a slab by the normalised error of some views, and return its A x of the following ones."""
+        A, x = self._updated(part, error, views, lmbda, noneg)
+        self._store(part, x, A.size)
+        return None if following is None else A.forward(x, following)[0]
 
-        Parameters
-        ----------
-        report : callable
-            Called with the number of slabs that are updated.
-        """
-        ax = None if following is None else self._nothing(following)
-        for part in range(len(self.volume.parts)):
-            A, x = self._updated(part, error, views, lmbda, noneg)
-            if following is not None:
-                ax = evaluated(ax + A.forward(x, following)[0])
-            self._store(part, x, A.size)
-            report(part + 1)
-        self.volume.turn()
-        return ax
+    def nothing(self, views: np.ndarray) -> mi.Float:
+        """Images of zeros of some views."""
+        nothing = dr.zeros(mi.Float, len(views) * self.A.pixels)
+        dr.make_opaque(nothing)
+        return nothing
 
     def _updated(self, part, error, views, lmbda, noneg):
         """The projector of a slab, and the slab after an update."""
@@ -194,20 +247,15 @@ class _Slabs:
 
         return A, evaluated(A.adjoint(error, views, between_zeros))
 
-    def _nothing(self, views):
-        nothing = dr.zeros(mi.Float, len(views) * self.A.pixels)
-        dr.make_opaque(nothing)
-        return nothing
-
     def _margins(self, part):
         """How many slices of zeros lie below and above a slab."""
         begin, end = self.volume.parts[part]
-        return int(begin > 0), int(end < self.scan.geometry.grid.shape[2])
+        return int(begin > 0), int(end < self.geometry.grid.shape[2])
 
     def _projector(self, part):
         """The projector of a slab between its slices of zeros, and a function that tells whether a voxel is none of these."""
         (begin, end), (below, above) = self.volume.parts[part], self._margins(part)
-        A = self.A.of_slab(self.scan.geometry.on(self.scan.geometry.grid.slab(begin - below, end + above)))
+        A = self.A.of_slab(self.geometry.on(self.geometry.grid.slab(begin - below, end + above)))
         low, high = (dr.opaque(mi.UInt, z) for z in (below, end - begin + below))
 
         def inside(voxel):
@@ -224,52 +272,26 @@ class _Slabs:
         self.volume.write(part, x.numpy().reshape(size)[:, :, below : below + end - begin])
 
 
-class _Volume:
-    """A volume in slabs, in two files of a folder: one is read, the other written, and they change places.
+class SlabFiles:
+    """A volume in slabs, in two files of a folder: one is read, the other written.
 
     Attributes
     ----------
     parts
         (begin, end) of the slabs.
     done
-        How often they have changed places; before, the volume is zero.
+        How often the files have changed places; before, the volume is zero.
+    folder
+        Of the files.
     """
 
-    def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
-        self.parts, self.done = scan.geometry.grid.slabs(thickness), 0
-        self._size, self._folder, self._digest = scan.geometry.grid.shape, folder, digest
+    def __init__(self, grid: Grid, thickness: int, folder: Path, done: int = 0):
+        self.parts, self.done = grid.slabs(thickness), done
+        self._size, self.folder = grid.shape, folder
         self._paths = [folder / name for name in FILES]
-        state = folder / STATE
-        for path, _ in leftovers(folder):
-            path.unlink()
-        if state.exists():
-            known = read_json(state)
-            try:
-                found, done = known['of'], int(known['updates'])
-            except (KeyError, TypeError, ValueError):
-                raise InputError(f'{state}: is not a state of ours; move its folder away') from None
-            if found != digest:
-                raise InputError(
-                    f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
-                    'remove the folder, or repeat that command to complete it'
-                )
-            if self._paths[done % 2].exists():  # else it was being discarded
-                self.done = done
-        elif any(os.path.lexists(path) for path in self._paths):
-            raise InputError(f'{folder}: has files named {" or ".join(FILES)} that are not ours; choose another folder')
-        self._require_room()
-        self._record()
 
-    def _require_room(self):
-        needed = 8 * prod(self._size) - sum(path.stat().st_size for path in self._paths if path.exists())
-        if needed > (free := shutil.disk_usage(self._folder).free):
-            raise InputError(
-                f'{self._folder}: two volumes need {needed / 2**30:,.1f} GiB more of the disk, which has '
-                f'{free / 2**30:,.1f}; choose another disk, or fewer voxels'
-            )
-
-    def __enter__(self) -> _Volume:
-        with writing(self._folder):
+    def __enter__(self):
+        with writing(self.folder):
             flags = os.O_RDWR | os.O_CREAT | getattr(os, 'O_BINARY', 0)
             self._files = [os.fdopen(os.open(path, flags, 0o666), 'r+b', buffering=0) for path in self._paths]
         return self
@@ -294,27 +316,67 @@ class _Volume:
     def write(self, part: int, slab: np.ndarray) -> None:
         """Set a slab of the next volume."""
         file = self._files[(self.done + 1) % 2]
-        with writing(self._folder):
+        with writing(self.folder):
             file.seek(self._place(part)[1])
             np.ascontiguousarray(slab).tofile(file)
 
-    def turn(self) -> None:
-        """The next volume is complete: it becomes the one that is read."""
-        with writing(self._folder):
+    def flush(self) -> None:
+        """Bring what was written to the disk."""
+        with writing(self.folder):
             os.fsync(self._files[(self.done + 1) % 2].fileno())
-        self.done += 1
-        self._record()
-
-    def _record(self):
-        write_text(self._folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
 
     def _place(self, part):
         (begin, end), (nx, ny, _) = self.parts[part], self._size
         return (nx, ny, end - begin), 4 * nx * ny * begin
 
 
-def _digest(scan, updates, noneg, thickness):
-    """Of all that the result depends on."""
+class Volume(SlabFiles):
+    """The files, and the state that says how far their work has come."""
+
+    def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
+        super().__init__(scan.geometry.grid, thickness, folder)
+        self._digest = digest
+        state = folder / STATE
+        for path, _ in leftovers(folder):
+            path.unlink()
+        if state.exists():
+            known = read_json(state)
+            try:
+                found, done = known['of'], int(known['updates'])
+            except (KeyError, TypeError, ValueError):
+                raise InputError(f'{state}: is not a state of ours; move its folder away') from None
+            if found != digest:
+                raise InputError(
+                    f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
+                    'remove the folder, or repeat that command to complete it'
+                )
+            if self._paths[done % 2].exists():  # else it was being discarded
+                self.done = done
+        elif any(os.path.lexists(path) for path in self._paths):
+            raise InputError(f'{folder}: has files named {" or ".join(FILES)} that are not ours; choose another folder')
+        self._require_room()
+        self._record()
+
+    def _require_room(self):
+        needed = 8 * prod(self._size) - sum(path.stat().st_size for path in self._paths if path.exists())
+        if needed > (free := shutil.disk_usage(self.folder).free):
+            raise InputError(
+                f'{self.folder}: two volumes need {needed / 2**30:,.1f} GiB more of the disk, which has '
+                f'{free / 2**30:,.1f}; choose another disk, or fewer voxels'
+            )
+
+    def turn(self) -> None:
+        """The next volume is complete: it becomes the one that is read."""
+        self.flush()
+        self.done += 1
+        self._record()
+
+    def _record(self):
+        write_text(self.folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
+
+
+def digest_of(scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int) -> str:
+    """A digest of all that the result depends on."""
     found = hashlib.sha256(repr((scan.digest(), projector_class(scan.geometry).__name__, noneg, thickness)).encode())
     for lmbda, views in updates:
         found.update(repr((lmbda, views.tolist())).encode())
