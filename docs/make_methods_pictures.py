@@ -41,7 +41,7 @@ def main():
         for name, method in METHODS.items():
             fit = fitted(data, method, OUT / f'{name}_{count}')
             image = fit.render(test)[0]
-            views[count][name] = image, f'{psnr_2d(image, truth):.1f} dB'
+            views[count][name] = image, f'{psnr_2d(image[None], truth[None]):.1f} dB'
             volume = lm.reconstruct(data.train, lm.ASDPOCS(niter=10), start=fit, views=ALL_VIEWS).volume
             volumes[count][name] = slice_of(volume, data.volume)
     draw(views, 'methods_views')
