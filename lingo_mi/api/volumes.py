@@ -142,7 +142,7 @@ def reconstruct(
     if truth is None:  # else it is simulated, as a rule
         warn_of_intensities(scan)
     if cluster is not None and path is not None and slab is not None:
-        require_whole_chunks(path, scan.geometry.grid, slab)
+        require_whole_chunks(path, slab)
     if slab is None:  # else the slabs are checked
         seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
         both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them

@@ -49,7 +49,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import parse
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.completion.prepare import require_volume
-from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map
+from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map, require_whole_chunks
 from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.fitting.measure import volume_quality
 from lingo_mi.geometry import Geometry, Grid
@@ -165,6 +165,8 @@ def check_arguments(args: argparse.Namespace) -> None:
 def check_output(out: Path, args: argparse.Namespace) -> None:
     """Raises InputError if a file cannot be written, or would spoil one."""
     check_volume_name(out)
+    if args.cluster is not None:
+        require_whole_chunks(out, args.slab)
     for path in (out, *(plan_and_error_map(out) if args.algorithm == 'best' else ())):
         check_new_file(path, args.force)
     if (page := args.report) is None:

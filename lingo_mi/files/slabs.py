@@ -130,11 +130,11 @@ def _new_zarr(folder: Path, grid: Grid, description: str) -> list[Any]:
     return levels
 
 
-def require_whole_chunks(path: Path, grid: Grid, thickness: int) -> None:
+def require_whole_chunks(path: Path, thickness: int) -> None:
     """Raises InputError unless slabs are whole chunks of an OME-Zarr, which several processes may then write at once."""
     if not path.name.endswith(ZARR):
         raise InputError(f'{path}: workers of a cluster write parts of one .ome.zarr; give such a name')
-    if thickness % CHUNK and thickness < grid.shape[2]:
+    if thickness % CHUNK:
         raise InputError(
             f'slabs must have a multiple of {CHUNK} slices on a cluster, not {thickness}: give slab={CHUNK}'
         )

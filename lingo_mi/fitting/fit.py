@@ -183,7 +183,7 @@ class Fit(FittedModel):
         if cluster is None:
             write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
         else:
-            require_whole_chunks(path, voxels, slab)
+            require_whole_chunks(path, slab)
             with workers(cluster, path) as runner:
                 voxelize_on(runner, self, voxels, slab, path.absolute())
         return path
