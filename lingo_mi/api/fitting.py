@@ -12,6 +12,7 @@ from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.interrupts import between_steps
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant
+from lingo_mi.files.units import unit_of
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.hold_out import with_held_out
 from lingo_mi.fitting.loop import run
@@ -39,6 +40,8 @@ def fit(
     resume: bool = False,
     force: bool = False,
     title: str = '',
+    units: str = '1/mm',
+    mu_water: float | None = None,
     progress: bool | Callable[..., None] = True,
     live: bool = False,
     log_dir: str | PathLike | None = None,
@@ -69,6 +72,8 @@ def fit(
         Replace an earlier result in the folder.
     title : str
         Of the report (default: the folder's name).
+    units, mu_water
+        Of the volume in the folder, as `Fit.save` has them.
     progress : bool or callable
         Whether to show a progress bar on standard error; or a function that is called between steps, as `fitting.loop.run` does.
     live : bool
@@ -100,7 +105,7 @@ def fit(
     require_type('scan', scan, (Scan, Dataset))
     require_type('method', method, (str, Method))
     require_type('live', live, bool)
-    seed = parsing.seed(seed)
+    seed, unit = parsing.seed(seed), unit_of(units, mu_water)
     dataset = with_held_out(scan, hold_out)
     if dataset.volume is None:  # else it is simulated, as a rule
         warn_of_intensities(dataset.train)
@@ -139,7 +144,7 @@ def fit(
             if dataset.test is not None and (not isinstance(scan, Dataset) or scan.test is None):
                 whole = len(dataset.train) + len(dataset.test)
                 note = dict(held_out=f'{len(dataset.test)} of {whole}, evenly spaced') | (note or {})
-            result.write(path, label, note)
+            result.write(path, label, note, unit)
     return result
 
 

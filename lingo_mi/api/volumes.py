@@ -19,6 +19,7 @@ from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
 from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map, require_whole_chunks
+from lingo_mi.files.units import PER_MM, Unit, unit_of
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.jobs.cluster import workers
@@ -40,6 +41,8 @@ def reconstruct(
     start: Fit | ArrayLike | None = None,
     views: int | None = None,
     out: str | PathLike | None = None,
+    units: str = '1/mm',
+    mu_water: float | None = None,
     slab: None = None,
     force: bool = False,
     progress: bool = True,
@@ -54,6 +57,8 @@ def reconstruct(
     start: Fit | None = None,
     views: int | None = None,
     out: str | PathLike,
+    units: str = '1/mm',
+    mu_water: float | None = None,
     slab: int | None = None,
     cluster: Any = None,
     force: bool = False,
@@ -69,6 +74,8 @@ def reconstruct(
     start: Fit | ArrayLike | None = None,
     views: int | None = None,
     out: str | PathLike | None = None,
+    units: str = '1/mm',
+    mu_water: float | None = None,
     slab: int | None = None,
     cluster: Any = None,
     force: bool = False,
@@ -92,7 +99,9 @@ def reconstruct(
         the paper), and the algorithm starts from nothing. The scan must be one on a circle. `Refined` meets these views first,
         and then the measured ones; without `views`, the measured ones alone.
     out : path, optional
-        Write the volume there (.nii, .nii.gz or .ome.zarr), as `Reconstruction.save` does.
+        Write the volume there (.nii, .nii.gz, .ome.zarr or .dicom), as `Reconstruction.save` does.
+    units, mu_water
+        Of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm, see `Reconstruction.save`.
     slab : int, optional
         Make the volume in slabs of so many slices, and write each to `out`, so that it need not fit into memory: by `FDK`,
         `SART`, `OSSART` and `SIRT`. Iterative ones hold the volume in a folder beside `out`, whose name ends in .slabs, until it
@@ -131,10 +140,12 @@ def reconstruct(
         slab = THICKNESS
     slab = None if slab is None else whole_number('slab', slab, 1)
     path = None if out is None else as_path('out', out)
-    start = _start(start)
+    start, unit = _start(start), unit_of(units, mu_water)
+    if path is None and unit != PER_MM:
+        raise InputError(f'units={units!r} is for a file, the volume here is per mm: give out=FILE')
     _check(algorithm, start, views, path, slab)
     if path is not None:
-        _check_output(path, algorithm, force)
+        _check_output(path, algorithm, force, unit)
     truth = scan.volume if isinstance(scan, Dataset) else None
     scan = scan.train if isinstance(scan, Dataset) else scan
     require_rays(scan.geometry)
@@ -142,7 +153,7 @@ def reconstruct(
     if truth is None:  # else it is simulated, as a rule
         warn_of_intensities(scan)
     if cluster is not None and path is not None and slab is not None:
-        require_whole_chunks(path, slab)
+        require_whole_chunks(path, slab, unit)
     if slab is None:  # else the slabs are checked
         seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
         both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them
@@ -155,12 +166,12 @@ def reconstruct(
                 nullcontext() if cluster is None else workers(cluster, path) as runner,
                 progress_bar(algorithm, scan, steps=algorithm.slab_steps(scan, slab), shown=progress) as bar,
             ):
-                run_in_slabs(scan, algorithm, path, slab, bar, runner)
+                run_in_slabs(scan, algorithm, path, slab, bar, runner, unit)
             return path
         with progress_bar(algorithm, scan, shown=progress) as bar:
             found = run_algorithm(scan, algorithm, progress=bar, **inputs)
         if path is not None:
-            found.save(path, force=force)
+            found.save(path, units=units, mu_water=mu_water, force=force)
     return found
 
 
@@ -194,10 +205,10 @@ def _check(algorithm: Any, start: Fit | np.ndarray | None, views: int | None, pa
         raise InputError('slab=N starts from an empty volume: leave out start, or slab')
 
 
-def _check_output(path: Path, algorithm: Algorithm, force: bool) -> None:
+def _check_output(path: Path, algorithm: Algorithm, force: bool, unit: Unit) -> None:
     """Raises InputError, before any work, if the volume cannot be written."""
     with writing(path):
-        check_volume_name(path)
+        check_volume_name(path, unit)
         for file in (path, *(plan_and_error_map(path) if isinstance(algorithm, Best) else ())):
             check_new_file(file, force)
 

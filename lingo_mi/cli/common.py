@@ -20,6 +20,7 @@ import numpy as np
 from lingo_mi.common import parsing
 from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.interrupts import noticed
+from lingo_mi.files.units import unit_of
 from lingo_mi.scene.shipped import scene_path, scenes
 from lingo_mi.storage.file_access import require_writable
 
@@ -153,7 +154,14 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         '--mu-water',
         type=float,
         metavar='MU',
-        help='a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to densities in [0, 1])',
+        help='attenuation of water per mm: a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to '
+        'densities in [0, 1]); and for --units hu',
+    )
+    parser.add_argument(
+        '--units',
+        choices=('1/mm', '1/cm', 'hu'),
+        default='1/mm',
+        help='of the volume that is written: attenuation per mm (default) or per cm, or Hounsfield units, with --mu-water',
     )
 
 
@@ -186,12 +194,20 @@ def check_input(args: argparse.Namespace) -> None:
             raise InputError(f'--{name} names no file')
     if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
-    if not args.volume and (args.shape or args.dtype or args.spacing or args.mu_water is not None):
-        raise InputError('--shape, --dtype, --spacing and --mu-water go with --volume')
+    if not args.volume and (args.shape or args.dtype or args.spacing):
+        raise InputError('--shape, --dtype and --spacing go with --volume')
+    if not args.volume and args.units != 'hu' and args.mu_water is not None:
+        raise InputError('--mu-water goes with --volume, or with --units hu')
+    unit_of(**units_of(args))
     if args.dtype and not _of_numbers(args.dtype):
         raise InputError(f'--dtype must be a NumPy type of real numbers, such as uint8, not {shown(args.dtype)}')
     if args.projections and args.volume:
         raise InputError('--projections and --volume exclude each other: measured views need no volume to scan')
+
+
+def units_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The `units` and `mu_water` of what is written; --mu-water may be that of a --volume."""
+    return dict(units=args.units, mu_water=args.mu_water if args.units == 'hu' else None)
 
 
 def _of_numbers(dtype: str) -> bool:

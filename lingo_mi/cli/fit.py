@@ -25,6 +25,7 @@ from lingo_mi.cli.common import (
     input_arguments,
     input_name,
     read_input,
+    units_of,
 )
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import nearest
@@ -144,6 +145,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
             title=Path(args.volume or args.projections or scene.name).name,
             live=args.live,
             log_dir=args.log_dir,
+            **units_of(args),
             note=dict(command=command_line(without=('--resume', '--force'))),
         )
     except KeyboardInterrupt:

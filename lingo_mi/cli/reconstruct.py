@@ -44,12 +44,14 @@ from lingo_mi.cli.common import (
     input_arguments,
     input_name,
     read_input,
+    units_of,
 )
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.parsing import parse
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.completion.prepare import require_volume
 from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map, require_whole_chunks
+from lingo_mi.files.units import unit_of
 from lingo_mi.fitting.fit import Fit, load_fit
 from lingo_mi.fitting.measure import volume_quality
 from lingo_mi.geometry import Geometry, Grid
@@ -90,7 +92,8 @@ def parser() -> Parser:
         '--out',
         type=Path,
         metavar='F',
-        help='the volume: NIfTI, .nii or .nii.gz, or OME-Zarr, .ome.zarr (default: out/<scene>-<algorithm>.nii.gz)',
+        help='the volume: NIfTI, .nii or .nii.gz, OME-Zarr, .ome.zarr, or a folder of DICOM slices, .dicom '
+        '(default: out/<scene>-<algorithm>.nii.gz)',
     )
     p.add_argument(
         '--slab',
@@ -164,9 +167,10 @@ def check_arguments(args: argparse.Namespace) -> None:
 
 def check_output(out: Path, args: argparse.Namespace) -> None:
     """Raises InputError if a file cannot be written, or would spoil one."""
-    check_volume_name(out)
+    unit = unit_of(**units_of(args))
+    check_volume_name(out, unit)
     if args.cluster is not None:
-        require_whole_chunks(out, args.slab)
+        require_whole_chunks(out, args.slab, unit)
     for path in (out, *(plan_and_error_map(out) if args.algorithm == 'best' else ())):
         check_new_file(path, args.force)
     if (page := args.report) is None:
@@ -232,7 +236,15 @@ def main() -> None:
     else:
         total = args.views if args.complete else None
         found = reconstruct(
-            dataset, algorithm, start=fit, views=total, out=out, slab=args.slab, cluster=args.cluster, force=args.force
+            dataset,
+            algorithm,
+            start=fit,
+            views=total,
+            out=out,
+            slab=args.slab,
+            cluster=args.cluster,
+            force=args.force,
+            **units_of(args),
         )
     if isinstance(found, Path):
         shape = ' x '.join(map(str, dataset.train.geometry.grid.shape))
@@ -250,10 +262,10 @@ def voxelized(fit: Fit, grid: Grid, out: Path, args: argparse.Namespace) -> Reco
     """Write the fit's own volume on the scan's voxels."""
     with writing_file(out):
         if args.slab:
-            return fit.save_volume(out, grid, slab=args.slab, cluster=args.cluster, force=args.force)
+            return fit.save_volume(out, grid, slab=args.slab, cluster=args.cluster, force=args.force, **units_of(args))
         began = time.perf_counter()
         found = Reconstruction(fit.volume(grid), [], time.perf_counter() - began, grid)
-        found.save(out, force=args.force)
+        found.save(out, force=args.force, **units_of(args))
         return found
 
 

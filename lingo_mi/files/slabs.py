@@ -17,11 +17,13 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.arrays import numeric
+from lingo_mi.files.dicom import require_hounsfield, write_dicom
+from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.files.volumes import volume_header
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import new_folder, optional, replacing, writing
 
-NIFTI, ZARR = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr')
+NIFTI, ZARR, DICOM = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr'), '.dicom'
 THICKNESS = 64  # slices of a slab, unless the caller chooses
 AXES = 'z', 'y', 'x'
 HALVES = 'halves'  # folder of slabs at half the resolution, while workers fill a `shared_zarr`
@@ -30,38 +32,42 @@ LEAST = 64  # voxels along the longest side of the coarsest level of a pyramid
 
 
 def plan_and_error_map(path: Path) -> tuple[Path, Path]:
-    """The files that stand beside a volume of the algorithm `best`: its plan, and its map of errors in the volume's format."""
+    """The files that stand beside a volume of the algorithm `best`: its plan, and its map of errors in the volume's format, of
+    DICOM in NIfTI."""
     ending = next((ending for ending in (*NIFTI, *ZARR) if path.name.endswith(ending)), path.suffix)
     name = path.name.removesuffix(ending)
+    ending = '.nii.gz' if ending == DICOM else ending
     return path.with_name(f'{name}-plan.json'), path.with_name(f'{name}-error{ending}')
 
 
-def check_volume_name(path: Path) -> None:
-    """Raises InputError unless a volume can be written under this name, with the packages that are installed."""
-    if not path.name.endswith((*NIFTI, *ZARR)):
+def check_volume_name(path: Path, unit: Unit = PER_MM) -> None:
+    """Raises InputError unless a volume can be written under this name, in this unit, with the packages that are installed."""
+    if not path.name.endswith((*NIFTI, *ZARR, DICOM)):
         raise InputError(
-            f'{path}: volumes are written as NIfTI or OME-Zarr; give a name that ends in .nii, .nii.gz or .ome.zarr'
+            f'{path}: volumes are written as NIfTI, OME-Zarr or DICOM; give a name that ends in .nii, .nii.gz, .ome.zarr or '
+            f'{DICOM}'
         )
+    if path.name.endswith(DICOM):
+        optional('pydicom')
+        require_hounsfield(path, unit)
     if path.name.endswith(ZARR):
         optional('zarr', 'ome-zarr')
 
 
-def write_slabs(
-    path: PathLike | str, grid: Grid, slabs: Iterable[np.ndarray], description: str = 'density per mm'
-) -> None:
+def write_slabs(path: PathLike | str, grid: Grid, slabs: Iterable[np.ndarray], unit: Unit = PER_MM) -> None:
     """Write a volume, whole or not at all, holding one slab of it at a time.
 
     Parameters
     ----------
     path : path-like
         .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of 2 x 2 x 2
-        voxels).
+        voxels) or .dicom (`dicom.write_dicom`).
     grid : Grid
         Of the whole volume.
     slabs : Iterable[ndarray]
-        float32 [x, y, slices] from the first slice on, together the whole volume.
-    description : str
-        What the values are, as of `write_volume`.
+        Densities per mm, float32 [x, y, slices], from the first slice on, together the whole volume.
+    unit : Unit
+        Of the values in the file.
 
     Raises
     ------
@@ -74,26 +80,26 @@ def write_slabs(
     >>> write_slabs('foot.ome.zarr', scan.geometry.grid, FDK().slabs(scan, 64))
     """
     path = Path(path)
-    check_volume_name(path)
-    write = _write_nifti if path.name.endswith(NIFTI) else _write_zarr
-    write(path, grid, slabs, description)
+    check_volume_name(path, unit)
+    write = _write_nifti if path.name.endswith(NIFTI) else _write_zarr if path.name.endswith(ZARR) else write_dicom
+    write(path, grid, _checked(path, grid, slabs, unit), unit)
 
 
-def _checked(path: Path, grid: Grid, slabs: Iterable[np.ndarray]):
-    """The slabs, float32, with their first slices."""
+def _checked(path: Path, grid: Grid, slabs: Iterable[np.ndarray], unit: Unit):
+    """The slabs in the unit, float32, with their first slices."""
     begin = 0
     for slab in slabs:
         slab = np.asarray(numeric(np.asarray(slab), path, 3), np.float32)
         if slab.shape[:2] != grid.shape[:2] or begin + slab.shape[2] > grid.shape[2]:
             raise InputError(f'{path}: slabs of the shape {slab.shape} do not make {grid.shape} voxels')
-        yield begin, slab
+        yield begin, unit.values(slab)
         begin += slab.shape[2]
     if begin < grid.shape[2]:
         raise InputError(f'{path}: slabs of {begin} slices do not make {grid.shape} voxels')
 
 
-def _write_nifti(path, grid, slabs, description):
-    header = volume_header(path, grid, description)
+def _write_nifti(path, grid, slabs, unit):
+    header = volume_header(path, grid, unit.description)
     with ExitStack() as stack:
         temporary = stack.enter_context(replacing(path))
         if path.suffix == '.gz':
@@ -101,14 +107,14 @@ def _write_nifti(path, grid, slabs, description):
         else:
             file = stack.enter_context(open(temporary, 'wb'))
         file.write(header)
-        for _, slab in _checked(path, grid, slabs):
+        for _, slab in slabs:
             file.write(slab.astype('<f4', copy=False).tobytes(order='F'))
 
 
-def _write_zarr(path, grid, slabs, description):
+def _write_zarr(path, grid, slabs, unit):
     with new_folder(path) as temporary:
-        levels = _new_zarr(temporary, grid, description)
-        for begin, slab in _grouped(_checked(path, grid, slabs), 2 ** (len(levels) - 1)):
+        levels = _new_zarr(temporary, grid, unit.description)
+        for begin, slab in _grouped(slabs, 2 ** (len(levels) - 1)):
             _add(levels, begin, slab.transpose(2, 1, 0))
 
 
@@ -130,8 +136,10 @@ def _new_zarr(folder: Path, grid: Grid, description: str) -> list[Any]:
     return levels
 
 
-def require_whole_chunks(path: Path, thickness: int) -> None:
-    """Raises InputError unless slabs are whole chunks of an OME-Zarr, which several processes may then write at once."""
+def require_whole_chunks(path: Path, thickness: int, unit: Unit = PER_MM) -> None:
+    """Raises InputError unless slabs are whole chunks of an OME-Zarr, which several processes may then write at once, per mm."""
+    if unit != PER_MM:
+        raise InputError('workers of a cluster write densities per mm: leave units out')
     if not path.name.endswith(ZARR):
         raise InputError(f'{path}: workers of a cluster write parts of one .ome.zarr; give such a name')
     if thickness % CHUNK:

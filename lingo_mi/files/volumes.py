@@ -5,7 +5,7 @@ in the world.
 
 Values become density by these rules, the first that applies:
 
-1. A file that `write_volume` or `slabs.write_slabs` wrote is returned unchanged.
+1. A file that `write_volume` or `slabs.write_slabs` wrote is returned unchanged, one in other units as density per mm.
 2. Hounsfield units. They are recognised by a minimum of -500 or less, by DICOM or by `hu=True`; with `mu_water`
    also if rule 3 would refuse negative values. With `mu_water` (1/mm) they become mu_water (1 + HU / 1000), at
    least 0, in 1/mm. Without, they are clipped to [-1000, 2000] and mapped to [0, 1] (R2-Gaussian's rule).
@@ -36,6 +36,7 @@ from lingo_mi.files import arrays, ome_zarr, slices
 from lingo_mi.files.arrays import numeric
 from lingo_mi.files.itk import read_metaimage, read_nrrd
 from lingo_mi.files.nifti import read_nifti
+from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.files.voxels import LPS_TO_RAS, read_voxels
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import reading, replacing
@@ -267,6 +268,8 @@ def read_volume(
         raise InputError(f'{path}: the header has no valid voxel size; correct its affine')
     if description.startswith(_OURS) and data.dtype.kind == 'f':
         density, unit = data.astype(np.float32), description[len(_OURS) :]
+        if (of_file := Unit.described(unit)) is not None:
+            density, unit = of_file.densities(density), PER_MM.description
     else:
         density, unit = _density(data, path, hu, mu_water)
     x, y, z = (float(s) for s in sides)

@@ -17,6 +17,7 @@ from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.effects.forward import Effects, find_effects
 from lingo_mi.files.slabs import THICKNESS, require_whole_chunks, write_slabs
+from lingo_mi.files.units import PER_MM, Unit, unit_of
 from lingo_mi.fitting import average
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fitted_model import FittedModel
@@ -143,6 +144,8 @@ class Fit(FittedModel):
         path: str | PathLike,
         grid: Grid | None = None,
         *,
+        units: str = '1/mm',
+        mu_water: float | None = None,
         slab: int = THICKNESS,
         cluster: Any = None,
         force: bool = False,
@@ -152,9 +155,11 @@ class Fit(FittedModel):
         Parameters
         ----------
         path : path
-            .nii, .nii.gz, or a new .ome.zarr; its folder is made.
+            .nii, .nii.gz, a new .ome.zarr, or a new folder .dicom; its folder is made.
         grid : Grid, optional
             Of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
+        units, mu_water
+            Of the values in the file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         slab : int
             Slices that are in memory at once.
         cluster : str or Client, optional
@@ -177,18 +182,27 @@ class Fit(FittedModel):
         `fit.save_volume('foot.ome.zarr', lm.Grid(2048, 0.125))`
         """
         path, slab = as_path('path', path), whole_number('slab', slab, 1)
-        voxels = self._grid(grid)
+        voxels, unit = self._grid(grid), unit_of(units, mu_water)
         with writing(path):
             new_file(path, force)
         if cluster is None:
-            write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)))
+            write_slabs(path, voxels, (self.volume(voxels.slab(*part)) for part in voxels.slabs(slab)), unit)
         else:
-            require_whole_chunks(path, slab)
+            require_whole_chunks(path, slab, unit)
             with workers(cluster, path) as runner:
                 voxelize_on(runner, self, voxels, slab, path.absolute())
         return path
 
-    def save(self, folder: str | PathLike, *, title: str = '', force: bool = False, note: dict | None = None) -> Path:
+    def save(
+        self,
+        folder: str | PathLike,
+        *,
+        title: str = '',
+        units: str = '1/mm',
+        mu_water: float | None = None,
+        force: bool = False,
+        note: dict | None = None,
+    ) -> Path:
         """Write volume.nii.gz, gaussians.ply, result.xml, views, metrics.json, the report and checkpoint.npz.
 
         Parameters
@@ -197,6 +211,8 @@ class Fit(FittedModel):
             Is made if it is missing.
         title : str
             Of the report (default: the folder's name).
+        units, mu_water
+            Of the values in volume.nii.gz: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         force : bool
             Replace an earlier result; other files in the folder are left alone.
         note : dict, optional
@@ -212,7 +228,7 @@ class Fit(FittedModel):
         InputError
             If the folder holds files already, cannot be written, or another process writes to it.
         """
-        folder = as_path('folder', folder)
+        folder, unit = as_path('folder', folder), unit_of(units, mu_water)
         with writing(folder):
             if folder.is_dir() and occupants(folder) and not force:
                 raise InputError(f'{folder}: is not empty; give force=True to replace an earlier result')
@@ -221,12 +237,12 @@ class Fit(FittedModel):
             clear_leftovers(folder)
             require_ours(folder, result_names(self.method, len(self.view_angles)) | {CHECKPOINT})
             self.checkpoint.save(folder / CHECKPOINT)
-            self.write(folder, title or folder.name, note)
+            self.write(folder, title or folder.name, note, unit)
         return folder
 
-    def write(self, folder: Path, title: str, note: dict | None = None) -> None:
+    def write(self, folder: Path, title: str, note: dict | None = None, unit: Unit = PER_MM) -> None:
         """`save` without the checkpoint, into an existing folder that this process has locked."""
-        write_fit(folder, self, self.numbers | (note or {}), lambda numbers: self.report(title, numbers))
+        write_fit(folder, self, self.numbers | (note or {}), lambda numbers: self.report(title, numbers), unit)
 
     def report(self, title: str = '', numbers: dict | None = None) -> ReportData:
         """The contents of the report. numbers: to show in the place of `numbers`."""

@@ -15,6 +15,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError, brief
 from lingo_mi.files.images import write_exr
 from lingo_mi.files.ply import write_ply, write_radiance_ply
+from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.fitting.method import Method
@@ -40,7 +41,9 @@ from lingo_mi.storage.output_folder import (
 )
 
 
-def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[dict], ReportData]) -> dict:
+def write_fit(
+    folder: Path, fit: FittedModel, numbers: dict, report: Callable[[dict], ReportData], unit: Unit = PER_MM
+) -> dict:
     """Write all files of a fit but its checkpoint into `folder`, and return the numbers.
 
     These are `volume.nii.gz`, `gaussians.ply`, `result.xml`, `views/`, `report.png`, `report.html` and `metrics.json`. Files of
@@ -58,6 +61,8 @@ def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[d
         For metrics.json.
     report : callable
         The contents of the report with all numbers. A report that cannot be drawn is a warning.
+    unit : Unit
+        Of the values in the volume's file.
 
     Raises
     ------
@@ -70,7 +75,7 @@ def write_fit(folder: Path, fit: FittedModel, numbers: dict, report: Callable[[d
     names |= {CHECKPOINT}
     remove_others(folder, names)
     if method.makes_volume:
-        write_volume(folder / VOLUME, fit.own_volume, geometry.grid, 'density per mm')
+        write_volume(folder / VOLUME, unit.values(fit.own_volume), geometry.grid, unit.description)
         if method.makes_gaussians:
             means, scales, quaternions, density = fit.gaussians
             write_ply(folder / CLOUD, means, scales, quaternions, density, fit.shares())

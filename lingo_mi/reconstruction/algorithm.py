@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.effects.forward import Effects
-from lingo_mi.files.slabs import THICKNESS, ZARR, write_slabs
+from lingo_mi.files.slabs import NIFTI, THICKNESS, write_slabs
+from lingo_mi.files.units import unit_of
 from lingo_mi.files.volumes import write_volume
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.metrics.quality import compared
@@ -80,28 +81,38 @@ class Reconstruction:
         """
         return compared(self.volume, as_numpy(truth, 'the true volume'))
 
-    def save(self, path: str | PathLike, *, force: bool = False) -> Path:
-        """Write the volume, densities per mm, with voxel size and position in mm; returns the path.
+    def save(
+        self, path: str | PathLike, *, units: str = '1/mm', mu_water: float | None = None, force: bool = False
+    ) -> Path:
+        """Write the volume with voxel size and position in mm; returns the path.
 
         Parameters
         ----------
         path : path-like
-            .nii, .nii.gz, or a new .ome.zarr; its folder is made.
+            .nii, .nii.gz, a new .ome.zarr, or a new folder .dicom for a DICOM series (in 'hu'); its folder is made.
+        units : str
+            Of the values in the file: '1/mm', '1/cm' or 'hu', Hounsfield units.
+        mu_water : float or None
+            Attenuation of water, 1/mm, for 'hu'.
         force : bool
             Replace an earlier file.
 
         Raises
         ------
         InputError
-            For another suffix, a file that is there already, or one that cannot be written.
+            For another suffix or unit, a file that is there already, or one that cannot be written.
+
+        Examples
+        --------
+        >>> found.save('foot.dicom', units='hu', mu_water=0.0206)
         """
-        path = as_path('path', path)
+        path, unit = as_path('path', path), unit_of(units, mu_water)
         with writing(path):
             new_file(path, force)
-            if path.name.endswith(ZARR):
-                write_slabs(path, self.grid, (self.volume[:, :, a:b] for a, b in self.grid.slabs(THICKNESS)))
+            if path.name.endswith(NIFTI):
+                write_volume(path, unit.values(self.volume), self.grid, unit.description)
             else:
-                write_volume(path, self.volume, self.grid, 'density per mm')
+                write_slabs(path, self.grid, (self.volume[:, :, a:b] for a, b in self.grid.slabs(THICKNESS)), unit)
         return path
 
 

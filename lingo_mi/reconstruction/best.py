@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.files.slabs import plan_and_error_map
+from lingo_mi.files.units import unit_of
 from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
@@ -100,20 +101,23 @@ class Chosen(Reconstruction):
             seconds=self.seconds,
         )
 
-    def save(self, path: str | PathLike, *, force: bool = False) -> Path:
+    def save(
+        self, path: str | PathLike, *, units: str = '1/mm', mu_water: float | None = None, force: bool = False
+    ) -> Path:
         """Write the volume, see `Reconstruction.save`, and beside it the map of errors and the plan; returns the volume's path.
 
-        For V.nii.gz these are V-error.nii.gz and V-plan.json.
+        For V.nii.gz these are V-error.nii.gz, always per mm, and V-plan.json.
         """
-        path = as_path('path', path)
+        path, unit = as_path('path', path), unit_of(units, mu_water)
         plan, error = plan_and_error_map(path)
         with writing(path):
             for file in (plan, error):
                 new_file(file, force)
-        super().save(path, force=force)
+        super().save(path, units=units, mu_water=mu_water, force=force)
         assert self.error is not None
         Reconstruction(self.error, [], self.seconds, self.grid).save(error, force=force)
-        write_text(plan, json.dumps(self.record(), indent=1) + '\n')  # last: it says whose the map is
+        as_read = dict(volume=values_digest(unit.densities(unit.values(self.volume))))
+        write_text(plan, json.dumps(self.record() | as_read, indent=1) + '\n')  # last: it says whose the map is
         return path
 
 

@@ -14,6 +14,7 @@ from lingo_mi.common import progress as bars
 from lingo_mi.common.errors import InputError
 from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import write_slabs
+from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.jobs.job import Runner
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
@@ -74,6 +75,7 @@ def run_in_slabs(
     thickness: int,
     progress: Progress | None = None,
     runner: Runner | None = None,
+    unit: Unit = PER_MM,
 ) -> None:
     """Reconstruct a scan in slabs of `thickness` slices, and write each to a file of the volume, which need not fit into memory.
 
@@ -86,6 +88,8 @@ def run_in_slabs(
         Called as progress(steps done, `algorithm.slab_steps`, residual or None).
     runner : Runner or None
         Of workers that make the slabs and write them, see `slab_cluster` (None: this process).
+    unit : Unit
+        Of the values in the file, for this process.
     """
     require_signal(scan)
     path = path.absolute()  # workers have other working directories
@@ -96,9 +100,9 @@ def run_in_slabs(
         assert isinstance(algorithm, Sweeps)
         sweep_on(runner, scan, *algorithm.updates(scan), thickness, work, path, progress)
     elif isinstance(algorithm, FDK):
-        return write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress))
+        return write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress), unit)
     else:
-        write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress))
+        write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress), unit)
     discard(work)  # not before the volume is safe
 
 

@@ -181,6 +181,8 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--iterations', '3', '-D', 'iterations=4'], 'leave one of them out'),
         (['-D', 'start=fdk', '--start', 'fdk'], '--start'),
         (['--mu-water', '0.02'], '--volume'),
+        (['--units', 'hu'], 'give --mu-water 0.0206'),
+        (['--hold-out', '1'], '--hold-out 1 leaves no view'),
         (['--spacing', '0.5'], '--volume'),
         (['--resume'], 'no checkpoint'),
         (['--seed', '-1'], 'seed'),

@@ -566,3 +566,21 @@ def test_the_noise_is_that_of_the_fit(tmp_path):
     np.testing.assert_allclose(volume(*start), expected(3), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(volume(*start, '--seed', 1), expected(1), rtol=1e-4, atol=1e-5)
     assert np.abs(volume('--seed', 1) - volume()).max() > 0
+
+
+def test_units_of_the_volume(scene, tmp_path):
+    """A fit, an algorithm and its slabs, in Hounsfield units."""
+    hu = '--units', 'hu', '--mu-water', '0.02'
+    for name, options in {'plain.nii': (), 'hu.nii': hu, 'slabs.nii': (*hu, '--slab', '9')}.items():
+        code, _, err = run(RECONSTRUCT, scene, '--out', tmp_path / name, *options)
+        assert code == 0, err
+    expected = 1000 * (load(tmp_path / 'plain.nii') / 0.02 - 1)
+    for name in ('hu.nii', 'slabs.nii'):
+        np.testing.assert_allclose(load(tmp_path / name), expected, rtol=1e-4, atol=1e-3 * expected.max())
+    short = '--iterations', '2', '-D', 'n_points=50'
+    code, _, err = fit(scene, *short, *hu, '--out', tmp_path / 'fit')
+    assert code == 0, err
+    volume = load_fit(tmp_path / 'fit').volume()
+    np.testing.assert_allclose(
+        load(tmp_path / 'fit' / 'volume.nii.gz'), 1000 * (volume / 0.02 - 1), rtol=1e-4, atol=0.01
+    )

@@ -44,7 +44,7 @@ def test_what_is_written_is_read_unchanged(tmp_path, volume):
         offOrigin=(3, -4, 5),
         angles=[0.0],
     )
-    write_slabs(tmp_path / 'v.ome.zarr', g.grid, [volume], 'density per mm')
+    write_slabs(tmp_path / 'v.ome.zarr', g.grid, [volume])
     found = read_volume(tmp_path / 'v.ome.zarr')
     np.testing.assert_array_equal(found.data, volume)
     assert found.unit == 'density per mm' and found.spacing == (1, 1.5, 2)
