@@ -298,7 +298,7 @@ class Fit(FittedModel):
         test = None if self.data is None else self.data.test
         if self.views is not None and test is not None:
             labels = [f'held-out view {i}, at {a:.1f}°' for i, a in enumerate(self.view_angles)]
-            for title, images in (('Rendered', self.views), ('Measured', test.projections)):
+            for title, images in (('Rendered', self.views), (self.report().reference, test.projections)):
                 parts.append(notebook.frames(images, labels, title))
         picture = overview(self.report(), headline(self.metrics()))
         embedded = base64.b64encode(picture).decode('ascii')

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import lingo_mi as lm
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import CircularGeometry, Grid
@@ -290,3 +291,16 @@ def test_script_refuses(args, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().err
     assert said.startswith('error: ') and said.count('\n') == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('name', ['shepp_logan', 'foot'])
+def test_real_attenuation_is_that_of_bone(name):
+    """2000 HU at most, in the volume and in line integrals, of ellipsoids and of voxels."""
+    plain, real = lm.phantom(name, size=16), lm.phantom(name, size=16, attenuation='real')
+    bone = 3 * 0.0206
+    np.testing.assert_allclose(real.data, bone * plain.data, rtol=1e-6)
+    assert real.data.max() <= bone
+    scans = [lm.simulate(thing, views=1, progress=False).train.projections for thing in (plain, real)]
+    np.testing.assert_allclose(scans[1], bone * scans[0], rtol=1e-5)
+    with pytest.raises(InputError, match="attenuation must be 'x3d' or 'real'"):
+        lm.phantom(name, size=16, attenuation='hu')
