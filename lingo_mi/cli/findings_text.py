@@ -98,10 +98,8 @@ def advice(scan: Scan, found: Findings) -> list[str]:
         )
     if border is not None:
         if found.air_is_off:
-            lines.append(
-                f'air is {border.air:.3g} instead of 0: import again with --air, or take it out with lingo-mi calibrate SCAN '
-                '--air --out F.npy'
-            )
+            calibrated = '' if found.air is None else ', or take it out with lingo-mi calibrate SCAN --out F.npy'
+            lines.append(f'air is {border.air:.3g} instead of 0: import again with --air{calibrated}')
         if found.air_differs:
             lines.append(
                 f'the air level of the views differs by {_air_spread(found):.2g} rms: import again with --air, which scales '

@@ -10,6 +10,7 @@ from scipy import ndimage
 import lingo_mi as lm
 from helpers.object_scan import PIXELS, scanned
 from lingo_mi.cli.findings_text import advice, facts
+from lingo_mi.inspection.air import without_air
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.measure import measure, open_beam
 from lingo_mi.inspection.sheet import draw
@@ -150,9 +151,10 @@ def test_the_arc_of_views_that_are_given_as_poses(start):
 
 
 def test_air_of_all_views(foot):
-    """The advice names a command that takes it out, as `test_calibration` measures."""
-    p = foot.projections + np.float32(0.1 * foot.projections.max())
-    assert any('lingo-mi calibrate SCAN --air --out' in line for line in advised(lm.Scan(foot.geometry, p)))
+    """The advice names what takes it out: `calibrate`, which begins with `without_air`."""
+    scan = lm.Scan(foot.geometry, foot.projections + np.float32(0.1 * foot.projections.max()))
+    assert any('lingo-mi calibrate SCAN --out' in line for line in advised(scan))
+    np.testing.assert_allclose(without_air(scan).projections, foot.projections, atol=1e-4 * foot.projections.max())
 
 
 def test_air_of_single_views(foot):
