@@ -50,7 +50,8 @@ class Scan:
     Raises
     ------
     InputError
-        If their shapes are not the geometry's, where a valid pixel is not finite, and where no pixel is valid.
+        If their shapes are not the geometry's, where a valid pixel is not finite, where no pixel is valid, and for effects on a
+        curved panel.
 
     Examples
     --------
@@ -77,6 +78,10 @@ class Scan:
 
     def __post_init__(self):
         require_type('geometry', self.geometry, Geometry, 'write Scan(geometry, projections)')
+        if self.effects is not None and isinstance(self.geometry, CurvedGeometry):
+            raise InputError(
+                'effects of a detector are modelled on flat panels alone: give line integrals without effects'
+            )
         p = as_numpy(self.projections, 'the projections', np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
         if p.shape != expected:
@@ -147,7 +152,7 @@ class Scan:
         Raises
         ------
         InputError
-            For a scan with effects, which happened in the real pixels, and as `CurvedGeometry.to_flat`.
+            As `CurvedGeometry.to_flat`.
 
         Examples
         --------

@@ -115,7 +115,7 @@ class CTScanner(mi.Sensor):
             del props[name]
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
-        rays = self.geometry.rays()
+        rays = self.geometry.rays()  # refuses curved panels
         self.panel = View.of(rays, self.index, *self.geometry.nDetector)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(

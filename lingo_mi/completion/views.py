@@ -31,7 +31,7 @@ def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
     InputError
         If a view is missing.
     """
-    reach = np.linalg.norm(scan.geometry.rays().corner, axis=1).max()
+    reach = np.linalg.norm(scan.geometry.rays(curved=True).corner, axis=1).max()
     there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
     allowed = 0.01 * min(scan.geometry.dDetector)
     missing = InputError(
@@ -55,7 +55,7 @@ def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
 def _corners(geometry: Geometry, reach: float) -> np.ndarray:
     """Points that identify a view, [view, 12] in mm: the source (parallel beam: its direction times `reach`) and three corners
     of the panel."""
-    f, (rows, columns) = geometry.rays(), geometry.nDetector
+    f, (rows, columns) = geometry.rays(curved=True), geometry.nDetector
     source = f.source * reach if f.parallel else f.source
     return np.concatenate([source, f.corner, f.corner + columns * f.u, f.corner + rows * f.v], 1)
 

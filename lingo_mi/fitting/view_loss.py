@@ -16,6 +16,7 @@ from lingo_mi.fitting.models.forward import ForwardModel
 from lingo_mi.fitting.options.loss import ImageLoss
 from lingo_mi.lingo.loss_scale import loss_scale
 from lingo_mi.projectors.backprop import Cuts, leaves
+from lingo_mi.projectors.bent import Bend
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.upload import uploaded
@@ -54,7 +55,7 @@ class MeasuredView:
     def of(scan: Scan, index: int, unit: float, weights: np.ndarray | None = None) -> MeasuredView:
         """View `index` of a scan; weights float32 [view, v, u] or None."""
         height, width = scan.geometry.nDetector
-        rays = scan.geometry.normalised_rays()[[index]]
+        rays = scan.geometry.normalised_rays(curved=True)[[index]]
         pixels = scan.projections[index].ravel() * np.float32(scan.geometry.grid.scale / unit)
         valid = on_device = None
         if weights is not None:
@@ -137,7 +138,8 @@ def differentiate(
     gx, gy = functools.reduce(_sum, [(dr.grad(leaf[-2]), dr.grad(leaf[-1])) for _, leaf, _ in bundles])
     footprints = bundles[len(bundles) // 2][0]
     with dr.suspend_grad():
-        norm = dr.norm(mi.Vector2f(gx * (view.width / 2), gy * (view.height / 2))) * batch
+        across, down = (view.width, view.height) if view.bend is None else (view.height, view.width)
+        norm = dr.norm(mi.Vector2f(gx * (across / 2), gy * (down / 2))) * batch
         norm = norm * factor if loss.loss_scale == 'statistic' else norm
         visible = dr.select(footprints.visible, mi.Float(1), 0)
     for footprints, leaf, cut in bundles:  # one by one: a single kernel for all would take long to compile
@@ -164,6 +166,8 @@ def differentiate_replayed(
         view.corner,
         view.u,
         view.v,
+        None if view.bend is None else view.bend.table,
+        None if view.bend is None else view.bend.numbers,
         target.pixels,
         target.weights,
         target.valid,
@@ -180,9 +184,10 @@ def differentiate_replayed(
 
 
 def _differentiated(*arrays, height, width, parallel, loss, forward, batch):
-    *gaussians, source, corner, u, v, pixels, weights, valid = arrays
+    *gaussians, source, corner, u, v, table, numbers, pixels, weights, valid = arrays
     dr.enable_grad(gaussians)
-    target = MeasuredView(View(source, corner, u, v, width, height, parallel), pixels, weights, valid)
+    bend = None if table is None else Bend(table, numbers)
+    target = MeasuredView(View(source, corner, u, v, width, height, parallel, bend), pixels, weights, valid)
     return *differentiate(tuple(gaussians), target, loss, forward, batch), [dr.grad(x) for x in gaussians]
 
 

@@ -125,7 +125,7 @@ class GaussianProjector(LinearMap):
         return line_integrals(centre, scale, rotation, density, view, self._options, primal)
 
     def _views(self):
-        rays = self.geometry.rays()
+        rays = self.geometry.rays(curved=True)
         return (View.of(rays, i, *self.geometry.nDetector) for i in range(len(rays)))
 
     def _cloud(self) -> list:

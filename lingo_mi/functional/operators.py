@@ -123,7 +123,7 @@ def project(
     arrays, geometry, extent = _taken(means, scales, quaternions, density, geometry, extent)
     require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
-    own = geometry.rays()
+    own = geometry.rays(curved=True)
     index, options = _indices(views, len(own)), RenderOptions(extent)
     own = own[index]
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.functional.frameworks import Argument
-from lingo_mi.geometry import Geometry, Rays
+from lingo_mi.geometry import CurvedGeometry, Geometry, Rays
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.view import View
 
@@ -23,7 +23,14 @@ def rays_argument(rays: Any, views: int) -> Argument:
 
 
 def on_host(vectors: Any, geometry: Geometry) -> Rays:
-    """The rays of a tensor [n, 4, 3]. Raises InputError, naming the first bad view: see `Rays.checked`. Waits for the device."""
+    """The rays of a tensor [n, 4, 3]. Raises InputError, naming the first bad view: see `Rays.checked`. Waits for the device.
+
+    Also for curved panels, whose rays are no such vectors.
+    """
+    if isinstance(geometry, CurvedGeometry):
+        raise InputError(
+            'rays describe flat panels, and the panel of this scan is curved: resample the scan with scan.to_flat()'
+        )
     return Rays.from_vectors(dr.detach(vectors).numpy(), geometry.mode == 'parallel')
 
 

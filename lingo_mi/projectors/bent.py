@@ -1,10 +1,12 @@
 """Where the pixels of curved panels lie on the flat ones that they touch, on the device (Dr.Jit): see `geometry.curve`.
 
-A ray through a pixel of a curved panel is the ray through (X, Y) of the flat one, so the projectors of voxels need no more.
+A ray through a pixel of a curved panel is the ray through (X, Y) of the flat one, so the projectors of voxels need no more. The
+splat of Gaussians works along straight lines of equally spaced pixels, which are the columns of a curved panel (`Bend`).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -72,3 +74,58 @@ def column_of(numbers: list[Any], x: Any) -> Any:
     root = dr.sqrt(dr.maximum(b * b - a * c, 0))
     k = dr.select(b < 0, (root - b) / a, -c / (b + root))
     return dr.fma(radius, dr.atan2(dr.fma(k, q - p, p), r - (1 - k)), middle)
+
+
+@dataclass
+class Bend:
+    """How the panel of one view is bent.
+
+    Parameters
+    ----------
+    table : Float64 [2 u]
+        X and s of the centres of its columns.
+    numbers : Float64 [6]
+        `Curve.numbers`, and the largest s.
+    """
+
+    table: Any
+    numbers: Any
+
+    @staticmethod
+    def of(curve: Curve, columns: int) -> Bend:
+        """Of a curve of one view and a panel of so many columns."""
+        table = column_table(curve, columns)
+        largest = (1 / curve.share([0.0, columns])).max()
+        return Bend(uploaded(table, double=True), uploaded(np.append(curve.numbers, largest), double=True))
+
+    def column(self, u: Any, active: Any = True) -> tuple[Any, Any]:
+        """X and s of columns u, Float64; 0 and 1 where they are not active."""
+        scale = dr.gather(mi.Float64, self.table, 2 * u + 1, active)
+        return dr.gather(mi.Float64, self.table, 2 * u, active), dr.select(active, scale, 1)
+
+    def on_plane(self, u: Any, v: Any) -> tuple[Any, Any]:
+        """(X, Y) of the centres of pixels, Float64."""
+        x, scale = self.column(u)
+        return x, self.foot + scale * (mi.Float64(v) + 0.5 - self.foot)
+
+    @property
+    def foot(self) -> Any:
+        """The row position of the source's foot."""
+        return dr.gather(mi.Float64, self.numbers, mi.UInt32(3))
+
+    def column_of(self, x: Any) -> Any:
+        """The column position on the curved panel of a position X on the flat one."""
+        return column_of([dr.gather(mi.Float64, self.numbers, mi.UInt32(i)) for i in range(NUMBERS)], x)
+
+    def rows_of(self, low: Any, high: Any) -> tuple[Any, Any]:
+        """Row positions that hold those from low to high on the flat panel, in whichever column."""
+        foot, least = self.foot, 1 / dr.gather(mi.Float64, self.numbers, mi.UInt32(NUMBERS))
+        low, high = low - foot, high - foot
+        return foot + dr.minimum(low, low * least), foot + dr.maximum(high, high * least)
+
+
+def turned(image: Any, rows: int, columns: int) -> Any:
+    """An image, Float [rows * columns], row by row, column by column instead."""
+    i = dr.arange(mi.UInt32, rows * columns)
+    height, width = dr.opaque(mi.UInt32, rows), dr.opaque(mi.UInt32, columns)
+    return dr.gather(mi.Float, image, i % height * width + i // height, mode=dr.ReduceMode.Permute)

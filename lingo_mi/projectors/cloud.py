@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from lingo_mi.common.errors import AccuracyWarning, InputError
 from lingo_mi.projectors.backprop import Cuts, leaves
+from lingo_mi.projectors.bent import Bend
 from lingo_mi.projectors.depth import deepest, parts_of
 from lingo_mi.projectors.footprint import NAMES, project
 from lingo_mi.projectors.full_float64 import full_float64
@@ -23,6 +24,7 @@ from lingo_mi.projectors.view import View
 
 DENOMINATOR = 'e1', 'e2', 'e11', 'e12', 'e22'  # numbers that say how |d|^2 varies over a footprint
 POSE = 4  # arrays at the end of the inputs: source, corner, u, v
+_NO_BEND = None, None
 PIXEL_VARIANCE = 1 / 12  # of a unit square, along each axis
 
 
@@ -75,7 +77,10 @@ def _of_inputs(gaussians, view, options, primal):
         raise InputError('the cloud is empty: it needs at least one Gaussian')
     inputs = *gaussians, view.source, view.corner, view.u, view.v
     settings = dict(panel=_Panel(view.width, view.height, view.parallel), options=options)
-    return dr.custom(_LineIntegrals, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal)
+    if view.bend is not None and (options.area or options.footprint != 'exact'):
+        raise InputError("a curved panel needs the exact footprint of rays: leave out footprint and pixel='area'")
+    bend = _NO_BEND if view.bend is None else (view.bend.table, view.bend.numbers)
+    return dr.custom(_LineIntegrals, inputs, tuple(map(dr.grad_enabled, inputs)), settings, primal, bend)
 
 
 @dataclass(frozen=True)
@@ -90,8 +95,9 @@ class _Panel:
     def pixels(self) -> int:
         return self.width * self.height
 
-    def view(self, pose: Sequence) -> View:
-        return View(*pose, width=self.width, height=self.height, parallel=self.parallel)
+    def view(self, pose: Sequence, bend: tuple) -> View:
+        bend = None if bend[0] is None else Bend(*bend)
+        return View(*pose, width=self.width, height=self.height, parallel=self.parallel, bend=bend)
 
 
 class _LineIntegrals(dr.CustomOp):
@@ -101,8 +107,9 @@ class _LineIntegrals(dr.CustomOp):
     are needed and which Gaussians are left over. The host then goes on while the device adds up pixels.
     """
 
-    def eval(self, inputs, wanted, settings, primal):
+    def eval(self, inputs, wanted, settings, primal, bend):
         self.inputs, self.wanted, self.settings, self.parts, self.known = inputs, wanted, settings, 1, None
+        self.bend = bend
         if not primal:
             return dr.zeros(mi.Float, settings['panel'].pixels)
         prepared, straddling = self._look()
@@ -115,18 +122,18 @@ class _LineIntegrals(dr.CustomOp):
                 ),
                 stacklevel=5,
             )
-        image = _DRAW(*prepared, *inputs[-POSE:], parts=self.parts, **settings)
+        image = _DRAW(*bend, *prepared, *inputs[-POSE:], parts=self.parts, **settings)
         if any(wanted):
             self.known = prepared, straddling
-        return _with_rest(image, inputs, settings, straddling)
+        return _with_rest(image, inputs, bend, settings, straddling)
 
     def forward(self):
         leaf = leaves(self.inputs)
         dr.set_grad(leaf, self.grad_in('inputs'))
-        view, footprints = _footprints(*leaf, **self.settings)
+        view, footprints = _footprints(*self.bend, *leaf, **self.settings)
         options = self.settings['options']
         image = splat(footprints, view.height, view.width, options.extent, self.parts, options.sharing) * view.lengths()
-        image = _with_rest(image, leaf, self.settings, dr.compress(footprints.straddles))
+        image = _with_rest(image, leaf, self.bend, self.settings, dr.compress(footprints.straddles))
         dr.forward_to(image)
         self.set_grad_out(dr.grad(image))
 
@@ -135,12 +142,14 @@ class _LineIntegrals(dr.CustomOp):
         prepared, straddling = self.known or self._look(deep=of_pose)
         self.known = None
         upstream: Any = self.grad_out()
-        found = _GATHER(*prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings)
+        found = _GATHER(
+            *self.bend, *prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings
+        )
         del prepared  # frees memory: as large as all that follows
-        gradients = _BY_INPUTS(*self.inputs, *found, wanted=self.wanted, **self.settings)
+        gradients = _BY_INPUTS(*self.bend, *self.inputs, *found, wanted=self.wanted, **self.settings)
         if dr.width(straddling) and not self.settings['panel'].parallel:
             leaf = leaves(self.inputs)
-            dr.backward_from(_with_rest(mi.Float(0), leaf, self.settings, straddling) * upstream)
+            dr.backward_from(_with_rest(mi.Float(0), leaf, self.bend, self.settings, straddling) * upstream)
             gradients = [a + dr.grad(b) for a, b in zip(gradients, leaf)]
         self.set_grad_in('inputs', tuple(gradients))
 
@@ -150,65 +159,68 @@ class _LineIntegrals(dr.CustomOp):
     def _look(self, deep=True):
         """The arrays for `splat.Plan`, and the indices of Gaussians that cannot be splatted. With `deep`, also sets the number
         of partial sums. Waits for the device."""
-        *prepared, straddles, depth = _PREPARE(*self.inputs, **self.settings, deep=deep)
+        *prepared, straddles, depth = _PREPARE(*self.bend, *self.inputs, **self.settings, deep=deep)
         if deep:
             self.parts = parts_of(depth)
         return prepared, dr.compress(straddles)
 
 
-def _read(*inputs, panel, **_) -> tuple[tuple[Any, ...], View]:
-    """The inputs as (centres, scales, rotations, densities) and the view."""
+def _read(*arrays, panel, **_) -> tuple[tuple[Any, ...], View]:
+    """The bend and the inputs as (centres, scales, rotations, densities) and the view."""
+    bend, inputs = arrays[:2], arrays[2:]
     *shapes, density = inputs[:-POSE]
     shapes = columns(*shapes) if len(shapes) == 1 else shapes
-    return (*shapes, density), panel.view(inputs[-POSE:])
+    return (*shapes, density), panel.view(inputs[-POSE:], bend)
 
 
-def _footprints(*inputs, panel, options, cut=None):
-    gaussians, view = _read(*inputs, panel=panel)
+def _footprints(*arrays, panel, options, cut=None):
+    gaussians, view = _read(*arrays, panel=panel)
     widen = PIXEL_VARIANCE if options.area else 0.0
     footprints = project(gaussians, view, options.extent, widen, cut)
     return view, _affine(footprints) if options.footprint == 'affine' else footprints
 
 
-def _with_rest(image, inputs, settings, indices):
+def _with_rest(image, inputs, bend, settings, indices):
     """The image plus the Gaussians at `indices`, which cannot be splatted. In a parallel beam these are invalid: NaN."""
     if dr.width(indices) == 0:
         return image
-    gaussians, view = _read(*inputs, **settings)
+    gaussians, view = _read(*bend, *inputs, **settings)
     return image + dr.nan if view.parallel else add_straddling(image, gaussians, view, indices)
 
 
-def _prepare(*inputs, deep, panel, options):
+def _prepare(*arrays, deep, panel, options):
     """The arrays for `splat.Plan`; which Gaussians cannot be splatted, Bool [N]; the overlap depth if `deep`, else None."""
-    view, f = _footprints(*inputs, panel=panel, options=options)
+    view, f = _footprints(*arrays, panel=panel, options=options)
     found = prepare(f.values, replace(f, values=()), options.sharing)
-    return *found, f.straddles, deepest((f.column, f.row), f.area, (view.width, view.height)) if deep else None
+    shape = (view.width, view.height) if view.bend is None else (view.height, view.width)
+    return *found, f.straddles, deepest((f.column, f.row), f.area, shape) if deep else None
 
 
-def _plan(prepared, panel, options):
-    return Plan(prepared, panel.height, panel.width, options.extent, options.sharing)
+def _plan(prepared, view, options):
+    return Plan(prepared, view.height, view.width, options.extent, options.sharing, view.bend)
 
 
 def _draw(*arrays, panel, options, parts):
-    view = panel.view(arrays[-POSE:])
-    return _plan(arrays[:-POSE], panel, options).image(parts) * view.lengths()
+    view = panel.view(arrays[-POSE:], arrays[:2])
+    return _plan(arrays[2:-POSE], view, options).image(parts) * view.lengths()
 
 
 def _gather(*arrays, panel, options, image, parts):
     """The result of `Plan.gradient`; then, if `image`, the derivative by the rays' lengths, Float [pixels]; else None."""
-    *prepared, source, corner, u, v, upstream = arrays
-    plan = _plan(prepared, panel, options)
-    lengths = panel.view((source, corner, u, v)).lengths()
+    *prepared, source, corner, u, v, upstream = arrays[2:]
+    view = panel.view((source, corner, u, v), arrays[:2])
+    plan, lengths = _plan(prepared, view, options), view.lengths()
     return *plan.gradient(upstream * lengths), plan.image(parts) * upstream if image else None
 
 
 @full_float64()
 def _by_inputs(*arrays, wanted, **settings):
-    """Derivatives by the inputs. `arrays`: the inputs, then the result of `_gather`."""
+    """Derivatives by the inputs. `arrays`: the bend, the inputs, then the result of `_gather`."""
+    bend, arrays = arrays[:2], arrays[2:]
     inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
     cut = Cuts()
-    view, footprints = _footprints(*inputs, **settings, cut=cut)
+    view, footprints = _footprints(*bend, *inputs, **settings, cut=cut)
     ends, gradients = list(footprints.values), list(by_values(found, dr.detach(footprints.values[3])))
     if by_lengths is not None:
         ends, gradients = [*ends, view.lengths()], [*gradients, by_lengths]

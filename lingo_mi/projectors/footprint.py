@@ -1,4 +1,4 @@
-r"""The exact footprint of a Gaussian on a flat detector.
+r"""The exact footprint of a Gaussian on a detector.
 
 For a ray :math:`o + tD` and a Gaussian (p, R, s, rho), whitened by :math:`W = \mathrm{diag}(1/s) R^T` to
 :math:`w = W(p - o)`, :math:`d = WD`, the line integral is
@@ -25,6 +25,9 @@ needle across the image t cancels down to the needle's width. The others are sto
 
 The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|. It is an ellipse if the
 kappa-ellipsoid lies between source and detector. Other Gaussians are left to `segment`.
+
+Of a curved detector, this is the footprint on the flat one that it touches, with the roles of rows and columns exchanged: its
+columns are straight lines there.
 """
 
 from __future__ import annotations
@@ -37,6 +40,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.projectors.backprop import Cuts
+from lingo_mi.projectors.bent import Bend
 from lingo_mi.projectors.full_float64 import full_float64
 from lingo_mi.projectors.rotation import rotate_inverse, rows_of
 from lingo_mi.projectors.view import View
@@ -59,7 +63,8 @@ class Footprints:
         projected centre, in pixels from the centre of pixel (column, row), which contains it.
     column, row : Int32 [N]
     row_begin, row_end : Int32 [N]
-        Rows of the footprint, clipped to the image; an empty range if there are none.
+        Rows of the footprint, clipped to the image; an empty range if there are none. On a curved detector: its columns; (column,
+        row) and (x, y) are then (Y, X) of `geometry.curve`.
     width : Float [N]
         Pixels across the widest row, for balancing work.
     area : Float [N]
@@ -67,6 +72,8 @@ class Footprints:
     straddles : Bool [N]
         Gaussians without a footprint, which `segment` must integrate; also invalid ones (a number that is not finite, or a zero
         scale or quaternion).
+    bend : Bend or None
+        The view's.
     """
 
     values: tuple
@@ -77,6 +84,7 @@ class Footprints:
     width: Any
     area: Any
     straddles: Any
+    bend: Bend | None = None
 
     @property
     def visible(self) -> Any:
@@ -108,7 +116,10 @@ def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, 
     Vector4d: Any = dr.float64_array_t(type(rotation))
     rows = cut(*rows_of(Vector4d(rotation), Vector3d))
     inverse = 1 / s
+    bend, height, width = view.bend, view.height, view.width
     a, b = view.u, view.v
+    if bend is not None:
+        a, b, height, width = b, a, width, height
     n = dr.cross(a, b)
 
     if view.parallel:
@@ -199,18 +210,22 @@ def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, 
         def pixel(position, size):
             return mi.Int32(dr.clip(dr.select(visible, position, 0), 0, size))
 
-        row_begin = pixel(dr.ceil(y + low_y - 0.5), view.height)
-        row_end = dr.select(visible, pixel(dr.floor(y + high_y - 0.5) + 1, view.height), 0)
-        begin, end = pixel(dr.floor(x + low_x - 0.5), view.width), pixel(dr.ceil(x + high_x + 0.5), view.width)
+        low_x, high_x, low_y, high_y = x + low_x, x + high_x, y + low_y, y + high_y
+        if bend is not None:
+            low_y, high_y = bend.column_of(low_y), bend.column_of(high_y)
+            low_x, high_x = bend.rows_of(low_x, high_x)
+        row_begin = pixel(dr.ceil(low_y - 0.5), height)
+        row_end = dr.select(visible, pixel(dr.floor(high_y - 0.5) + 1, height), 0)
+        begin, end = pixel(dr.floor(low_x - 0.5), width), pixel(dr.ceil(high_x + 0.5), width)
         row_end = dr.select(end > begin, row_end, 0)
         far_out = 1e9  # keeps the whole part of a centre far outside the image within Int32
         column = mi.Int32(dr.clip(dr.select(visible, dr.floor(x), 0), -far_out, far_out))
         row = mi.Int32(dr.clip(dr.select(visible, dr.floor(y), 0), -far_out, far_out))
-        width, row_end = mi.Float(end - begin), dr.maximum(row_end, row_begin)
-        area = dr.minimum(mi.Float(row_end - row_begin) * width, mi.Float(dr.pi * extent * extent / (mx * my)))
+        widest, row_end = mi.Float(end - begin), dr.maximum(row_end, row_begin)
+        area = dr.minimum(mi.Float(row_end - row_begin) * widest, mi.Float(dr.pi * extent * extent / (mx * my)))
     values = (amplitude, mx, my, shear, e1, e2, e11, e12, e22, x - (Float64(column) + 0.5), y - (Float64(row) + 0.5))
     values = tuple(v if name in DOUBLE else mi.Float(v) for name, v in zip(NAMES, values))
-    return Footprints(values, column, row, row_begin, row_end, width, area, straddles)
+    return Footprints(values, column, row, row_begin, row_end, widest, area, straddles, bend)
 
 
 def _roots(a, b, c):

@@ -47,6 +47,8 @@ def _integrate(centre: Any, scale: Any, rotation: Any, density: Any, view: View)
     i = dr.arange(mi.UInt32, view.height * view.width)
     width = dr.opaque(mi.UInt32, view.width)
     x, y = Float64(i % width) + 0.5, Float64(i // width) + 0.5
+    if view.bend is not None:
+        x, y = view.bend.on_plane(i % width, i // width)
     D = view.corner - view.source + x * view.u + y * view.v
     w, d = rotate_inverse(rows, p - view.source) / s, rotate_inverse(rows, D) / s
     dd = dr.squared_norm(d)

@@ -12,6 +12,10 @@ t = dx + shear dy suffers cancellation for an oblique needle: thousands of pixel
 pixel. The kernels therefore store where the ridge t = 0 crosses the row of the centre (`ridge`, in place of the centre's
 x). They follow it from row to row with twice float32's digits. Within a row, t is a whole number of pixels from the pixel
 on the ridge, less a fraction.
+
+On a curved panel the lanes work on columns instead, and `_InColumn` does what differs: the columns are no whole pixels apart on
+the flat panel that footprints refer to, and its pixels s times as long. t is then counted in the curved panel's own pixels, and
+where the ridge is in float64.
 """
 
 from __future__ import annotations
@@ -39,6 +43,7 @@ from lingo_mi.projectors.balance import (
     unpack_halves,
     whole,
 )
+from lingo_mi.projectors.bent import Bend, turned
 from lingo_mi.projectors.exponential import HALF_LOG2E, exp2_of_negative
 from lingo_mi.projectors.footprint import DOUBLE, NAMES, Footprints
 
@@ -66,7 +71,7 @@ def splat(
 
 class _Splat(dr.CustomOp):
     def eval(self, values, rest, height, width, extent, parts, sharing):
-        self.plan = Plan(prepare(values, rest, sharing), height, width, extent, sharing)
+        self.plan = Plan(prepare(values, rest, sharing), height, width, extent, sharing, rest.bend)
         self.shear, self.parts = values[3], parts
         return self.plan.image(parts)
 
@@ -110,12 +115,15 @@ class _Packed:
         The cut-off squared.
     packets : Int32
         Packets per image row.
+    bend : Bend or None
+        Of a curved panel.
     """
 
     numbers: Any
     places: Any
     extent2: Any
     packets: Any
+    bend: Bend | None = None
 
     def load(self, g):
         """The numbers and the places of footprint g."""
@@ -123,17 +131,20 @@ class _Packed:
 
 
 class Plan:
-    """The work of one image: footprints that `prepare` packed, shared out by their pixels."""
+    """The work of one image: footprints that `prepare` packed, shared out by their pixels. bend: of a curved panel."""
 
-    def __init__(self, prepared: Sequence, height: int, width: int, extent: float, sharing: Sharing):
+    def __init__(
+        self, prepared: Sequence, height: int, width: int, extent: float, sharing: Sharing, bend: Bend | None = None
+    ):
         packed, places, *work = prepared
+        height, width = (height, width) if bend is None else (width, height)
         self.height, self.width, self.work = height, width, Work(*work, sharing=sharing)
         extent2, packets = dr.opaque(mi.Float, extent * extent), dr.opaque(mi.Int32, sharing.adding.packets(width))
-        self.packed = _Packed(packed, places, extent2, packets)
+        self.packed = _Packed(packed, places, extent2, packets, bend)
 
     def image(self, parts: int = 1) -> Any:
         """Float [height * width]."""
-        return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed)
+        return self._upright(self.work.add_up(_draw, self.height, self.width, parts, f=self.packed))
 
     def tangent(self, tangents: Sequence, shear: Any, parts: int = 1) -> Any:
         """The image's derivative along `tangents` of `Footprints.values`. shear: one of these values."""
@@ -143,19 +154,25 @@ class Plan:
         zeros = dr.zeros(mi.Float, self.work.count)  # a tangent that vanishes has width 1
         moved = pack(mi.Vector4f, mi.Float, [mi.Float(v) + zeros for v in (*others, ridge, y, 0)])
         dr.eval(moved)
-        return self.work.add_up(_draw, self.height, self.width, parts, f=self.packed, moved=moved)
+        return self._upright(self.work.add_up(_draw, self.height, self.width, parts, f=self.packed, moved=moved))
 
     def gradient(self, grad_image: Any) -> list:
         """Derivatives by the footprints' numbers, Float [N] each, from the derivative by the image.
 
         The last, by y, is taken with the ridge fixed; `by_values` converts it.
         """
+        if self.packed.bend is not None:
+            grad_image = turned(grad_image, self.width, self.height)
         layout, sums = self.work.sharing.reading, Sums(self.work.count, len(NAMES))
         upstream = layout.pad(grad_image, self.height, self.width)
         dr.make_opaque(upstream)
         packed = replace(self.packed, packets=dr.opaque(mi.Int32, layout.packets(self.width)))
         dr.eval(_gather(self.work.shares(layout), packed, upstream, sums), sums.arrays)
         return sums.columns()
+
+    def _upright(self, image):
+        """The image row by row: that of a curved panel is made column by column."""
+        return image if self.packed.bend is None else turned(image, self.height, self.width)
 
 
 def by_values(found: Sequence, shear: Any) -> tuple:
@@ -173,10 +190,66 @@ class _Item:
         self.e1, self.e2, self.e11, self.e12, self.e22 = e
         self.shear_low, self.ridge_low = unpack_halves(low)
         self.column, self.row, self.row_begin, self.row_end = w
-        self.extent2, self.packets = f.extent2, f.packets
+        self.extent2, self.packets, self.bend = f.extent2, f.packets, f.bend
         self.half_extent2, self.twice_e12 = 0.5 * f.extent2, 2 * self.e12
         self.a = dr.square(self.mx) - f.extent2 * self.e11
         self.mu = self.mx * HALF_LOG2E**0.5
+
+    def at(self, y) -> _Item:
+        """The footprint as its row y sees it."""
+        return self if self.bend is None else _InColumn(self, y, self.bend)
+
+    def rows_from_centre(self, y):
+        """The distance of row y from that of the centre, in rows."""
+        return mi.Float(y - self.row)
+
+    def on_ridge(self, n):
+        """Where t is 0 in a row at that distance: a column and a fraction."""
+        along, along_low = times(self.shear, self.shear_low, n)
+        steps = whole(along - self.ridge)
+        # Near the ridge t needs all its digits; there these differences are exact.
+        offset = (self.ridge - (along - steps)) + (self.ridge_low - along_low)
+        return self.column - mi.Int32(steps), offset
+
+    def in_its_pixels(self, t, d1):
+        """t and d1 in pixels of the footprint."""
+        return t, d1
+
+    def moments(self, found):
+        """The moments of a row in t, with t in pixels of the footprint."""
+        return found
+
+
+class _InColumn(_Item):
+    """A footprint as a column y of a curved panel sees it: lengths along the column are in pixels of the curved panel."""
+
+    def __init__(self, i: _Item, y, bend: Bend):
+        vars(self).update(vars(i))
+        self._place, self._scale = bend.column(y, y < i.row_end)
+        self._foot, scale = bend.foot, mi.Float(self._scale)
+        self.scale = scale
+        self.mx, self.mu, self.e1, self.twice_e12 = i.mx * scale, i.mu * scale, i.e1 * scale, i.twice_e12 * scale
+        self.a, self.e11 = i.a * dr.square(scale), i.e11 * dr.square(scale)
+
+    def rows_from_centre(self, y):
+        self._n = self._place - (mi.Float64(self.row) + 0.5)
+        return mi.Float(self._n)
+
+    def on_ridge(self, n):
+        Float64 = mi.Float64
+        shear = Float64(self.shear) + Float64(self.shear_low)
+        ridge = Float64(self.column) + 0.5 + (Float64(self.ridge) + Float64(self.ridge_low)) - shear * self._n
+        element = self._foot + (ridge - self._foot) / self._scale - 0.5
+        steps = whole(element)
+        return mi.Int32(steps), mi.Float(element - steps)
+
+    def in_its_pixels(self, t, d1):
+        return t * self.scale, d1 / self.scale
+
+    def moments(self, found):
+        s, n0, n1, n2, q0, q1, q2 = found
+        square = dr.square(self.scale)
+        return s, n0, n1 * self.scale, n2 * square, q0, q1 * self.scale, q2 * square
 
 
 def _row(layout: Layout, i: _Item, y):
@@ -187,7 +260,7 @@ def _row(layout: Layout, i: _Item, y):
     object
         Dy; m = (my dy)^2; d0 and d1 with den = d0 + t (d1 + e11 t); where t is 0, as a column and a fraction; begin; end.
     """
-    n = mi.Float(y - i.row)
+    n = i.rows_from_centre(y)
     dy = n - i.y
     m = dr.square(i.my * dy)
     d0 = dr.fma(dy, dr.fma(i.e22, dy, i.e2), 1)
@@ -195,11 +268,7 @@ def _row(layout: Layout, i: _Item, y):
     # num <= extent^2 den, a quadratic in t
     b, c0 = i.half_extent2 * d1, i.extent2 * d0 - m
     root = dr.sqrt(dr.maximum(dr.fma(i.a, c0, b * b), 0))
-    along, along_low = times(i.shear, i.shear_low, n)
-    steps = whole(along - i.ridge)
-    # Near the ridge t needs all its digits; there these differences are exact.
-    offset = (i.ridge - (along - steps)) + (i.ridge_low - along_low)
-    column = i.column - mi.Int32(steps)
+    column, offset = i.on_ridge(n)
     begin, end = layout.span((b - root) / i.a, (b + root) / i.a, offset, column, y >= i.row_end, i.packets)
     return dy, m, d0, d1, column, offset, begin, end
 
@@ -222,13 +291,16 @@ def _draw(share: Share, target: Target, f: _Packed, moved=None):
 
         def rows(row):
             y = item.row_begin + row
-            dy, m, d0, d1, column, offset, first, last = _row(share.layout, item, y)
+            here = item.at(y)
+            dy, m, d0, d1, column, offset, first, last = _row(share.layout, here, y)
             column, line = share.beside(column, target.base(g) + y * f.packets)
 
             def pixels(packet):
                 t = share.position(packet, column, offset)
-                inverse, exponent, shape = _shape(t, item, m, d0, d1)
-                factor = item.amplitude if moved is None else _tangent_factor(item, dc, t, dy, d1, inverse, exponent)
+                inverse, exponent, shape = _shape(t, here, m, d0, d1)
+                factor = item.amplitude
+                if moved is not None:
+                    factor = _tangent_factor(item, dc, dy, *here.in_its_pixels(t, d1), inverse, exponent)
                 target.add(factor * shape, line + packet)
 
             share.each_packet((first, last), pixels)
@@ -246,14 +318,15 @@ def _gather(share: Share, f: _Packed, upstream, found: Sums):
 
         def rows(row, *sums):
             y = item.row_begin + row
-            dy, m, d0, d1, column, offset, first, last = _row(share.layout, item, y)
+            here = item.at(y)
+            dy, m, d0, d1, column, offset, first, last = _row(share.layout, here, y)
             column, line = share.beside(column, y * f.packets)
             total, dot = share.total, share.dot
 
             def pixels(packet, *moments):
                 s, n0, n1, n2, q0, q1, q2 = moments
                 t = share.position(packet, column, offset)
-                inverse, exponent, shape = _shape(t, item, m, d0, d1)
+                inverse, exponent, shape = _shape(t, here, m, d0, d1)
                 # dL/d(num) = -1/2 n and dL/d(den) = -1/2 (n - n num/den), each times the amplitude
                 value = share.read(upstream, line + packet) * shape
                 n = value * inverse
@@ -271,7 +344,7 @@ def _gather(share: Share, f: _Packed, upstream, found: Sums):
                 )
 
             moments = share.each_packet((first, last), pixels, *(mi.Float(0) for _ in range(7)))
-            return _add_row(sums, item, dy, moments)
+            return _add_row(sums, item, dy, here.moments(moments))
 
         sums = share.each_row(block, stop, item.row_end - item.row_begin, rows, *(mi.Float(0) for _ in NAMES))
         found.add(sums, g)
@@ -306,7 +379,7 @@ def _add_row(sums, i: _Item, dy, moments):
     return tuple(a + b for a, b in zip(sums, parts))
 
 
-def _tangent_factor(i: _Item, dc, t, dy, d1, inverse, exponent):
+def _tangent_factor(i: _Item, dc, dy, t, d1, inverse, exponent):
     """The footprint's directional derivative over its shape."""
     d_amplitude, d_mx, d_my, d_shear, d_e1, d_e2, d_e11, d_e12, d_e22, d_ridge, d_y, _ = dc
     t_dot = dy * d_shear - d_ridge

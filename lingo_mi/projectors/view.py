@@ -1,4 +1,4 @@
-"""One flat-panel view as Dr.Jit values, for the projector kernels."""
+"""One view as Dr.Jit values, for the projector kernels."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from lingo_mi.geometry.rays import Rays
+from lingo_mi.projectors.bent import Bend
 
 
 def vector64(xyz: Iterable[float]) -> Any:
@@ -25,6 +26,8 @@ class View:
     - `cone`: from `source` along D = corner + x u + y v - source
     - `parallel`: through corner + x u + y v along the unit vector `source`
 
+    With a `bend`, (x, y) is the position on the flat panel that the curved one touches.
+
     Integrals of a cone beam begin at the source. They do not end at the panel, which may be a virtual one within the object.
 
     Parameters
@@ -35,6 +38,8 @@ class View:
         Pixels.
     parallel : bool
         Whether the beam is parallel.
+    bend : Bend or None
+        Of a curved panel. It is constant: a pose is differentiable as a rigid motion of source and panel together.
     """
 
     source: Any
@@ -44,6 +49,7 @@ class View:
     width: int
     height: int
     parallel: bool = False
+    bend: Bend | None = None
 
     @staticmethod
     def of(rays: Rays, index: int, height: int, width: int) -> View:
@@ -53,6 +59,7 @@ class View:
             width=width,
             height=height,
             parallel=rays.parallel,
+            bend=None if rays.curve is None else Bend.of(rays.curve[[index]], width),
         )
 
     def lengths(self) -> Any:
@@ -62,6 +69,8 @@ class View:
         i: Any = dr.arange(mi.UInt32, self.width * self.height)
         x: Any = mi.Float(i % self.width + 0.5)
         y: Any = mi.Float(i // self.width + 0.5)
+        if self.bend is not None:
+            x, y = (mi.Float(p) for p in self.bend.on_plane(i % self.width, i // self.width))
         axis = self.corner - self.source
         # All in float32, also the constant, which would promote the sum to float64: |D| only needs relative accuracy.
         d = mi.Vector3f(axis) + x * mi.Vector3f(self.u) + y * mi.Vector3f(self.v)

@@ -9,7 +9,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import to_posed
-from lingo_mi.geometry import CircularGeometry, Geometry, astra
+from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, PosedGeometry, astra
 from lingo_mi.geometry.grid import Grid, grid_of
 from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.geometry.trajectories import circular, helix
@@ -35,6 +35,7 @@ NAMES = (
     'tilt',
     'rotDetector',
     'poses',
+    'radius',
 )
 _CIRCLE = (
     'DSO',
@@ -66,6 +67,12 @@ def describe(geometry: Geometry, index: int = 0) -> dict:
         offOrigin=join(geometry.grid.centre),
         view=index,
     )
+    if isinstance(geometry, CurvedGeometry):
+        shared, geometry = shared | dict(radius=geometry.radius), geometry.flat
+        if (
+            isinstance(geometry, CircularGeometry) and geometry.offDetector[1]
+        ):  # which would move the panel along its arc
+            geometry = PosedGeometry(poses=geometry.rays(), nDetector=geometry.nDetector, grid=geometry.grid)
     if not isinstance(geometry, CircularGeometry):
         vectors = astra.to_vectors(geometry.rays(), geometry.nDetector)
         return shared | dict(poses=join(vectors.ravel().tolist()))
@@ -126,8 +133,10 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
     voxels = dict(
         nVoxel=_counts(props, 'nVoxel'), dVoxel=_numbers(props, 'dVoxel'), offOrigin=_numbers(props, 'offOrigin', 0.0)
     )
+    radius = _distance(props, 'radius', 0.0)
     if parameter(props, 'poses', ''):
-        return _read_poses(props, shared | voxels), None
+        posed = _read_poses(props, shared | voxels)
+        return CurvedGeometry(flat=posed, radius=radius) if radius else posed, None
     total, start = parameter(props, 'totalAngle', 360.0), parameter(props, 'startAngle', 0.0)
     views, held_out = parameter(props, 'views', 50), parameter(props, 'test_views', 0)
     if held_out < 0:
@@ -153,11 +162,12 @@ def read_scanner(props: Any) -> tuple[Geometry, Geometry | None]:
 
     def geometry(at):
         circle = CircularGeometry(angles=at, **shared)
-        if not (pitch or tilt or any(turned)):
-            return circle
-        return Geometry.per_view(
-            **circle.numbers(), height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned)
-        )
+        flat: Geometry = circle
+        if pitch or tilt or any(turned):
+            flat = Geometry.per_view(
+                **circle.numbers(), height=helix(at, pitch), tilt=np.radians(tilt), rotDetector=np.radians(turned)
+            )
+        return flat.curved(radius) if radius else flat
 
     if not held_out:
         return geometry(angles), None

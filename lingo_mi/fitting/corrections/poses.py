@@ -76,7 +76,7 @@ class Poses:
     def corrected(self, geometry: Geometry) -> Geometry:
         """A scan's geometry, in mm, with corrected views."""
         g, centre = geometry, np.array(geometry.grid.centre)
-        f = self.correct(g.normalised_rays())
+        f = self.correct(g.normalised_rays(curved=True))
         source = f.source if f.parallel else f.source / g.grid.scale + centre
         rays = replace(
             f, source=source, corner=f.corner / g.grid.scale + centre, u=f.u / g.grid.scale, v=f.v / g.grid.scale

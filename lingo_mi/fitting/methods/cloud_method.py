@@ -103,7 +103,7 @@ class CloudMethod(Method):
         method = replace(method, start=start, densify=densify)
         if g.mode == 'parallel':
             return method
-        rays = g.normalised_rays()
+        rays = g.normalised_rays(curved=True)
         clear = np.linalg.norm(rays.source, axis=1).min() - np.linalg.norm(g.grid.half)
         largest = 0.9 * clear / self.extent
         if largest <= self.bounds.scale_min:
@@ -122,6 +122,7 @@ class CloudMethod(Method):
         begun = time.perf_counter()
         method = self.bounded(scan)
         scan = line_integrals(scan) if self.effects == 'model' else replace(scan, effects=None)
+        scan = scan.to_flat()  # a start need not be exact
         unit, geometry = density_unit(scan, self.normalise), scan.geometry
 
         def render(points, density, spacing, views):

@@ -65,7 +65,7 @@ class CloudModel(Model):
         """
         g, (height, width) = self.geometry, geometry.nDetector
         # In the frame of the fit's own volume, whatever the voxels of this geometry.
-        every = geometry.on(g.grid).normalised_rays()
+        every = geometry.on(g.grid).normalised_rays(curved=True)
         gaussians = self.forward.gaussians(state.values)
 
         def along(rays):
