@@ -96,8 +96,8 @@ class _Panel:
         return self.width * self.height
 
     def view(self, pose: Sequence, bend: tuple) -> View:
-        bend = None if bend[0] is None else Bend(*bend)
-        return View(*pose, width=self.width, height=self.height, parallel=self.parallel, bend=bend)
+        bent = None if bend[0] is None else Bend(*bend)
+        return View(*pose, width=self.width, height=self.height, parallel=self.parallel, bend=bent)
 
 
 class _LineIntegrals(dr.CustomOp):
