@@ -236,13 +236,14 @@ def _line_integrals(projections, values, where, projections_path):
 def _dump_yaml(path, geometry, test=None, *, poses=None, **more):
     """Writes a geometry file. poses: the name of a file that holds them; None: they are lines of this one."""
     bend = {'radius': geometry.radius} if isinstance(geometry, CurvedGeometry) else {}
-    if _on_circle(geometry) and (test is None or _on_circle(test)):
-        values = {**from_geometry(_flat(geometry)), 'angles': np.degrees(geometry.angles).tolist()}
+    flat = _flat(geometry)
+    if isinstance(flat, CircularGeometry) and _on_circle(geometry) and (test is None or _on_circle(test)):
+        values = {**from_geometry(flat), 'angles': np.degrees(geometry.angles).tolist()}
         if test is not None:
             values['test_angles'] = np.degrees(test.angles).tolist()
     else:
         values = {'mode': geometry.mode, 'nDetector': list(geometry.nDetector), **of_grid(geometry.grid)}
-        values['poses'] = poses or astra.to_vectors(_flat(geometry).rays(), geometry.nDetector).tolist()
+        values['poses'] = poses or astra.to_vectors(flat.rays(), geometry.nDetector).tolist()
         if test is not None:
             values['test_poses'] = astra.to_vectors(_flat(test).rays(), test.nDetector).tolist()
     values |= bend | more

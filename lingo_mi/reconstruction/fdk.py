@@ -325,7 +325,8 @@ class FDK(Algorithm):
             Float32 [view, u, v], and their geometry.
         """
         projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
-        shape = len(geometry), *geometry.nDetector[::-1]
+        n_v, n_u = geometry.nDetector
+        shape = len(geometry), n_u, n_v
         found = np.empty(shape, np.float32) if empty is None else empty(shape)
         for first in range(0, len(geometry), BATCH):
             found[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
