@@ -160,10 +160,6 @@ class Scan:
         """
         if not isinstance(self.geometry, CurvedGeometry):
             return self
-        if self.effects is not None:
-            raise InputError(
-                'the effects of a detector happened in its own pixels: give line integrals without effects'
-            )
         flat, (top, bottom, left, right) = self.geometry.to_flat(), self.geometry.flat_pixels()
         real = self.geometry.rays(curved=True)
         x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)

@@ -6,12 +6,11 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from lingo_mi.common.errors import InputError
 from lingo_mi.files.slabs import shared_zarr, write_chunks
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.geometry.grid import Grid
-from lingo_mi.jobs.job import Job, Runner, run_all
+from lingo_mi.jobs.job import Job, Runner, run_or_refuse
 from lingo_mi.storage.output_folder import CHECKPOINT
 
 
@@ -30,8 +29,7 @@ def voxelize_on(runner: Runner, fit: FittedModel, grid: Grid, thickness: int, pa
         fit.checkpoint.save(checkpoint)
         parts = enumerate(grid.slabs(thickness))
         jobs = [Job(f'slab {k}', 1, voxelize_slab, (checkpoint, grid.slab(*p), p[0], target)) for k, p in parts]
-        if failed := run_all(jobs, runner, lambda _: None):
-            raise InputError(next(f'{name}: {line}' for name, line in failed.items()))
+        run_or_refuse(jobs, runner)
         shutil.rmtree(checkpoint.parent)
 
 

@@ -91,6 +91,18 @@ def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
         return Event(job.name, 'failed', brief(f'{type(error).__name__}: {error}'))
 
 
+def run_or_refuse(jobs: list[Job], runner: Runner, tell: Tell = lambda _: None) -> None:
+    """`run_all` for jobs that are of use only together.
+
+    Raises
+    ------
+    InputError
+        For the first job that failed twice, with its name and line.
+    """
+    if failed := run_all(jobs, runner, tell):
+        raise InputError(next(f'{name}: {line}' for name, line in failed.items()))
+
+
 def run_all(jobs: list[Job], runner: Runner, tell: Tell) -> dict[str, str]:
     """Run all jobs, and those that failed once more when all others have ended; the one line of each that failed twice, by name.
 

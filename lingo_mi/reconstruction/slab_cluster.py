@@ -20,11 +20,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from lingo_mi.common.errors import InputError
 from lingo_mi.files.slabs import shared_zarr, write_chunks
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.circle import CircularGeometry
-from lingo_mi.jobs.job import Event, Job, Runner, run_all
+from lingo_mi.jobs.job import Event, Job, Runner, run_or_refuse
 from lingo_mi.reconstruction.algorithm import Progress
 from lingo_mi.reconstruction.fdk import BATCH, FDK, backprojected
 from lingo_mi.reconstruction.slab_sweeps import (
@@ -185,8 +184,7 @@ def _run(runner: Runner, jobs: list[Job], slab_done: Callable[[], object]) -> No
         if event.kind == 'done':
             slab_done()
 
-    if failed := run_all(jobs, runner, tell):
-        raise InputError(next(f'{name}: {line}' for name, line in failed.items()))
+    run_or_refuse(jobs, runner, tell)
 
 
 @contextmanager
