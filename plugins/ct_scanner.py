@@ -1,8 +1,7 @@
-"""The sensor `ct_scanner`: a CT scanner with a flat panel, in TIGRE's terms."""
+"""The sensor `ct_scanner`: a CT scanner with a flat or a curved panel, in TIGRE's terms."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -11,7 +10,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan
-from lingo_mi.geometry import CircularGeometry, Geometry
+from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Dataset
 from lingo_mi.scene.data_files import data_file
@@ -68,6 +67,11 @@ class CTScanner(mi.Sensor):
        - Instead of DSO, DSD, angles and the like, a pose for every view: 12 numbers each as in ASTRA (source or beam, centre
          of the panel, u, v), or a file of them, of projection matrices, or of RTK's geometry (see
          `lingo_mi.files.poses`), looked for like `projections`. A file that leaves the pixel size open needs dDetector.
+     * - radius
+       - |float|
+       - Of a panel that is bent on a cylinder, mm: DSD where its axis passes through the focal spot. dDetector is then a pixel's
+         height and width along the arc; `poses` say where the panel's middle is. Not for meshes, nor with a tube, a
+         detector or n x n rays a pixel. (Default: 0, a flat panel)
      * - test_views
        - |int|
        - Views held out of the fit, at angles drawn uniformly from the same range, or between the
@@ -115,11 +119,11 @@ class CTScanner(mi.Sensor):
             del props[name]
         props['film'] = mi.load_dict(film(*self.geometry.nDetector))
         super().__init__(props)
-        rays = self.geometry.rays()  # refuses curved panels
-        self.panel = View.of(rays, self.index, *self.geometry.nDetector)
+        self.rays = self.geometry.rays(curved=True)[[self.index]]
+        self.panel = View.of(self.rays, 0, *self.geometry.nDetector)
         # From where parallel rays start: well before the volume, wherever the panel is.
         self.back = 2 * float(
-            np.linalg.norm(rays.corner[self.index])
+            np.linalg.norm(self.rays.corner)
             + np.linalg.norm(self.geometry.grid.centre)
             + np.linalg.norm(self.geometry.grid.size)
         )
@@ -152,7 +156,7 @@ class CTScanner(mi.Sensor):
         (x, y), (width, height) = film.crop_offset(), film.crop_size()
         if (width, height) == (panel.width, panel.height):
             return panel
-        return replace(panel, corner=panel.corner + x * panel.u + y * panel.v, width=width, height=height)
+        return View.of(self.rays.cropped(x, y), 0, height, width)
 
     def view(self, index: int, geometry: Geometry | None = None) -> mi.Sensor:
         """The sensor of one view, of this scan or of another geometry, with the same detector."""
@@ -170,11 +174,10 @@ class CTScanner(mi.Sensor):
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         f = self.frame
         Vector3f = mi.Vector3f
-        point = (
-            Vector3f(f.corner)
-            + Vector3f(f.u) * (position_sample.x * f.width)
-            + Vector3f(f.v) * (position_sample.y * f.height)
-        )
+        x, y = position_sample.x * f.width, position_sample.y * f.height
+        if f.bend is not None:
+            x, y = f.bend.position(x, y)
+        point = Vector3f(f.corner) + Vector3f(f.u) * x + Vector3f(f.v) * y
         if f.parallel:
             start, direction = point - Vector3f(f.source) * self.back, Vector3f(f.source)
         else:
@@ -199,9 +202,10 @@ class CTScanner(mi.Sensor):
     def to_string(self) -> str:
         g = self.geometry
         circle = isinstance(g, CircularGeometry)
+        bend = f'radius = {g.radius:g}, ' if isinstance(g, CurvedGeometry) else ''
         way = f'DSO = {g.DSO:g}, DSD = {g.DSD:g}, offDetector = {g.offDetector}' if circle else 'a pose a view'
         return (
-            f'CTScanner[\n  mode = {g.mode}, {way},\n  nDetector = {g.nDetector}, '
+            f'CTScanner[\n  mode = {g.mode}, {bend}{way},\n  nDetector = {g.nDetector}, '
             f'dDetector = {g.dDetector},\n  nVoxel = {g.grid.shape}, '
             f'dVoxel = {g.grid.spacing}, offOrigin = {g.grid.centre},\n  views = {len(g)}, view = {self.index}\n]'
         )

@@ -15,6 +15,7 @@ from lingo_mi.effects.detector import DARKEST, Detector
 from lingo_mi.effects.focal_spot import FocalSpot, aperture_views
 from lingo_mi.effects.hardening import Tube, by_material, hardened
 from lingo_mi.effects.scatter import Scatter
+from lingo_mi.geometry import CurvedGeometry
 from lingo_mi.projectors.options import RenderOptions
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Scan
@@ -219,6 +220,12 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
     detector = getattr(sensor, 'detector', None) or getattr(sensor.film(), 'detector', None)
     if not tubes and detector is None:
         return None
+    geometry = getattr(sensor, 'geometry', None)
+    if isinstance(geometry, CurvedGeometry):
+        raise InputError(
+            'effects of a tube and a detector are modelled on flat panels alone: leave out xray_tube and ct_detector, or the '
+            'radius of the panel'
+        )
     if len(tubes) > 1:
         raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
     tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
@@ -229,7 +236,6 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
         )
     if detector is not None or scatter is not None:
         require_whole(sensor.film(), f'the film of {sensor.id()!r} under a ct_detector or with scatter')
-    geometry = getattr(sensor, 'geometry', None)
     if detector is not None and detector.psf and geometry is None:
         raise InputError('ct_detector: psf, in mm on the panel, needs a ct_scanner')
     if scatter is not None and geometry is None:

@@ -45,6 +45,10 @@ class Curve:
         """The bends of some views."""
         return Curve(self.middle, self.radius[index], self.foot_u[index], self.foot_v[index], self.distance[index])
 
+    def cropped(self, x: float, y: float) -> Curve:
+        """The bends of the part of the panels that begins at the pixel position x, y."""
+        return Curve(self.middle - x, self.radius, self.foot_u - x, self.foot_v - y, self.distance)
+
     @property
     def numbers(self) -> np.ndarray:
         """radius, middle, foot_u, foot_v and distance of each view: float64 [n, 5]."""

@@ -135,9 +135,7 @@ class CurvedGeometry(Geometry):
             As `flat_pixels`.
         """
         top, bottom, left, right = self.flat_pixels()
-        rays = self.flat.rays()
-        rays = replace(rays, corner=rays.corner + left * rays.u + top * rays.v)
-        return from_poses(rays, (bottom - top, right - left), self.grid)
+        return from_poses(self.flat.rays().cropped(left, top), (bottom - top, right - left), self.grid)
 
     def flat_pixels(self) -> tuple[int, int, int, int]:
         """The rows [top, bottom) and columns [left, right) on the plane of `flat` that this panel sees in all views.

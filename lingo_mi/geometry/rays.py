@@ -123,6 +123,12 @@ class Rays:
         source = source if self.parallel else source + shift
         return replace(self, source=source, corner=corner + shift, u=u, v=v)
 
+    def cropped(self, x: float, y: float) -> Rays:
+        """The part of the panels that begins at the pixel position x, y."""
+        return replace(
+            self, corner=self.corner + x * self.u + y * self.v, curve=self.curve and self.curve.cropped(x, y)
+        )
+
     def joined(self, other: Rays) -> Rays:
         """These views, then the other's, of the same kind of beam."""
         if self.parallel != other.parallel:

@@ -108,6 +108,13 @@ class Bend:
         x, scale = self.column(u)
         return x, self.foot + scale * (mi.Float64(v) + 0.5 - self.foot)
 
+    def position(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """(X, Y) of any positions on the panel, Float64: those of `Curve.on_plane`."""
+        radius, middle, foot_u, foot_v, distance = self._numbers()
+        angle = (mi.Float64(x) - middle) / radius
+        scale = distance / (distance - radius * (1 - dr.cos(angle)))
+        return foot_u + scale * (middle + radius * dr.sin(angle) - foot_u), foot_v + scale * (mi.Float64(y) - foot_v)
+
     @property
     def foot(self) -> Any:
         """The row position of the source's foot."""
@@ -115,7 +122,10 @@ class Bend:
 
     def column_of(self, x: Any) -> Any:
         """The column position on the curved panel of a position X on the flat one."""
-        return column_of([dr.gather(mi.Float64, self.numbers, mi.UInt32(i)) for i in range(NUMBERS)], x)
+        return column_of(self._numbers(), x)
+
+    def _numbers(self) -> list[Any]:
+        return [dr.gather(mi.Float64, self.numbers, mi.UInt32(i)) for i in range(NUMBERS)]
 
     def rows_of(self, low: Any, high: Any) -> tuple[Any, Any]:
         """Row positions that hold those from low to high on the flat panel, in whichever column."""

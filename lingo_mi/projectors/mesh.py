@@ -87,8 +87,9 @@ class MeshPaths:
         Raises
         ------
         InputError
-            If the mesh crosses the plane of a cone beam's source parallel to the panel.
+            If the mesh crosses the plane of a cone beam's source parallel to the panel, and for a curved panel.
         """
+        view.require_flat(f'the mesh {self.name!r}')
         with dr.suspend_grad():
             vertices, t, scale = self._project(view)
             if not view.parallel:

@@ -283,6 +283,8 @@ def _lines(view: View, near: Any) -> grid.Lines:
     width = dr.opaque(mi.UInt32, view.width)
     x: Any = mi.Float(i % width) + 0.5
     y: Any = mi.Float(i // width) + 0.5
+    if view.bend is not None:
+        x, y = (mi.Float(p) for p in view.bend.on_plane(i % width, i // width))
     near = mi.Vector3d(*near)
     n = dr.cross(view.u, view.v)
     Float, Vector3f = mi.Float, mi.Vector3f

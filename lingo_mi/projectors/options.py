@@ -60,6 +60,9 @@ class RenderOptions:
     def subdivided(self, view: View) -> View:
         """The view with every pixel divided into n x n parts."""
         n = self.pixel
+        if n == 1:
+            return view
+        view.require_flat('a pixel of n x n rays')
         return replace(view, u=view.u / n, v=view.v / n, width=view.width * n, height=view.height * n)
 
     def averaged(self, image: Any, view: View) -> Any:

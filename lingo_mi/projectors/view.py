@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.projectors.bent import Bend
 
@@ -61,6 +62,11 @@ class View:
             parallel=rays.parallel,
             bend=None if rays.curve is None else Bend.of(rays.curve[[index]], width),
         )
+
+    def require_flat(self, what: str) -> None:
+        """Raises InputError, which names what needs a flat panel, if this one is curved."""
+        if self.bend is not None:
+            raise InputError(f'{what} needs a flat panel, and this one is curved: leave out radius')
 
     def lengths(self) -> Any:
         """|D| of every pixel, Float [height * width], row by row: the Jacobian of the ray parameter, 1 for parallel beams."""

@@ -60,7 +60,7 @@ def require_densities(volume: np.ndarray) -> None:
 
 def warn_if_truncated(geometry: Geometry) -> None:
     """Warn if the volume's midplane is wider than the panels' field of view."""
-    rays, centre = geometry.rays(), np.array(geometry.grid.centre)
+    rays, centre = geometry.rays(curved=True), np.array(geometry.grid.centre)
     widest, columns = max(geometry.grid.size[:2]), geometry.nDetector[1]
     cut = 0
     for view in range(len(rays)):

@@ -125,7 +125,7 @@ def render_objects(objects: Sequence, geometry: Geometry, extent: float = cutoff
             elif same_box:  # skips empty margins, which rendering through the scene may not
                 total += grid.project_volume(grid_values(thing), geometry, report)
             else:
-                rays = geometry.rays()
+                rays = geometry.rays(curved=True)
                 for i in range(len(geometry)):
                     view = View.of(rays, i, *geometry.nDetector)
                     total[i] += thing.line_integrals(view, RenderOptions(extent)).numpy().reshape(geometry.nDetector)
@@ -144,7 +144,7 @@ def render_with(
     """`render_objects` as measured by a detector. keys: keys of the views' noise."""
     objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
-    rays = geometry.rays()
+    rays = geometry.rays(curved=True)
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
             view = View.of(rays, i, *geometry.nDetector)

@@ -2,6 +2,7 @@
 
 import json
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -50,6 +51,20 @@ def test_fit(method, data, tmp_path):
     again = Fit.load(tmp_path / 'fit')
     assert isinstance(again.geometry, CurvedGeometry)
     np.testing.assert_array_equal(again.render(data.test.geometry), fit.render(data.test.geometry))
+
+
+def test_the_scene_of_a_result_renders_it(data, tmp_path):
+    """Also if poses were corrected, of which no two panels are alike."""
+    for name, rates in (('plain', '0,0'), ('poses', '2e-4,2e-5')):
+        fit = lm.fit(data, lm.Fast(iterations=40).changed(rate_pose=rates), progress=False)
+        fit.save(tmp_path / name)
+        scene = mi.load_file(str(tmp_path / name / 'result.xml'))
+        scanner = scene.sensors()[0]
+        assert isinstance(scanner.geometry, CurvedGeometry)
+        for view in (0, 7):
+            expected = fit.render(fit.geometry.subset([view]))[0]
+            found = np.array(mi.render(scene, sensor=scanner.view(view)))[..., 0]
+            np.testing.assert_allclose(found, expected, atol=2e-6 * expected.max())
 
 
 def test_what_needs_a_flat_panel(data):
