@@ -43,10 +43,17 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(scope='session', autouse=True)
 def variant() -> str:
-    """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
-    from lingo_mi.common.runtime import use_variant
+    """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test.
 
-    return use_variant(VARIANT)
+    Processes side by side share the cores, because threads that wait for each other's cores take a third more time. Commands that
+    tests run have all cores.
+    """
+    from lingo_mi.common.runtime import cores, use_threads, use_variant
+
+    name = use_variant(VARIANT)
+    if name.startswith('llvm'):
+        use_threads(max(1, cores() // int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))))
+    return name
 
 
 @pytest.fixture

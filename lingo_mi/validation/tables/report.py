@@ -76,7 +76,7 @@ CONTROLS = {
     'lingo, loss scale on the densification alone': 'lingo:loss_scale=statistic',
     'lingo, twice the densification threshold': 'lingo:densify_threshold=1e-4',
     'lingo, densities as R2-Gaussian': 'lingo:density=r2',
-    'lingo, densities by least squares': 'lingo:density=lsq',
+    'lingo, densities of the paper': 'lingo:density=paper',
     'r2, rates that fall over the run': 'r2:decay_steps=0',
     'lingo, rates that fall over the run': 'lingo:decay_steps=0',
 }
