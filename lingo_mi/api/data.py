@@ -172,17 +172,18 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
 
 
 def load_raw(
-    frames: str | PathLike, geometry: str | PathLike | Geometry, *, progress: bool = True, **options: Any
+    frames: str | PathLike, geometry: str | PathLike | Geometry | None = None, *, progress: bool = True, **options: Any
 ) -> Scan:
     """Read a scanner's raw frames and turn them into line integrals, one frame at a time.
 
     Parameters
     ----------
     frames : path-like
-        A folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, .npy [n, v, u], or HDF5 as NXtomo or
-        DXchange.
-    geometry : path-like or Geometry
-        Of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml.
+        A folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, DICOM (a file or a folder), .npy
+        [n, v, u], or HDF5 as NXtomo or DXchange.
+    geometry : path-like or Geometry or None
+        Of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml; None: what the frames' own file
+        says, as DICOM does.
     progress : bool
         Whether to show a progress bar on standard error.
     options
@@ -205,7 +206,8 @@ def load_raw(
     >>> scan = lm.load_raw('frames/', 'scanner.yml', flats='flats/', darks='darks/', binning=2)
     """
     require_type('frames', frames, (str, PathLike))
-    require_type('geometry', geometry, (str, PathLike, Geometry))
+    if geometry is not None:
+        require_type('geometry', geometry, (str, PathLike, Geometry))
     known = {field.name for field in dataclasses.fields(Options)}
     for name in options.keys() - known:
         raise InputError(f'load_raw has no option {name!r}{nearest(name, known)}; it has {", ".join(sorted(known))}')

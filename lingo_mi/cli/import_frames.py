@@ -14,6 +14,8 @@ examples:
       NXtomo or DXchange, with its own flats, darks and angles
   lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
       Nikon, with the air level of every view from a region without object
+  lingo-mi import dicom/ --out scan.npy
+      DICOM-CT-PD, which says its geometry; frames of a C-arm need the air level, too
   lingo-mi fit scan.npy"""
 
 
@@ -22,9 +24,14 @@ def parser() -> Parser:
     add = p.add_argument
     add(
         'frames',
-        help='a folder of .tif, .edf, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, .npy [n, v, u], or .h5 / .nxs',
+        help='a folder of .tif, .edf, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, DICOM (a file or a folder), '
+        '.npy [n, v, u], or .h5 / .nxs',
     )
-    add('--geometry', required=True, metavar='F', help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml")
+    add(
+        '--geometry',
+        metavar='F',
+        help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml (default: what the frames' own file says, as of DICOM)",
+    )
     add(
         '--out',
         required=True,
@@ -86,7 +93,7 @@ def main() -> None:
 
     if args.binning < 1:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
-    named = named_files(args.geometry) if Path(args.geometry).suffix.lower() in ('.yml', '.yaml') else []
+    named = named_files(args.geometry) if Path(args.geometry or '').suffix.lower() in ('.yml', '.yaml') else []
     inputs = [args.frames, args.geometry, args.flats, args.darks, args.angles, args.exposure, *named]
     check_scan_output(args.out, inputs, args.force)
     exposure = 1.0
@@ -107,7 +114,7 @@ def main() -> None:
     photons = history.get('photons_from_flats', history['photons_from_views'])
     print(f'{args.out}: {len(scan)} views of {scan.geometry.nDetector[0]} x {scan.geometry.nDetector[1]} pixels')
     print(f'  {history["bad_pixels"]} bad pixels of the panel, {left_out:.2%} of all pixels left out')
-    if 'darks' not in history:
+    if 'darks' not in history and 'corrected_before' not in history:
         print('  no dark frames: counts without beam are taken to be 0')
     source = 'flats' if 'photons_from_flats' in history else 'views'
     print(f'  about {photons:.3g} photons a pixel, from the scatter of the {source}')

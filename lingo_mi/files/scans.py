@@ -107,7 +107,22 @@ _KEYS = {
 
 
 MOST_LISTED = 1000  # poses in a geometry file
-FRAMES = {'.tif', '.tiff', '.edf', '.his', '.hnd', '.hnc', '.xim', '.h5', '.hdf5', '.hdf', '.nxs', '.nx'}  # raw ones
+FRAMES = {
+    '.tif',
+    '.tiff',
+    '.edf',
+    '.his',
+    '.hnd',
+    '.hnc',
+    '.xim',
+    '.h5',
+    '.hdf5',
+    '.hdf',
+    '.nxs',
+    '.nx',
+    '.dcm',
+    '.ima',
+}  # raw
 VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 

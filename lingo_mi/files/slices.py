@@ -173,11 +173,11 @@ def read_tiff(files: list[Path]) -> np.ndarray:
 
 
 def _dicom(folder):
-    pydicom = optional('pydicom')
+    optional('pydicom')  # before files are looked for
     slices = []
     for file in sorted(f for f in folder.iterdir() if f.is_file()):
-        data = _dicom_file(pydicom, file)
-        if data is not None:
+        data = read_dicom_file(file)
+        if data is not None and 'PixelData' in data:
             slices.append((file, data))
     if not slices:
         raise InputError(f'{folder}: holds neither DICOM nor TIFF slices; give the folder that directly holds them')
@@ -195,15 +195,21 @@ def _dicom(folder):
         ) from None
 
 
-def _dicom_file(pydicom, file) -> Any:
-    """A file with pixels, None for others: there are notes and indices in the same folder."""
+def read_dicom_file(file: Path, pixels: bool = True) -> Any:
+    """A DICOM file, without its pixels if they are not asked for; None for a file of another kind.
+
+    Raises
+    ------
+    InputError
+        If it is damaged or deflated, or pydicom is not installed.
+    """
+    pydicom = optional('pydicom')
     try:
         with reading(file):
             # The only syntax that is unpacked whole, whatever it holds, before anything is known of it.
             if pydicom.filereader.read_file_meta_info(file).get('TransferSyntaxUID') == _DEFLATED_DICOM:
                 raise InputError(f'{file}: is a deflated DICOM file, which is not read; export the series uncompressed')
-            data = pydicom.dcmread(file)
-            return data if 'PixelData' in data else None
+            return pydicom.dcmread(file, stop_before_pixels=not pixels)
     except InputError:
         raise
     except pydicom.errors.InvalidDicomError:

@@ -8,9 +8,9 @@ from os import PathLike
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.raw.frames import Frames
 from lingo_mi.raw.line_integrals import Fields, fields
 from lingo_mi.raw.options import Options, region_of
+from lingo_mi.raw.recording import Frames
 
 
 @dataclass(frozen=True)

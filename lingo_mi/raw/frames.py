@@ -1,9 +1,8 @@
-"""Raw frames, read one at a time: a TIFF stack, a folder of images (TIFF, EDF, those that RTK reads), a .npy, or HDF5."""
+"""Files and folders of raw frames: TIFF, EDF, those that RTK reads, .npy and HDF5 here, others in a file of their own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 
@@ -12,75 +11,11 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
+from lingo_mi.raw import dicom
+from lingo_mi.raw.recording import Frames, Recording, checked
 from lingo_mi.storage.file_access import one_line, optional, reading
 
-RTK = '.his', '.hnd', '.hnc', '.xim'  # of Elekta's and Varian's scanners, one frame a file
-IMAGES = {'.tif': 'tifffile', '.tiff': 'tifffile', '.edf': 'fabio'} | dict.fromkeys(RTK, 'itk')
 LINKED = 4  # groups below the root in which frames are looked for: entry, subentry, instrument, detector
-HDF5 = ('.h5', '.hdf5', '.hdf', '.nxs', '.nx')
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Images of one panel.
-
-    Parameters
-    ----------
-    where : str
-        File or folder, for messages.
-    count : int
-        How many.
-    shape : tuple[int, int]
-        Pixels (v, u).
-    dtype : np.dtype
-        Of the counts as they are stored.
-    read : callable
-        read(i) -> [v, u], frame i, as it is stored.
-    """
-
-    where: str
-    count: int
-    shape: tuple[int, int]
-    dtype: np.dtype
-    read: Callable[[int], np.ndarray]
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, i: int) -> np.ndarray:
-        """Frame i, float64 [v, u]. Raises InputError if it cannot be read, is of another size or holds no real numbers."""
-        try:
-            with reading(self.where, Path(self.where).is_dir()):
-                frame = np.asarray(self.read(i))
-        except InputError:
-            raise
-        except Exception as error:  # damaged files fail inside the readers in many ways
-            raise InputError(
-                f'{self.where}: frame {i} cannot be read ({one_line(error)[:120]}); copy it again'
-            ) from None
-        if frame.shape != self.shape:
-            raise InputError(
-                f'{self.where}: frame {i} has the shape {frame.shape}, but the first one has {self.shape}; all frames need '
-                'one panel'
-            )
-        if frame.dtype.kind not in 'uif':
-            raise InputError(f'{self.where}: frame {i} holds {frame.dtype} values; counts are needed')
-        return frame.astype(np.float64)
-
-    def subset(self, index: Sequence[int] | np.ndarray) -> Frames:
-        """The frames `index` only."""
-        index = [int(i) for i in index]
-        return Frames(self.where, len(index), self.shape, self.dtype, lambda i: self.read(index[i]))
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What one file or folder holds: the views, and what else it may say. `angles` [n] in degrees."""
-
-    views: Frames
-    flats: Frames | None = None
-    darks: Frames | None = None
-    angles: np.ndarray | None = None
 
 
 def open_recording(path: PathLike | str) -> Recording:
@@ -89,8 +24,8 @@ def open_recording(path: PathLike | str) -> Recording:
     Parameters
     ----------
     path : path-like
-        A folder of .tif, .tiff, .edf, .his, .hnd, .hnc or .xim images, in the order of the numbers in their names; a multi-page
-        .tif; a multi-frame .edf; .npy [n, v, u]; HDF5 as NXtomo (image_key) or DXchange (/exchange/data).
+        A folder of images of one kind of IMAGES, in the order of the numbers in their names, or of DICOM files; or a file of one
+        kind of FILES: .npy [n, v, u], HDF5 as NXtomo (image_key) or DXchange (/exchange/data), a scanner's own.
 
     Raises
     ------
@@ -100,27 +35,29 @@ def open_recording(path: PathLike | str) -> Recording:
     path = Path(path)
     suffix = path.suffix.lower()
     if path.is_dir():
-        return Recording(_folder(path))
+        return _folder(path)
     with reading(path):
         open(path, 'rb').close()
-    if suffix == '.npy':
-        return Recording(_array(path))
-    if suffix in HDF5:
-        return _checked(path, lambda: _hdf5(path))
-    if suffix in RTK:
-        raise InputError(f'{path}: is one frame; give the folder of the frames')
+    if suffix in FILES:
+        return checked(path, lambda: FILES[suffix](path))
+    if dicom.is_dicom(path):
+        return checked(path, lambda: dicom.open_file(path))
     if suffix in IMAGES:
-        return Recording(_image_stack(path))
+        raise InputError(f'{path}: is one frame; give the folder of the frames')
     raise InputError(
-        f'{path}: is not a known file of frames; give a folder of TIFF or EDF, .tif, .edf, .npy or HDF5 (.h5, .nxs)'
+        f'{path}: is not a known file of frames; give a folder of images or of DICOM files, or one of {", ".join(FILES)}'
     )
 
 
 def _folder(path):
-    files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGES), key=by_number)
+    with reading(path, folder=True):
+        inside = list(path.iterdir())
+    files = sorted((f for f in inside if f.suffix.lower() in IMAGES), key=by_number)
     if not files:
-        raise InputError(f'{path}: holds no {", ".join(IMAGES)} images; give the folder of the frames')
-    first = _checked(path, lambda: _image(files[0]))
+        if series := [f for f in inside if dicom.is_dicom(f)]:
+            return checked(path, lambda: dicom.open_dicom(path, series))
+        raise InputError(f'{path}: holds no {", ".join(IMAGES)} images nor DICOM files; give the folder of the frames')
+    first = checked(path, lambda: _image(files[0]))
 
     def read(i):
         image = _image(files[i])
@@ -130,35 +67,36 @@ def _folder(path):
             )
         return image
 
-    return Frames(str(path), len(files), first.shape, first.dtype, read)
+    return Recording(Frames(str(path), len(files), first.shape, first.dtype, read))
 
 
 def _image(path):
-    package = IMAGES[path.suffix.lower()]
-    if package == 'itk':
-        itk = optional('itk', 'reference')
-        if not hasattr(itk, 'RTK'):  # to ask for it loads it, and it tells ITK of its formats
-            raise InputError(f"{path}: needs RTK: pip install '.[reference]' in a checkout of lingo_mi")
-        image = np.asarray(itk.imread(str(path)))
-    elif package == 'fabio':
-        with optional('fabio').open(str(path)) as file:
-            image = _whole(path, file)
-    else:
-        image = read_tiff_file(path)
+    image = IMAGES[path.suffix.lower()](path)
     if image.ndim != 2 or image.size == 0:
         raise InputError(f'{path}: is damaged, or no image of one channel (its shape is {image.shape}); copy it again')
     return image
 
 
-def _image_stack(path):
-    count, frame = _checked(path, lambda: (_edf if path.suffix.lower() == '.edf' else _tiff)(path))
-    first = _checked(path, lambda: frame(0))
-    return Frames(str(path), count, first.shape, first.dtype, frame)
+def _rtk_image(path):
+    itk = optional('itk', 'reference')
+    if not hasattr(itk, 'RTK'):  # to ask for it loads it, and it tells ITK of its formats
+        raise InputError(f"{path}: needs RTK: pip install '.[reference]' in a checkout of lingo_mi")
+    return np.asarray(itk.imread(str(path)))
+
+
+def _edf_image(path):
+    with optional('fabio').open(str(path)) as file:
+        return _whole(path, file)
+
+
+def _stack(path, count, frame):
+    first = frame(0)
+    return Recording(Frames(str(path), count, first.shape, first.dtype, frame))
 
 
 def _edf(path):
     file = optional('fabio').open(str(path))
-    return file.nframes, lambda i: _whole(path, file.get_frame(i))
+    return _stack(path, file.nframes, lambda i: _whole(path, file.get_frame(i)))
 
 
 def _whole(path, frame):
@@ -175,8 +113,8 @@ def _tiff(path):
     whole = file.series[0]
     if len(file.pages) == 1 and whole.ndim == 3 and whole.axes.endswith('YX'):  # as ImageJ writes more than 4 GB
         stack = tifffile.memmap(path, mode='r')
-        return len(stack), lambda i: stack[i]
-    return len(file.pages), lambda i: file.pages[i].asarray()
+        return _stack(path, len(stack), lambda i: stack[i])
+    return _stack(path, len(file.pages), lambda i: file.pages[i].asarray())
 
 
 def _array(path):
@@ -188,18 +126,7 @@ def _array(path):
     if not isinstance(stack, np.ndarray) or stack.ndim != 3:
         raise InputError(f'{path}: is not an array [n, v, u]; write the frames with numpy.save')
     arrays.numeric(stack[:1], path, 3, finite=False)
-    return Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i])
-
-
-def _checked(path, read):
-    """What `read` gives, with an InputError for whatever a damaged file does."""
-    try:
-        with reading(path, Path(path).is_dir()):
-            return read()
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f'{path}: is damaged or of another kind ({one_line(error)[:120]}); copy it again') from None
+    return Recording(Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i]))
 
 
 # ---- HDF5 --------------------------------------------------------------------------------------------------
@@ -284,3 +211,18 @@ def _nxtomo(file):
 def _unit(data):
     unit = np.ravel(data.attrs.get('units', 'degree'))[0]  # also of an array of one
     return (unit.decode() if isinstance(unit, bytes) else str(unit)).lower()
+
+
+# Readers by suffix: of one image of a folder, and of a file that holds a whole recording.
+IMAGES: dict[str, Callable[[Path], np.ndarray]] = {
+    **dict.fromkeys(('.tif', '.tiff'), read_tiff_file),
+    '.edf': _edf_image,
+    **dict.fromkeys(('.his', '.hnd', '.hnc', '.xim'), _rtk_image),  # Elekta's and Varian's
+}
+FILES: dict[str, Callable[[Path], Recording]] = {
+    '.npy': _array,
+    **dict.fromkeys(('.tif', '.tiff'), _tiff),
+    '.edf': _edf,
+    **dict.fromkeys(dicom.SUFFIXES, dicom.open_file),
+    **dict.fromkeys(('.h5', '.hdf5', '.hdf', '.nxs', '.nx'), _hdf5),
+}

@@ -26,7 +26,7 @@ CLIPPED = 1e-3  # part of a view's pixels with the same highest count
 
 
 def import_raw(
-    path: PathLike | str, geometry: PathLike | str | Geometry, options: Options, progress: bool = True
+    path: PathLike | str, geometry: PathLike | str | Geometry | None, options: Options, progress: bool = True
 ) -> tuple[Scan, dict[str, Any]]:
     """The scan, and its history: plain values by name, for the scan's file.
 
@@ -34,9 +34,10 @@ def import_raw(
     ----------
     path : path-like
         What `lingo_mi.raw.frames.open_recording` opens.
-    geometry : path-like or Geometry
-        Of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, Nikon's .xtekct, or RTK's .xml. In a .yml nDetector may
-        be left out, and nVoxel and dVoxel: the voxels are then as large as a pixel on the axis.
+    geometry : path-like or Geometry or None
+        Of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, a scanner's own file (`frame_geometry.SCANNER_FILES`),
+        or RTK's .xml; None: what the frames' own file says. In a .yml nDetector may be left out, and nVoxel and dVoxel: the
+        voxels are then as large as a pixel on the axis.
 
     Raises
     ------
@@ -45,13 +46,15 @@ def import_raw(
         field, and where most pixels are left out.
     """
     recording = open_recording(path)
+    if recording.transmission and (options.flats is not None or options.darks is not None):
+        raise InputError(f'{path}: its frames are corrected already: leave out flats and darks')
     views, n = recording.views, len(recording.views)
     flats = recording.flats if options.flats is None else open_recording(options.flats).views
     darks = recording.darks if options.darks is None else open_recording(options.darks).views
-    given, white, steps = geometry_of(geometry, options, recording.angles, views)
+    given, white, steps = geometry_of(geometry, options, recording)
     v0, v1, u0, u1 = crop = region_of('crop', options.crop, views.shape) or (0, views.shape[0], 0, views.shape[1])
     chosen, exposure = chosen_views(options.views, n), exposures(options.exposure, n)
-    beam = Beam.of(path, options, views, flats, darks, white)
+    beam = Beam.of(path, options, views, flats, darks, 1.0 if recording.transmission else white)
 
     (nv, nu), (down, across) = views.shape, steps
     rows, columns = (v0, v1) if down > 0 else (nv - v1, nv - v0), (u0, u1) if across > 0 else (nu - u1, nu - u0)
@@ -89,9 +92,10 @@ def import_raw(
     scan, photons = Scan(out, p, valid), beam.panel.photons
     history: dict[str, Any] = dict(
         frames=str(path),
-        geometry=str(geometry) if not isinstance(geometry, Geometry) else 'given in Python',
+        geometry='given in Python' if isinstance(geometry, Geometry) else str(geometry or path),
         flats=None if flats is None else f'{flats.where} ({len(flats)})',
         darks=None if darks is None else f'{darks.where} ({len(darks)})',
+        corrected_before=recording.transmission or None,
         views=[int(chosen[0]), int(chosen[-1]) + 1, int(chosen[1] - chosen[0]) if len(chosen) > 1 else 1],
         crop=list(crop),
         binning=list(bins),

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.raw.frames import Frames
+from lingo_mi.raw.recording import Frames
 
 DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
 DIFFERENCE = (1, -4, 6, -4, 1)

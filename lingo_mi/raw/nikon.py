@@ -7,20 +7,24 @@ import re
 import warnings
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry.limits import MOST_VIEWS
+from lingo_mi.raw.recording import Taken
 from lingo_mi.storage.file_access import one_line, reading
 
 
-def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
-    """A circular scan in the names of `lingo_mi.files.scanner_dict` (mm, angles in degrees), and the white level in counts.
+def read_xtekct(path: PathLike | str) -> Taken:
+    """The circular scan that it describes, and the white level in counts.
 
-    Seen from the source, Nikon's columns run to the left: `frame[:, ::-1]` goes with these numbers. CentreOfRotationTop and
-    -Bottom, mm on the panel, become COR. Raises InputError where the file is missing or damaged, or lacks a number.
+    Seen from the source, Nikon's columns run to the left. CentreOfRotationTop and -Bottom, mm on the panel, become COR.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or lacks a number.
     """
     path = Path(path)
     parser = configparser.ConfigParser(strict=False, interpolation=None)
@@ -67,7 +71,7 @@ def read_xtekct(path: PathLike | str) -> tuple[dict[str, Any], float]:
     )
     if top + bottom:
         values['COR'] = (top + bottom) / 2 * DSO / DSD
-    return values, number('WhiteLevel', 0)
+    return Taken(values, columns=-1, white=number('WhiteLevel', 0) or None)
 
 
 def read_numbers(path: PathLike | str) -> np.ndarray:

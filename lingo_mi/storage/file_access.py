@@ -356,5 +356,5 @@ def optional(module: str, extra: str = 'formats') -> Any:
         return importlib.import_module(module)
     except ImportError:
         raise InputError(
-            f"this format needs the package {module}: pip install '.[{extra}]' in a checkout of lingo_mi"
+            f"this format needs the package {module.partition('.')[0]}: pip install '.[{extra}]' in a checkout of lingo_mi"
         ) from None

@@ -596,4 +596,4 @@ def test_frames_in_a_file_that_is_not_there(tmp_path, place):
 
 def test_kinds_of_frames_that_a_scan_is_not():
     """`read_scan`, in a package below, names `import` for what this one opens."""
-    assert scans.FRAMES == {*frames.IMAGES, *frames.HDF5}
+    assert scans.FRAMES == {*frames.IMAGES, *frames.FILES} - {'.npy'}

@@ -63,7 +63,7 @@ def test_binning_that_leaves_columns_over(tmp_path, xtekct):
 def test_centre_of_rotation(xtekct):
     """Millimetres on the panel become millimetres at the object."""
     xtekct.write_text(TEXT.format(top=1.12))
-    assert read_xtekct(xtekct)[0]['COR'] == pytest.approx(0.076)
+    assert read_xtekct(xtekct).scanner['COR'] == pytest.approx(0.076)
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,9 @@ def test_angles(tmp_path):
 
 @pytest.mark.skipif('LINGO_MI_DATA' not in os.environ, reason='needs LINGO_MI_DATA')
 def test_a_scanners_own_file():
-    values, white = read_xtekct(Path(os.environ['LINGO_MI_DATA']) / 'nikon' / 'radiogram.xtekct')
-    assert white == 60000 and len(values['angles']) == 3142 and values['nDetector'] == [2000, 1500]
+    found = read_xtekct(Path(os.environ['LINGO_MI_DATA']) / 'nikon' / 'radiogram.xtekct')
+    values = found.scanner
+    assert found.white == 60000 and len(values['angles']) == 3142 and values['nDetector'] == [2000, 1500]
     assert values['angles'][-1] - values['angles'][0] == pytest.approx(360, abs=0.2)
 
 
