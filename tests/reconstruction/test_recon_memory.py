@@ -80,7 +80,7 @@ def taken(algorithm, *sizes):
 @pytest.mark.parametrize('algorithm', NEEDS)
 def test_peak_memory_of_small_scans(algorithm):
     """What `reconstruct.py` goes by. Small ones take up to twice that share, since Dr.Jit keeps some of what is freed."""
-    assert 0.7 < taken(algorithm, 192, 288, 48)[0] < 2
+    assert 0.7 < taken(algorithm, 192, 288, 12)[0] < 2
 
 
 @pytest.mark.thorough
