@@ -6,18 +6,21 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.fitting.methods.cloud_method import CloudMethod
-from lingo_mi.geometry.base import Geometry
+from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import spread
 from lingo_mi.reconstruction.arcs import gaps
 from lingo_mi.reconstruction.line_integrals import corrected
-from lingo_mi.reconstruction.preconditions import require_circle, require_pixels
+from lingo_mi.reconstruction.preconditions import require_pixels
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 from lingo_mi.scene.description import MOST_VIEWS
+
+SAME = 1e-9  # share of the scanner's size by which a view may be off one that is turned about z
 
 
 def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
@@ -68,14 +71,43 @@ def as_corrected(scan: Scan, fit: Fit) -> Scan:
     return replace(scan, geometry=fit.geometry.on(g.grid))
 
 
+def turns(geometry: Geometry) -> np.ndarray:
+    """Angles of the source on its circle about z, radians [view]."""
+    if isinstance(geometry, CircularGeometry):
+        return geometry.angles
+    source = geometry.rays(curved=True).source
+    return np.arctan2(source[:, 1], source[:, 0])
+
+
+def at_turns(geometry: Geometry, angles: np.ndarray) -> Geometry:
+    """The same scanner at other angles of its circle about z, radians.
+
+    Raises
+    ------
+    InputError
+        For a scan whose views are not one view turned about z.
+    """
+    if isinstance(geometry, CircularGeometry):
+        return replace(geometry, angles=angles)
+    rays, own = geometry.rays(curved=True), turns(geometry)
+
+    def turned(to):
+        first = rays[np.zeros(len(to), int)]
+        return first.moved(Rotation.from_rotvec(np.outer(to - own[0], [0, 0, 1])).as_matrix())
+
+    if np.abs(turned(own).vectors - rays.vectors).max() > SAME * np.abs(rays.vectors).max():
+        raise InputError('the completion of a scan needs a source on a circle about z; this scan has other poses')
+    return Geometry.from_poses(turned(angles), geometry.nDetector, grid=geometry.grid)
+
+
 def missing_angles(geometry: Geometry, views: int) -> np.ndarray:
     """Angles (radians) of the views to add to a geometry's, so that `views` in all are spread as evenly as the given ones allow.
 
     The widest gap is divided first, until there are enough views. An open arc is not extended, unless one more gap makes it half
     a turn or more: then its last view is taken to be left out, as in half a turn of evenly spaced views.
     """
-    angles = geometry.angles
-    order, gap, is_open = gaps(geometry, 2 * np.pi)
+    angles = turns(geometry)
+    order, gap, is_open = gaps(angles, 2 * np.pi)
     if is_open and gap.sum() < np.pi - 1e-3:
         order, gap = order[:-1], gap[:-1]
     parts = np.ones(len(gap), int)
@@ -104,7 +136,7 @@ def complete_views(scan: Scan, fit: Fit, views: int) -> Scan:
     InputError
         For fewer views than were measured, for more than a scan may have, and for a scan that is not a circle about z.
     """
-    require_circle(scan, 'the completion of a scan')
+    at_turns(scan.geometry, np.zeros(1))  # fails early
     if views > MOST_VIEWS:
         raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
     check_memory(scan.geometry.on(scan.geometry.grid.slab(0, 1)), views=views)  # of the views: no volume is made here
@@ -124,7 +156,7 @@ def insert_views(
     Raises
     ------
     InputError
-        For fewer views than are given, and for invalid pixels.
+        For fewer views than are given, and for invalid pixels, and for a scan that is not a circle about z.
     """
     require_pixels(scan, 'the completion of a scan')
     geometry = circle or scan.geometry
@@ -132,5 +164,5 @@ def insert_views(
         raise InputError(f'{views} views were asked for, but {len(scan)} are measured: ask for more')
     if views == len(scan):
         return scan
-    rendered = replace(geometry, angles=missing_angles(geometry, views))
+    rendered = at_turns(geometry, missing_angles(geometry, views))
     return Scan(scan.geometry.joined(rendered), np.concatenate([scan.projections, render(rendered)]))

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.geometry.base import Geometry
-
 MISSING = np.radians(20)  # beyond a typical gap
 
 
-def gaps(geometry: Geometry, turn: float) -> tuple[np.ndarray, np.ndarray, bool]:
+def gaps(angles: np.ndarray, turn: float) -> tuple[np.ndarray, np.ndarray, bool]:
     """The order of the views around the circle, the gap after each in that order, and whether the arc is open.
 
     Angles are taken modulo `turn`, radians. An open arc begins with the first view; the views at its ends represent a typical
     gap. It lacks `MISSING` or more; a circle of which a view or two are left out is closed.
     """
-    angle = np.mod(geometry.angles, turn)
+    angle = np.mod(angles, turn)
     order = np.argsort(angle, kind='stable')
     gap = np.diff(angle[order], append=angle[order[0]] + turn)
     distinct = np.sort(gap[gap > 1e-6])

@@ -99,7 +99,7 @@ def view_weights(geometry: Geometry) -> np.ndarray:
     _, first, repeats, counts = np.unique(steps, return_index=True, return_inverse=True, return_counts=True)
     if len(first) == 1:
         return np.full(n, np.pi / n)
-    order, gap, _ = gaps(geometry.subset(first), turn)
+    order, gap, _ = gaps(geometry.angles[first], turn)
     weight = np.empty(len(first))
     weight[order] = (gap + np.roll(gap, 1)) / 2
     return (weight / counts)[repeats] * min(1.0, np.pi / gap.sum())
@@ -127,7 +127,7 @@ def ray_weights(geometry: CircularGeometry) -> np.ndarray:
         return 1 + np.sin(np.pi / 2 * np.clip(np.sign(offset) * fan / overlap, -1, 1))[None]
     if not cone or len(geometry) == 1:
         return np.ones((1, n_u))
-    order, gap, is_open = gaps(geometry, 2 * np.pi)
+    order, gap, is_open = gaps(geometry.angles, 2 * np.pi)
     excess = (gap.sum() - np.pi) / 2
     if not is_open or excess <= np.abs(fan).max():
         return np.ones((1, n_u))
@@ -140,7 +140,7 @@ def ray_weights(geometry: CircularGeometry) -> np.ndarray:
 
 def _lacking(geometry: CircularGeometry) -> int:
     """Columns missing on a panel's shorter side. Only on a closed circle, where opposite views measure those rays."""
-    if len(geometry) == 1 or gaps(geometry, 2 * np.pi)[2]:
+    if len(geometry) == 1 or gaps(geometry.angles, 2 * np.pi)[2]:
         return 0
     return round(2 * abs(geometry.offDetector[1]) / geometry.dDetector[1])
 

@@ -107,7 +107,7 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
             f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in '
             'its plane too far'
         )
-    if len(geometry) > 1 and not gaps(geometry, 2 * np.pi)[2]:
+    if len(geometry) > 1 and not gaps(geometry.angles, 2 * np.pi)[2]:
         if inner_right > -left:
             left = inner_left
         elif -inner_left > right:

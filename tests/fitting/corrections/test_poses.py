@@ -32,12 +32,13 @@ def misaligned(g, seed=5, degrees=0.5, mm=1.0):
     return Geometry.from_poses(frames, g.nDetector, nVoxel=g.grid.shape, dVoxel=g.grid.spacing), turn, shift
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', ['cone', 'parallel', 'curved'])
 def test_derivatives_by_differences(mode):
     """Of the loss by the six numbers of a view's motion, at a view that has been moved."""
-    g = geometry(3, mode=mode)
+    flat = geometry(3, mode=mode.replace('curved', 'cone'))
+    g = flat.curved(300.0) if mode == 'curved' else flat
     # Smooth, for differences: nothing is cut off, and the measured views are above the rendered ones everywhere (L1).
-    stepper = MOVING.changed(extent=7).stepper(Scan(g, tiny_scan(g).projections + 50))
+    stepper = MOVING.changed(extent=7).stepper(Scan(g, tiny_scan(flat).projections + 50))
     [correction] = stepper.corrections
     moved = correction.poses
     points = some_points(g, 40)
