@@ -16,7 +16,7 @@ from lingo_mi.storage.folder_lock import locked
 if TYPE_CHECKING:
     from lingo_mi.validation.tables.cells import Scale
 
-ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer', 'best'
+ALGORITHMS = 'fdk', 'sart', 'asd-pocs', 'refined', 'voxelize', 'finer', 'best', 'sart-r2', 'asd-pocs-r2'
 PUBLISHED = '3dgs', 'xgaussian', 'r2', 'lingo'  # the columns of the paper
 
 
@@ -49,9 +49,10 @@ def table_arguments(parser: argparse.ArgumentParser) -> None:
         '--algorithms',
         nargs='+',
         choices=ALGORITHMS,
-        default=list(ALGORITHMS[:-2]),
+        default=list(ALGORITHMS[:5]),
         metavar='A',
-        help=f'rows of ct, of {", ".join(ALGORITHMS)} (default: all but the last two)',
+        help=f'rows of ct, of {", ".join(ALGORITHMS)} (default: the first five); the last two have the options that '
+        'R2-Gaussian has released',
     )
     parser.add_argument(
         '--seeds',

@@ -48,13 +48,17 @@ from lingo_mi.validation.tables.photons import LARGEST, counting, noisy
 from lingo_mi.validation.tables.record import Record
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
+R2_ERROR = 0.15  # of asd-pocs-r2: the error of its views at which least total variation goes first, over their norm
 NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d_r2', 'ipsd'), ('psnr_3d_r2', 'ssim_3d_r2')  # of a fit's views; of a volume
 
-# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults).
+# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults, and in
+# sart-r2 and asd-pocs-r2 what R2-Gaussian has released).
 ALGORITHMS = {
     'fdk': FDK(),
     'sart': SART(niter=20),
     'asd-pocs': ASDPOCS(niter=10),
+    'sart-r2': SART(niter=20, lmbda_red=0.999),
+    'asd-pocs-r2': ASDPOCS(niter=10, lmbda_red=0.9999, rmax=0.94),
     'refined': Refined(),
     'finer': Refined(finer=2, completed_niter=0, niter=4),
     'best': Best(),
@@ -357,6 +361,8 @@ class Cells:
         if isinstance(algorithm, Refined):
             inputs = dict(completed=views, sample=self._cloud(cell.fit).volume)
             views = dataset.train
+        if cell.algorithm == 'asd-pocs-r2':
+            algorithm = replace(algorithm, maxl2err=R2_ERROR * float(np.linalg.norm(views.projections)))
         with progress_bar(algorithm, views, label) as progress:
             found = run_algorithm(views, algorithm, progress=progress, **inputs)
         return dict(
