@@ -35,37 +35,39 @@ def calibrate(
     scatter: bool = False,
     progress: bool = True,
 ) -> Calibration:
-    """Find where the panel really is: its shift along u, as of an axis of rotation off centre; its turn in its own plane; and its
-    drift over the scan. If asked for, also what the detector makes of line integrals.
+    """Find where the panel really is: its shift along u, its turn in its own plane, and its drift over the scan.
 
-    Views are predicted from quick reconstructions of other views, on few voxels, and are to agree with them (see
-    `lingo_mi.calibration.search`). Takes some 30 such reconstructions, and 6 for each further number. A constant shift along v
-    can hardly be told from an object that lies higher, and is not sought. A beam that drifts looks like a panel that moves: where
-    an edge of the panel shows air in all views, its level is taken out of each view first.
+    An axis of rotation off centre is a shift along u. On request, the response of the detector to line integrals is found, too.
+
+    Quick reconstructions on few voxels predict the views, and the search looks for the panel with which predicted and measured
+    views agree best (`lingo_mi.calibration.search`). It takes some 30 such reconstructions, and 6 for each further number. It
+    does not look for a constant shift along v, which is hard to distinguish from an object that lies higher. A beam that drifts
+    looks like a panel that moves. If an edge of the panel shows air in all views, the level of air is therefore subtracted from
+    each view first.
 
     Parameters
     ----------
     scan : Scan or Dataset
-        At least 8 views, in the order in which they were taken; of a `Dataset` its `train`.
+        At least 8 views, in the order in which they were taken. A `Dataset` gives its `train`.
     drift : int
-        Degree of a polynomial in time for the shifts along u and v; 0: the panel does not drift.
+        Degree of a polynomial in time for the shifts along u and v. With 0 the panel does not drift.
     air : bool
-        Whether to seek an air level, a cubic polynomial in time, instead of reading it beside the object.
+        Whether to fit an air level, a cubic polynomial in time, instead of reading it beside the object.
     gain : bool
-        Whether to seek a gain of the views, likewise, about 1.
+        Whether to fit a gain of the views, also a cubic polynomial in time, near 1.
     curve : int
-        Coefficients, 0 to 3, of the curve from line integral to measured value, as of beam hardening.
+        Number of coefficients, 0 to 3, of the curve from line integral to measured value. Beam hardening makes such a curve.
     scatter : bool
-        Whether to seek scattered light, the same smooth image in all views.
+        Whether to fit scattered light, the same smooth image in all views.
     progress : bool
         Whether to show a progress bar on standard error.
 
     Returns
     -------
     Calibration
-        A `Calibration`: `lines()` says what was found and how surely, `corrected(data)` is the scan with it. What is less than
-        three standard errors from zero is left as it was, as is scattered light that would be negative in places. Warns where the
-        views contradict their angles or their order: what is found then means nothing.
+        `lines()` lists the results with their standard errors, and `corrected(data)` is the corrected scan. A number within three
+        standard errors of zero is not corrected, and neither is scattered light that would be negative in places. A warning says
+        if the views contradict their angles or their order, because the results are then meaningless.
 
     Raises
     ------

@@ -50,16 +50,16 @@ def simulate(
         A Mitsuba scene with a `ct_scanner` (its path, or the name of a shipped one, such as 'x3d_foot'), a `phantom`, or a volume
         [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`).
     geometry : Geometry or None
-        For a phantom or a volume: the scanner. A volume must have `geometry.grid.shape` voxels. Without it, a phantom is scanned
-        as in X3D: a cone beam, `views` views over half a turn (50), as many random ones held out. On a grid other than its own, a
-        phantom is its voxels.
+        The scanner of a phantom or a volume. A volume must have `geometry.grid.shape` voxels. Without a geometry, a phantom is
+        scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. A phantom
+        on another grid than its own is scanned as voxels, not as a formula.
     views : int or None
-        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out` has
-        views of its own for that. Of a phantom without a geometry: how many to scan.
+        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
+        provides held-out views. For a phantom without a geometry: how many views to scan.
     held_out : Geometry or None
-        With `geometry`: further views, to measure new views on.
+        Further views of `geometry`, to measure the quality of new views.
     seed : int
-        Of random angles and of the noise of a scene's detector.
+        Seed of random angles and of the noise of a scene's detector.
     parameters : dict or None
         Values for the `<default>` names of a scene file.
     progress : bool
@@ -68,8 +68,8 @@ def simulate(
     Returns
     -------
     Dataset
-        A `Dataset`: `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm; `volume` [x, y, z] is
-        the true density, where it is known.
+        `train` and `test` (or None) are `Scan`s of projections [view, v, u], density times mm. `volume` [x, y, z] is the true
+        density, if it is known.
 
     Raises
     ------
@@ -141,15 +141,14 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
         A pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images, `scan.npy` [view,
         v, u] with `scan.yml` beside it, or the .npz of a public scan.
     geometry : path-like or None
-        The geometry file of an .npy, where it is another than that of the same stem.
+        The geometry file of an .npy (default: the .yml of the same name).
     views : int or None
-        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has views of its own
-        for that.
+        How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has held-out views.
 
     Returns
     -------
     Dataset
-        A `Dataset` of line integrals ln(I0 / I) [view, v, u].
+        Line integrals ln(I0 / I) [view, v, u].
 
     Raises
     ------
@@ -182,8 +181,8 @@ def load_raw(
         A folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, DICOM (a file or a folder), .npy
         [n, v, u], or HDF5 as NXtomo or DXchange.
     geometry : path-like or Geometry or None
-        Of the whole frames: a `Geometry`, a geometry file .yml, Nikon's .xtekct, or RTK's .xml; None: what the frames' own file
-        says, as DICOM does.
+        The geometry of whole frames: a `Geometry`, a .yml, Nikon's .xtekct, or RTK's .xml. None takes it from the file of the
+        frames, such as DICOM.
     progress : bool
         Whether to show a progress bar on standard error.
     options
@@ -194,12 +193,12 @@ def load_raw(
     Returns
     -------
     Scan
-        A `Scan` whose `valid` leaves out dead, hot and saturated pixels and those without counts.
+        Its mask `valid` excludes dead, hot and saturated pixels and those without counts.
 
     Raises
     ------
     InputError
-        If something is missing, contradictory or damaged; warns of black views, and of views brighter than the flats.
+        If something is missing, contradictory or damaged. Black views, and views brighter than the flats, cause a warning.
 
     Examples
     --------
@@ -224,11 +223,11 @@ def phantom(name: str, size: int = 256, seed: int = 0, *, attenuation: str = 'x3
     size : int
         Voxels a side, 8 to 512.
     seed : int
-        Of textures, vessels and random Gaussians.
+        Seed of textures, vessels and random Gaussians.
     attenuation : str
-        'x3d': densities from 0 to 1, as the published tables of X3D and R2-Gaussian have them, and line integrals that no scanner
-        measures. 'real': these times 0.0618 per mm, dense cortical bone at 60 keV. One factor for all makes bone right, and soft
-        tissue of the foot and the head lighter than water.
+        'x3d': densities from 0 to 1, as in the published tables of X3D and R2-Gaussian. No scanner measures line integrals as
+        large as theirs. 'real': these densities times 0.0618 per mm, dense cortical bone at 60 keV. Soft tissue of the foot and
+        the head is then lighter than water, because the factor is right for bone.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a reconstruction or a fit will cost, before it is begun."""
+"""Memory and time of a reconstruction or a fit, before it begins."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ LEAST_STEPS = 3  # of a trial: the first compiles kernels, and does not count
 
 @dataclass(frozen=True)
 class Estimate:
-    """What work will take.
+    """Memory and time of a reconstruction or a fit.
 
     Attributes
     ----------
     memory : float
-        Peak memory, bytes: that by which the work is refused. Of a fit, the least that it may be.
+        Peak memory, bytes. The work is refused if it needs more than `room`. For a fit, this is a lower bound.
     room : float
-        Bytes that this process may take; of a GPU, where one is used.
+        Bytes that this process may take, on the GPU if one is used.
     seconds : tuple of float or None
-        Least and most time; None if it was not tried.
+        Least and most time. None without a trial.
     """
 
     memory: float
@@ -60,32 +60,31 @@ class Estimate:
 def estimate(
     scan: Scan | Dataset | Geometry, work: Algorithm | Method | str, *, trial: float | None = None
 ) -> Estimate:
-    """Estimate the memory and the time of `lm.reconstruct(scan, work)` or `lm.fit(scan, work)`, which is not done.
+    """Estimate the memory and the time of `lm.reconstruct(scan, work)` or `lm.fit(scan, work)` without doing the work.
 
     Parameters
     ----------
     scan : Scan, Dataset or Geometry
-        Of a `Dataset` its `train`. A geometry suffices for the memory.
+        A `Dataset` gives its `train`. A geometry suffices for the memory.
     work : Algorithm, Method or str
         An algorithm such as `lm.SART()`, a method such as `lm.Fast()`, or a method's name, as `lm.fit` takes it.
     trial : float, optional
-        Seconds. The work is begun, stopped after about so long, but not before its third step, and thrown away; its pace on this
-        machine gives the time. Without a trial the time is unknown, for it differs between machines by a factor of a hundred.
+        Seconds for which the work runs on trial, but at least three steps. Its pace gives the time, and its result is discarded.
+        Without a trial the time is unknown, because it differs between machines by a factor of a hundred.
 
     Returns
     -------
     Estimate
-        `memory` is what `lm.reconstruct` and `lm.fit`, and the commands, refuse by. `seconds` is a range: steps of one kind may
-        take 0.7 to 1.5 times what those tried did, and steps whose work changes (fits, in which Gaussians are added and which
-        may stop early, `Best` and `PenalisedLeastSquares`) 0.3 to 4 times. A trial waits for the device after every step, so
-        that steps of a few milliseconds, as in `FDK` of small scans, look slower than they are. Work that ends within the trial
-        gives the time itself.
+        `lm.reconstruct`, `lm.fit` and the commands refuse work by the same `memory`. `seconds` is a range, because later steps
+        may take 0.7 to 1.5 times as long as the tried ones. In fits, `Best` and `PenalisedLeastSquares`, whose steps change, the
+        factor is 0.3 to 4. A trial waits for the device after every step, so steps of a few milliseconds look slower than they
+        are. Work that ends within the trial gives its exact time.
 
     Raises
     ------
     InputError
-        For other types, a trial that is not positive, needs a scan, or does not fit into memory, one of `Refined`, which starts
-        from a fit, and as the work does.
+        For other types; for a trial that is not positive, lacks a scan, exceeds the memory, or is of `Refined`, which starts from
+        a fit; and for all errors of the work.
 
     Examples
     --------
@@ -127,7 +126,7 @@ def _check_trial(scan: Scan | Geometry, work: Algorithm | Method, trial: Any, fo
 
 
 class _Enough(Exception):
-    """Ends a trial."""
+    """Raised to end a trial."""
 
 
 def _tried(scan: Scan, work: Algorithm | Method, trial: float) -> tuple[float, float]:

@@ -53,31 +53,31 @@ def fit(
     Parameters
     ----------
     scan : Scan or Dataset
-        The views to fit. Of a `Dataset` these are `train`, and quality on its held-out views and true volume is measured on the
-        way.
+        The views to fit. A `Dataset` gives its `train`, and the fit measures its quality on the held-out views and the true
+        volume.
     method : Method or str
-        `Fast` (this package's own), `LINGO` or `R2` (the published ones), `GaussianSplatting` or `XGaussian` (baselines that
-        composite opacities: they make views, but no volume), `NAF` (a neural field), or a method of yours. Or its name, with
-        options as in 'lingo:V_S=1'.
+        `Fast` (the default), `LINGO` or `R2` (published methods), `GaussianSplatting` or `XGaussian` (baselines that composite
+        opacities, and so make views but no volume), `NAF` (a neural field), or a method that you wrote. A text names the method
+        and its options: 'lingo:V_S=1'.
     hold_out : int or None
-        One view in so many is not fitted, to measure how well unseen views are predicted; 0: all are fitted. Default: 10 of a
-        measured `Dataset`, one of 20 views or more that has neither held-out views nor a true volume, else 0.
+        One view in `hold_out` is not fitted, and measures how well the fit predicts unseen views. 0 fits all views. The default
+        is 10 for a `Dataset` of 20 views or more that has neither held-out views nor a true volume, and otherwise 0.
     seed : int
-        Of every random choice.
+        Seed of every random choice.
     folder : path, optional
-        Of the result. The fit writes a checkpoint there every 30 s, and at the end all that `Fit.save` writes.
+        Folder of the result. The fit writes a checkpoint there every 30 s, and at the end the files of `Fit.save`.
     resume : bool
-        Go on from the checkpoint in the folder, as if the fit had never stopped; scan and options must be the same.
+        Continue from the checkpoint in the folder, as if the fit had never stopped. Scan and options must be the same.
     force : bool
         Replace an earlier result in the folder.
     title : str
-        Of the report (default: the folder's name).
+        Title of the report (default: the folder's name).
     units, mu_water
-        Of the volume in the folder, as `Fit.save` has them.
+        Units of the volume in the folder, as in `Fit.save`.
     progress : bool or callable
-        Whether to show a progress bar on standard error; or a function that is called between steps, as `fitting.loop.run` does.
+        Whether to show a progress bar on standard error; or a function that is called between steps, as by `fitting.loop.run`.
     live : bool
-        Serve a page that grows while the fit runs, to this machine alone. Its address is printed; a notebook shows the page.
+        Serve a page that grows while the fit runs, to this machine alone. The fit prints its address; a notebook shows the page.
     log_dir : path, optional
         A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
     note : dict, optional

@@ -86,30 +86,30 @@ def reconstruct(
     Parameters
     ----------
     scan : Scan or Dataset
-        Projections and geometry; of a `Dataset` its `train`. Effects that it knows are taken out first: beam hardening, scatter,
-        dead pixels; blur together with scatter, or with a fit to start from. `dataclasses.replace(scan, effects=None)` takes the
-        projections for line integrals.
+        Projections and geometry. A `Dataset` gives its `train`. The effects that the scan names are corrected first: beam
+        hardening, scatter, dead pixels, and blur if there is scatter or a fit to start from. `dataclasses.replace(scan,
+        effects=None)` treats the projections as line integrals.
     algorithm : Algorithm
-        `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `Refined` or `Best`, with its options. `Best` chooses its settings by
-        measured views that it holds out, and takes neither `start` nor `views`; with `cloud` it fits a cloud by itself.
+        `FDK`, `SART`, `OSSART`, `SIRT`, `CGLS`, `ASDPOCS`, `PenalisedLeastSquares`, `Refined` or `Best`, with its options. `Best`
+        takes neither `start` nor `views`.
     start : Fit or array, optional
         A fit to this scan, or a volume [x, y, z] in 1/mm, to start from. `Refined` needs one.
     views : int, optional
-        With a fit: how many views to reconstruct from. Those that were not measured are rendered from the fit (the two stages of
-        the paper), and the algorithm starts from nothing. The scan must be one on a circle. `Refined` meets these views first,
-        and then the measured ones; without `views`, the measured ones alone.
+        How many views to reconstruct from, with a fit as `start`. The fit renders those that were not measured (the second stage
+        of the paper), and the algorithm starts from an empty volume. The scan must be on a circle. `Refined` uses these views
+        first, and then the measured ones. Without `views`, it uses the measured ones alone.
     out : path, optional
         Write the volume there (.nii, .nii.gz, .ome.zarr or .dicom), as `Reconstruction.save` does.
     units, mu_water
-        Of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm, see `Reconstruction.save`.
+        Units of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm (`Reconstruction.save`).
     slab : int, optional
-        Make the volume in slabs of so many slices, and write each to `out`, so that it need not fit into memory: by `FDK`,
-        `SART`, `OSSART` and `SIRT`. Iterative ones hold the volume in a folder beside `out`, whose name ends in .slabs, until it
-        is written. If they are stopped, the same call goes on.
+        Slices of a slab. `FDK`, `SART`, `OSSART` and `SIRT` then make the volume slab by slab and write each to `out`, so the
+        volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name ends in .slabs,
+        while they work. If they are stopped, the same call continues.
     cluster : str or Client, optional
-        Let the workers of a Dask cluster make the slabs (default: of 64 slices), and write them to `out`, an .ome.zarr: the
-        scheduler's address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see
-        the folder of `out`. The volume is that of one process. The slab of a worker that dies is made again by another one.
+        A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
+        address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of
+        `out`. The volume is the same as that of one process. If a worker dies, another makes its slab.
     force : bool
         Replace an earlier file.
     progress : bool
@@ -118,7 +118,7 @@ def reconstruct(
     Returns
     -------
     Reconstruction or Path
-        `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b|, NaN for passes where it was not computed;
+        `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b| of each pass, NaN if it was not computed;
         `seconds`. It can be used as an array. With `slab` or `cluster`: the path of the volume.
 
     Raises
@@ -130,8 +130,8 @@ def reconstruct(
     --------
     ::
 
-        found = lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
-        found.volume, found.residuals[-1]
+        result = lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
+        result.volume, result.residuals[-1]
     """
     ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
