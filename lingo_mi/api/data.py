@@ -187,7 +187,8 @@ def load_raw(
         Whether to show a progress bar on standard error.
     options
         Flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
-        saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file; pixel, mm.
+        saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file; pixel, mm;
+        rings and outliers, to be taken out, True or False.
         `lingo_mi.raw.options.Options` describes them, and `lingo-mi import` writes a file.
 
     Returns

@@ -66,6 +66,14 @@ def parser() -> Parser:
     add('--views', metavar='A:B:STEP', help='the views to keep, such as ::4')
     add('--angles', metavar='F', help='a file of angles in degrees, one a line (.txt, .ang)')
     add('--pixel', type=float, metavar='MM', help="size of a raw pixel, for RTK's geometry")
+    add(
+        '--rings',
+        action='store_true',
+        help='subtract what single pixels add in all views, such as gains that have changed since the flats',
+    )
+    add(
+        '--outliers', action='store_true', help='leave out pixels that are far brighter than their neighbours (zingers)'
+    )
     add('--force', action='store_true', help='overwrite existing files')
     return p
 
@@ -105,7 +113,7 @@ def main() -> None:
     options = Options(
         flats=args.flats, darks=args.darks, air=args.air, percentile=args.percentile, i0=args.i0, exposure=exposure,
         saturation=args.saturation, crop=args.crop, binning=args.binning, views=chosen_views(args.views), angles=args.angles,
-        pixel=args.pixel,
+        pixel=args.pixel, rings=args.rings, outliers=args.outliers,
     )  # fmt: skip
     scan, history = import_raw(args.frames, args.geometry, options)
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -114,6 +122,8 @@ def main() -> None:
     photons = history.get('photons_from_flats', history['photons_from_views'])
     print(f'{args.out}: {len(scan)} views of {scan.geometry.nDetector[0]} x {scan.geometry.nDetector[1]} pixels')
     print(f'  {history["bad_pixels"]} bad pixels of the panel, {left_out:.2%} of all pixels left out')
+    if 'rings' in history:
+        print(f'  rings: {history["rings"]:.3g} rms of line integrals subtracted, the same in all views')
     if 'darks' not in history and 'corrected_before' not in history:
         print('  no dark frames: counts without beam are taken to be 0')
     source = 'flats' if 'photons_from_flats' in history else 'views'

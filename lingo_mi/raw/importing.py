@@ -17,6 +17,7 @@ from lingo_mi.raw.frame_geometry import cropped, geometry_of, grid_given, grid_i
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.line_integrals import counts_to_line_integrals, photons_of_images
 from lingo_mi.raw.options import Options, chosen_views, exposures, region_of
+from lingo_mi.raw.rings import require_enough, ring_offsets
 from lingo_mi.scan import Scan
 
 BELOW = -0.1  # a line integral that noise does not explain: 10 % more counts than the flat
@@ -65,6 +66,8 @@ def import_raw(
     out = out.binned(options.binning).subset(chosen)
     if not grid_given(geometry):
         out = grid_in_view(out)
+    if options.rings:
+        require_enough(len(chosen), out.nDetector[1])
     # Line integrals and their mask, and the scan's copy of them without invalid pixels.
     require_room(9 * len(chosen) * float(np.prod(out.nDetector)), path)
 
@@ -79,7 +82,7 @@ def import_raw(
             frame = views[i]
             levels[k] = beam.level(frame, float(exposure[i]))  # of the whole frame: air may lie outside the crop
             p[k], valid[k] = counts_to_line_integrals(
-                kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit
+                kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit, options.outliers
             )
             light[k] = np.exp(np.minimum(-p[k][valid[k]], 50)).sum() / valid[k].size  # no overflow
             highest = frame.max()
@@ -89,6 +92,12 @@ def import_raw(
     dark = light < DARK * np.median(light)
     valid[dark] = False
     _check_views(path, chosen, p, valid, clipped)
+    rings = None
+    if options.rings:
+        offsets = ring_offsets(p, valid)
+        p -= offsets
+        p[~valid] = 0
+        rings = float(f'{np.sqrt(np.square(offsets).mean()):.4g}')
     scan, photons = Scan(out, p, valid), beam.panel.photons
     history: dict[str, Any] = dict(
         frames=str(path),
@@ -103,6 +112,8 @@ def import_raw(
         air_percentile=options.percentile,
         i0=None if beam.i0 is None else float(beam.i0),
         air_level=[float(f'{np.nanmin(levels):.6g}'), float(f'{np.nanmax(levels):.6g}')],
+        rings=rings,
+        outliers=True if options.outliers else None,
         bad_pixels=int((~beam.panel.good).sum()),
         photons_from_flats=None if photons is None else float(f'{photons * bins[0] * bins[1]:.4g}'),
         photons_from_views=float(f'{photons_of_images(scan.projections, scan.valid):.4g}'),

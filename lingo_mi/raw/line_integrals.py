@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, rank_filter
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.raw.recording import Frames
@@ -21,6 +21,7 @@ DIFFERENCE = (1, -4, 6, -4, 1)
 MOST_VIEWS = 64  # of which noise is measured
 FULL = 0.9  # a flat with more of its pixels saturated is none
 UNLIKE = 0.5  # a flat below this part of the others' brightness, or above its inverse, is none
+OUTLIER, BRIGHTER = 8.0, 1.1  # standard deviations and times by which an outlier is brighter than its neighbours
 HOT = 0.05  # and one whose dark count is that part of the flat's counts off its neighbours'
 
 
@@ -117,7 +118,12 @@ def _near(dark, signal):
 
 
 def counts_to_line_integrals(
-    view: np.ndarray, known: Fields, bins: tuple[int, int], exposure: float = 1.0, saturation: float = np.inf
+    view: np.ndarray,
+    known: Fields,
+    bins: tuple[int, int],
+    exposure: float = 1.0,
+    saturation: float = np.inf,
+    outliers: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Line integrals of one view [v, u], and the mask of its valid pixels [v, u].
 
@@ -133,10 +139,14 @@ def counts_to_line_integrals(
         Of this view over that of the flats; without flats its air level in counts.
     saturation : float
         Counts from here on are not valid.
+    outliers : bool
+        Whether `bright_outliers` are left out.
     """
     counts = view - known.dark
     good = known.good & np.isfinite(counts) & (view < saturation)
     full = np.full(view.shape, exposure) if known.flat is None else known.flat * exposure
+    if outliers:
+        good &= ~bright_outliers(counts, full, good)
     bv, bu = bins
     rows, columns = view.shape[0] // bv, view.shape[1] // bu
 
@@ -146,6 +156,28 @@ def counts_to_line_integrals(
     signal, air = (summed(np.where(good, x, 0)) for x in (counts, full))
     valid = (2 * summed(good.astype(float)) >= bv * bu) & (signal > 0) & (air > 0)
     return np.log(np.where(valid, air, 1) / np.where(valid, signal, 1)), valid
+
+
+def bright_outliers(counts: np.ndarray, full: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Pixels that are far brighter than those around them, bool [v, u]: zingers, which photons make that hit the sensor itself.
+
+    Far brighter is more than the fifth brightest of 5 x 5 pixels, by `OUTLIER` standard deviations and `BRIGHTER` times. So up to
+    four pixels beside each other are found, and a crack, which crosses all five rows, is not.
+
+    Parameters
+    ----------
+    counts, full : ndarray
+        Of the view and of the unattenuated beam, without the dark ones, [v, u].
+    good : ndarray
+        Bool, likewise: pixels that are looked at.
+    """
+    if not good.any():
+        return np.zeros(good.shape, bool)
+    light = np.where(good, counts / np.where(full > 0, full, 1), 0)
+    root = np.sqrt(np.maximum(median_filter(light, 3), 1e-12))  # the noise of counts grows as their root
+    noise = 1.4826 * np.median(np.abs(light - root**2)[good] / root[good])
+    around = rank_filter(light, -5, 5)
+    return good & (light > BRIGHTER * around) & (light - around > OUTLIER * noise * root)
 
 
 def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import checked, whole_number
 
 
@@ -41,6 +41,10 @@ class Options:
         [n] degrees or the file that lists them, where the geometry does not.
     pixel : float or None
         Size of a raw pixel, mm; for a geometry of RTK.
+    rings : bool
+        Whether what each pixel adds in all views is subtracted, see `lingo_mi.raw.rings`.
+    outliers : bool
+        Whether pixels far brighter than their neighbours are left out, see `line_integrals.bright_outliers`.
     """
 
     flats: PathLike | str | None = None
@@ -55,6 +59,8 @@ class Options:
     views: tuple[int, int | None, int] | None = None
     angles: Any = None
     pixel: float | None = None
+    rings: bool = False
+    outliers: bool = False
 
     def __post_init__(self):
         """Raises InputError for values of another kind; those that depend on the frames are checked with them."""
@@ -62,6 +68,8 @@ class Options:
             if getattr(self, name) is not None:
                 checked(name, getattr(self, name), 0.0)
         whole_number('binning', self.binning, 1)
+        require_type('rings', self.rings, bool)
+        require_type('outliers', self.outliers, bool)
         try:
             first, end, step = (0, None, 1) if self.views is None else self.views
             for value in (first, 0 if end is None else end, step):
