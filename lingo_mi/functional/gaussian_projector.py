@@ -26,10 +26,11 @@ from lingo_mi.projectors.view import View
 class GaussianProjector(LinearMap):
     """Line integrals of N Gaussians as a function of their densities, A, and its transpose A.T.
 
-    `A(density)` takes the values at the centres, [N], and gives line integrals [view, v, u]: those of `lm.project`. `A.T(images)`
-    gives, for each Gaussian, the sum over all pixels of their value times the line integral of the Gaussian of density 1. Places
-    and shapes are fixed, so that both are linear. They take and give arrays of NumPy, Dr.Jit, PyTorch or JAX, with further axes
-    in front, and are differentiable in them. For derivatives by centres, scales and rotations, take `lm.project`.
+    `A(density)` takes the values at the centres, [N], and returns line integrals [view, v, u], as `lm.project` does.
+    `A.T(images)` returns a number for each Gaussian: the sum over all pixels of the pixel's value times the line integral of this
+    Gaussian with density 1. Both are linear, because places and shapes are fixed. They take and return arrays of NumPy, Dr.Jit,
+    PyTorch or JAX, with leading batch axes, and are differentiable in them. For derivatives with respect to centres, scales and
+    rotations, use `lm.project`.
 
     Parameters
     ----------
@@ -51,8 +52,8 @@ class GaussianProjector(LinearMap):
     Raises
     ------
     InputError
-        For arrays of other shapes, no Gaussian, one that is not finite, has no extent or no rotation, and another type of
-        geometry.
+        For arrays of other shapes, an empty cloud, a Gaussian that is not finite, has no extent or no rotation, and another type
+        of geometry.
 
     Examples
     --------

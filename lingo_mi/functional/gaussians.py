@@ -13,7 +13,7 @@ from lingo_mi.projectors import cutoff
 class Gaussians:
     """A cloud of N Gaussians in the world frame of a scan, for `lm.project` and `lm.voxelize`.
 
-    It unpacks into its four arrays, `means, scales, quaternions, density = cloud`, which leaves the cut-off behind.
+    It unpacks into four arrays without the cut-off: `means, scales, quaternions, density = cloud`.
 
     Attributes
     ----------
@@ -22,17 +22,17 @@ class Gaussians:
     scales : array
         Standard deviations, mm, float [N, 3].
     quaternions : array
-        (x, y, z, w), float [N, 4]; of a fit of unit length.
+        (x, y, z, w), float [N, 4]. Those of a fit have unit length.
     density : array
         Values at the centres, 1/mm, float [N]; opacities for `GaussianSplatting` and `XGaussian`.
     extent : float
-        Cut-off in standard deviations: a fit's Gaussians are what was fitted only if they end where they did in the fit.
+        Cut-off in standard deviations. Use the Gaussians of a fit with the cut-off of this fit, because the fit depends on it.
 
     Examples
     --------
     ::
 
-        images = lm.project(fit.gaussians, geometry)      # those of fit.render(geometry)
+        images = lm.project(fit.gaussians, geometry)      # the same as fit.render(geometry)
     """
 
     means: Any

@@ -23,12 +23,12 @@ BASIS, FEW = 12, 4  # vectors of the Krylov space of `norm`, of an accurate one 
 
 
 class LinearMap(ABC):
-    """A linear map between arrays of fixed shapes. Arrays may have further axes in front, over which it maps one by one.
+    """A linear map between arrays of fixed shapes. Leading axes of an array are a batch.
 
     Attributes
     ----------
     domain_shape, range_shape : tuple of int
-        Of what it takes and of what it gives.
+        Shapes of its argument and of its result.
     """
 
     domain_shape: tuple[int, ...]
@@ -47,7 +47,7 @@ class LinearMap(ABC):
     def __call__(self, x: Any) -> Any:
         """The map of an array [..., *domain_shape]: float32 [..., *range_shape], of the caller's kind, on its device.
 
-        It is linear, so it may be differentiated any number of times, in reverse and in forward mode (of Dr.Jit's arrays once).
+        It is differentiable any number of times, in reverse and in forward mode (with Dr.Jit's arrays once).
 
         Raises
         ------
@@ -116,8 +116,8 @@ class LinearMap(ABC):
         Parameters
         ----------
         tolerance : float
-            ARPACK's, above 0. 1e-4 gives about six digits in some 20 calls of the map and of its transpose; 1e-2, enough for the
-            length of a step, two or three in about 6.
+            Tolerance of ARPACK, above 0. 1e-4 gives about six digits in some 20 calls of the map and of its transpose. 1e-2 gives
+            two or three digits in about 6 calls, which suffices for the length of a step.
         """
         flat = self.aslinearoperator()
         squared = flat.H @ flat

@@ -3,7 +3,7 @@ r"""The exact forward operators of a cloud of Gaussians, on whatever arrays the 
     sigma(x) = sum_i density_i exp(-1/2 |diag(1/scale_i) R_i^T (x - mean_i)|^2)
 
 `project` integrates sigma along the rays of a scan, in closed form (`projectors.footprint`); `voxelize` samples it at the
-centres of voxels. What comes out is of the caller's kind, with the caller's automatic differentiation:
+centres of voxels. The result is an array of the caller's library, with this library's automatic differentiation:
 
     NumPy, lists, anything with __array__ or __dlpack__ -> NumPy
     Dr.Jit arrays and tensors -> TensorXf
@@ -78,12 +78,12 @@ def project(
 ) -> Any:
     """Line integrals of a cloud of Gaussians along the rays of a scan: images [n, v, u], float32, of the caller's kind.
 
-    Takes `project(gaussians, geometry)`, where `gaussians` is a `Gaussians` such as `fit.gaussians`, or its four arrays:
+    Call it as `project(gaussians, geometry)` with a `Gaussians` such as `fit.gaussians`, or with four arrays.
 
-    The arrays are of one kind, on one device. Dr.Jit's may also be Point3f, Vector3f, Vector4f and Float of N. Rays are computed
-    on in float64 where they are that. Differentiable once in all arrays: in reverse mode, in Dr.Jit also in forward mode.
-    A result that is to be differentiated holds about 100 bytes for each Gaussian in each view until it is: in a step of a fit,
-    project a few views, not all. Derivatives by the rays are exact but for the cut-off.
+    The arrays are of one library, on one device. With Dr.Jit they may also be Point3f, Vector3f, Vector4f and Float of N. Rays of
+    float64 are used in float64. The result is differentiable once in all arrays, in reverse mode, and with Dr.Jit also in forward
+    mode. Until it is differentiated, it holds about 100 bytes for each Gaussian in each view, so project only a few views in a
+    step of a fit. Derivatives with respect to the rays are exact up to the cut-off.
 
     Parameters
     ----------
@@ -96,23 +96,23 @@ def project(
     density
         [N] values at the centres, in 1/mm for images without a unit.
     geometry
-        The scan; its rays run from the source through the pixel centres and on, so that a virtual panel may stand within the
-        object (DSD = DSO); those of a parallel beam begin and end at infinity.
+        The scan. Rays run from the source through the pixel centres and beyond, so a virtual panel may be inside the object
+        (DSD = DSO). Rays of a parallel beam begin and end at infinity.
     extent : float or None
-        Cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, 5 for arrays); with 5, images are good to 2e-6 and
-        derivatives to 4e-5 (relative L2 norms, docs/accuracy.md).
+        Cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, or 5 for arrays). With 5, images have an error of
+        2e-6 and derivatives of 4e-5 (relative L2 norms, docs/accuracy.md).
     views : Iterable[int] or None
         Indices of the views to project, n of them; None for all.
     rays
-        [n, 4, 3] source (of a parallel beam its direction), corner of the panel, and steps u and v from pixel to pixel, of these
-        n views, mm, in the place of the geometry's own, which are `geometry.rays().vectors`.
+        Rays to use instead of `geometry.rays().vectors`, [n, 4, 3], mm: for each of the n views the source (in a parallel beam
+        its direction), the corner of the panel, and the steps u and v from pixel to pixel.
 
     Raises
     ------
     InputError
-        For arrays of another shape or of several kinds, an empty cloud, a Gaussian that is not finite, has no extent or no
-        rotation, views that the scan has not, rays that make no view, and arrays on another device than the active variant's.
-        Within `jax.jit` what is wrong with values, not with shapes, comes as JAX's own error around the message.
+        For arrays of another shape or of several libraries, an empty cloud, a Gaussian that is not finite, has no extent or no
+        rotation, views that the scan does not have, rays that make no view, and arrays on another device than the active
+        variant's. Within `jax.jit`, JAX raises its own error with this message for wrong values.
 
     Examples
     --------
@@ -166,14 +166,13 @@ def voxelize(
 ) -> Any:
     """Densities of a cloud of Gaussians at the voxel centres of a grid: [x, y, z], float32, of the caller's kind.
 
-    Takes `voxelize(gaussians, grid)`, or four arrays, as `project`.
-
-    The other arguments, and errors, are those of `project`. Differentiable in all four arrays, in reverse mode.
+    Call it as `voxelize(gaussians, grid)`, or with four arrays. Other arguments and errors are as for `project`. The result is
+    differentiable in all four arrays, in reverse mode.
 
     Parameters
     ----------
     grid
-        Or a geometry, whose grid it is.
+        The voxels, or a geometry whose grid is used.
 
     Examples
     --------

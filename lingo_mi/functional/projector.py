@@ -32,32 +32,32 @@ MODELS = 'joseph', 'exact'
 class Projector(LinearMap):
     """Line integrals of a voxel volume in the views of a scan, A, and backprojection, its transpose A.T.
 
-    `A(volume)` takes densities [x, y, z], per mm, and gives line integrals [view, v, u] without a unit. `A.T(projections)` gives
-    the sum over all pixels of their value times the length, in mm, that each voxel has in their rays. A.T is the transpose of A
-    to rounding. Both take and give arrays of NumPy, Dr.Jit, PyTorch or JAX, with further axes in front, and are differentiable
-    in them. All is computed in float32.
+    `A(volume)` takes densities [x, y, z], per mm, and returns line integrals [view, v, u] without a unit. `A.T(projections)`
+    returns a number for each voxel: the sum over all pixels of the pixel's value times the length of its ray in the voxel, in mm.
+    A.T is the transpose of A to rounding. Both take and return arrays of NumPy, Dr.Jit, PyTorch or JAX, with leading batch axes,
+    and are differentiable in them. Computation is in float32.
 
-    `A(volume, rays=rays)` takes the rays from an array, and is differentiable in it: see `__call__`.
+    `A(volume, rays=rays)` takes the rays from an array, and is differentiable in it (`__call__`).
 
     Parameters
     ----------
     geometry : Geometry
         The scanner and the grid of the volume.
     model : {'joseph', 'exact'}
-        'joseph' interpolates in the slices of voxel centres (error about 0.5 % of the line integrals); 'exact' integrates the
-        trilinear interpolant exactly, and takes three to four times as long. A source beside or inside the volume has the exact
-        one in either case.
+        'joseph' interpolates in the slices of voxel centres (error about 0.5 % of the line integrals). 'exact' integrates the
+        trilinear interpolant exactly, and takes three to four times as long. If the source is beside or inside the volume, the
+        model is always 'exact'.
     views : slice or sequence of int, optional
-        Of the geometry (default: all).
+        Views of the geometry (default: all).
     valid : array of bool, optional
-        Pixels that count, [view, v, u] or [v, u]. Others have zeros in the projections and add nothing to the transpose.
+        Pixels to use, [view, v, u] or [v, u]. Others are zero in the projections and add nothing to the transpose.
 
     Attributes
     ----------
     geometry : Geometry
-        Of the views that were chosen.
+        The geometry of the chosen views.
     model : str
-        The one that is used.
+        The model that is used.
     domain_shape, range_shape : tuple of int
         (x, y, z) and (view, v, u).
 
@@ -131,17 +131,17 @@ class Projector(LinearMap):
         Parameters
         ----------
         x : array
-            The volume. It may be differentiated any number of times, in reverse and in forward mode (of Dr.Jit's arrays once).
+            The volume. It may be differentiated any number of times, in reverse and in forward mode (with Dr.Jit's arrays once).
         rays : array, optional
-            [view, 4, 3], of the volume's kind: source (of a parallel beam its direction), corner of the panel, and steps u and v
-            from pixel to pixel, mm, in the place of the geometry's own, which are `A.geometry.rays().vectors`. They are
-            computed on in float64 where they are that. The volume has no further axes then, and both are differentiable once: in
-            reverse mode, in Dr.Jit also in forward mode.
+            Rays to use instead of `A.geometry.rays().vectors`, [view, 4, 3], mm, of the volume's library: for each view the
+            source (in a parallel beam its direction), the corner of the panel, and the steps u and v from pixel to pixel. Rays of
+            float64 are used in float64. The volume then has no batch axes, and both arrays are differentiable once, in reverse
+            mode, and with Dr.Jit also in forward mode.
 
         Returns
         -------
         array
-            With rays, those of the projector of a scan with these poses.
+            The projections. With rays, they are those of a scan with these poses.
 
         Raises
         ------
@@ -149,16 +149,14 @@ class Projector(LinearMap):
             For an array of another shape or kind, or with NaN or infinity, for rays that make no view, and if the result does
             not fit into memory.
 
-        Notes
-        -----
-        Derivatives by the rays are those of the model, and at kinks of its interpolation the mean of both sides. Joseph's model
-        jumps where a sample enters the box, if the volume is not zero at its faces, and where the main axis of a ray changes (a
-        ray of a cone that is steeper than 45 degrees, in voxels, also where its panel begins to lean). These jumps are not in the
-        derivatives. Where they matter, take `model='exact'`, which has none of them.
+        Notes ----- Derivatives with respect to the rays are those of the model, and at kinks of its interpolation the mean of
+        both sides. They do not contain the jumps of Joseph's model. This model jumps if a sample enters the box and the volume is
+        not zero at its faces, if the main axis of a ray changes, and, for a ray of a cone that is steeper than 45 degrees in
+        voxels, if the panel begins to lean. If these jumps matter, use `model='exact'`, which has none.
 
         Examples
         --------
-        The derivatives of a loss by source, corner, u and v of each view, in PyTorch: ::
+        The derivatives of a loss with respect to source, corner, u and v of each view, in PyTorch: ::
 
             rays = torch.tensor(geometry.rays().vectors, requires_grad=True)
             loss = (A(volume, rays=rays) - measured).square().sum()

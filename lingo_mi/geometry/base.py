@@ -44,17 +44,17 @@ if TYPE_CHECKING:
 
 
 class Placement(Motion, Voxels, total=False):
-    """Where scanner and volume lie, as `Geometry.cone` describes it."""
+    """Place of scanner and volume, as `Geometry.cone` describes it."""
 
 
 class ViewNumbers(Placement):
-    """What every view may have of its own."""
+    """Numbers that may differ from view to view."""
 
     angles: ArrayLike
 
 
 class ConeNumbers(Placement):
-    """A cone beam but for its angles."""
+    """The numbers of a cone beam, without its angles."""
 
     DSO: float
     DSD: float
@@ -64,20 +64,20 @@ class ConeNumbers(Placement):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry(ABC):
-    """A scan, and the voxels to reconstruct: what every kind of scan has.
+    """The geometry of a scan, and the voxels to reconstruct.
 
     Parameters
     ----------
     mode : str
         'cone' or 'parallel'.
     nDetector : [2]
-        Pixels, (v, u): rows, columns; at least 1.
+        Pixels (v, u), rows and columns, at least 1.
     dDetector : [2]
         Pixel size, (v, u), mm.
     grid : Grid
         The voxels.
     angles : [n]
-        Radians: the direction to the source, seen from above.
+        Direction to the source, seen from above, radians.
     DSO, DSD : float
         Distances from the source to the axis and to the panel, mm.
 
@@ -85,7 +85,7 @@ class Geometry(ABC):
     ------
     InputError
         For wrong shapes, numbers that are not finite or beyond the limits of `lingo_mi.geometry.limits`, and sizes and counts
-        that are not positive. One number may stand for both of nDetector, dDetector and offDetector.
+        that are not positive. nDetector, dDetector and offDetector may be one number for both axes.
 
     Examples
     --------
@@ -137,12 +137,12 @@ class Geometry(ABC):
         nDetector, dDetector
             Pixels and pixel size in mm, (v, u).
         angles : [n]
-            Radians, n >= 1; whole numbers over more than four turns cause a warning, as they look like degrees.
+            Radians, n >= 1. Whole numbers over more than four turns cause a warning, because they look like degrees.
         **placement
-            The voxels: either grid, or TIGRE's numbers of one, (x, y, z): nVoxel, dVoxel in mm, and offOrigin, its centre, in mm.
-            Further offDetector, (v, u) mm, the shift of the panel, positive v up; rotDetector, (roll, pitch, yaw) radians, by
-            which it is turned; COR, mm, of an axis off centre; tilt, radians, by which the source is lifted out of the plane of
-            rotation; height, mm, once or for every view. All but the voxels are 0 by default; `trajectories.Motion` defines them.
+            The voxels: either `grid`, or TIGRE's numbers (x, y, z): nVoxel, dVoxel in mm, and offOrigin, the centre, in mm. The
+            other numbers are 0 by default, and `trajectories.Motion` defines them: offDetector, (v, u) mm, shifts the panel,
+            positive v up; rotDetector, (roll, pitch, yaw) radians, turns it; COR, mm, is for an axis off centre; tilt, radians,
+            lifts the source out of the plane of rotation; height, mm, once or for every view, lifts source and panel.
 
         Returns
         -------
@@ -152,7 +152,7 @@ class Geometry(ABC):
         Raises
         ------
         InputError
-            For numbers that make no scan, and for voxels given in both ways or in none.
+            For numbers that make no scan, and unless exactly one of `grid` and TIGRE's numbers describes the voxels.
 
         Examples
         --------
@@ -173,7 +173,7 @@ class Geometry(ABC):
     ) -> Geometry:
         """A parallel beam that turns about z. The parameters are those of `cone`, without the distances.
 
-        Its beam is not turned by rotDetector.
+        rotDetector does not turn its beam.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Geometry(ABC):
         Parameters
         ----------
         angles : [n]
-            Radians, beyond 2 pi if there are several turns; negative ones lie below z = 0.
+            Radians, beyond 2 pi if there are several turns. Negative angles lie below z = 0.
         **scan
             The other parameters of `cone`.
 
@@ -229,11 +229,11 @@ class Geometry(ABC):
         Parameters
         ----------
         DSO, DSD : float or [n]
-            As of `cone`.
+            As in `cone`.
         **views
             angles, [n] radians or [n, 3] Euler angles; offDetector, rotDetector, COR, height and tilt, once or for every view;
-            the voxels as of `cone`. offOrigin may be [n, 3], TIGRE's way to move the object: the grid then stays at the mean, and
-            the scanner moves by what is left, the other way round.
+            the voxels as in `cone`. offOrigin may be [n, 3], which is TIGRE's way to move the object. The grid then stays at the
+            mean, and the scanner moves by the differences from it, in the opposite direction.
 
         Raises
         ------
@@ -252,7 +252,7 @@ class Geometry(ABC):
 
     @classmethod
     def from_poses(cls, rays: Rays, nDetector: ArrayLike, **voxels: Unpack[Voxels]) -> Geometry:
-        """A scan whose every view has a pose.
+        """A scan with a pose for every view.
 
         Parameters
         ----------
@@ -261,14 +261,14 @@ class Geometry(ABC):
         nDetector
             Pixels, (v, u).
         **voxels
-            Either grid, or nVoxel, dVoxel and offOrigin, as of `cone`.
+            Either grid, or nVoxel, dVoxel and offOrigin, as in `cone`.
 
         Returns
         -------
         Geometry
-            The `CircularGeometry`, which every file format knows, for poses that are a circle's to a thousandth of a pixel (the
-            source around z, the panel upright, rows down); a `PosedGeometry` for others; a `CurvedGeometry` for rays that have a
-            curve.
+            A `CircularGeometry`, which every file format knows, if the poses are on a circle to a thousandth of a pixel (the
+            source around z, the panel upright, rows down). A `CurvedGeometry` if the rays have a curve. Otherwise a
+            `PosedGeometry`.
 
         Raises
         ------
@@ -326,7 +326,7 @@ class Geometry(ABC):
         Parameters
         ----------
         curved : bool
-            Whether the caller knows curved panels, whose rays have a `Rays.curve`. Those of others are refused without it.
+            Whether the caller supports curved panels, whose rays have a `Rays.curve`. If not, curved panels are refused.
         """
 
     @abstractmethod
@@ -335,7 +335,7 @@ class Geometry(ABC):
 
     @abstractmethod
     def binned(self, factor: int) -> Geometry:
-        """The same rays with `factor` x `factor` pixels taken as one; rows and columns left over are dropped.
+        """The same scan with `factor` x `factor` pixels joined into one. Remaining rows and columns are dropped.
 
         A side of fewer than two new pixels is not binned: see `bins`.
         """
@@ -382,14 +382,14 @@ class Geometry(ABC):
     def curved(self, radius: float | None = None) -> CurvedGeometry:
         """The same scan with its panel bent towards the source on a cylinder, whose axis runs along the panel's columns.
 
-        Columns are then spaced along the arc, dDetector[1] apart. The panel touches the flat one where the perpendicular from the
-        source meets it, and offDetector[1] moves the panel along its arc.
+        Columns are then dDetector[1] apart along the arc. The curved panel touches the flat one at the foot of the perpendicular
+        from the source, and offDetector[1] moves the panel along its arc.
 
         Parameters
         ----------
         radius : float, optional
-            Of the cylinder, mm. Without it, DSD: the axis passes through the focal spot, as in clinical scanners, and the angle
-            between neighbouring columns is dDetector[1] / DSD.
+            Radius of the cylinder, mm (default: DSD). With DSD the cylinder's axis passes through the focal spot, as in clinical
+            scanners, and the angle between neighbouring columns is dDetector[1] / DSD.
 
         Raises
         ------
@@ -411,12 +411,12 @@ class Geometry(ABC):
         return curved(self, radius)
 
     def source_shifted(self, shift: ArrayLike) -> Geometry:
-        """The same panels, seen from elsewhere: a flying focal spot.
+        """The same panels with shifted sources: a flying focal spot.
 
         Parameters
         ----------
         shift : [3] or [view, 3]
-            Of the source, mm: along the rows (u), against the columns (up, for an upright panel), and away from the panel.
+            Shift of the source, mm: along the rows (u), against the columns (up, for an upright panel), and away from the panel.
 
         Raises
         ------
@@ -440,8 +440,8 @@ class Geometry(ABC):
         Parameters
         ----------
         views : slice or sequence of int, optional
-            Whose panel and outermost rays are drawn, the first strongest (default: three, evenly spaced). Dots are the sources of
-            all views.
+            Views to draw with their panel and outermost rays, the first one strongest (default: three, evenly spaced). Dots are
+            the sources of all views.
 
         Returns
         -------

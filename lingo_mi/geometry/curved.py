@@ -25,17 +25,17 @@ class CurvedGeometry(Geometry):
     """A cone beam before a panel that is bent on a cylinder: rows run along the arc, columns along the cylinder's axis.
 
     `Geometry.curved` makes one in a clinical scanner's terms. Here the panel touches a flat one along its middle, on the side of
-    the source, and its columns are spaced along the arc as the flat one's along u, as in ASTRA's `cyl_cone_vec`.
+    the source. Its columns are as far apart along the arc as the flat one's along u, as in ASTRA's `cyl_cone_vec`.
 
-    Voxels are projected along the exact rays, and so are Gaussians. What only a flat panel serves says so; `Scan.to_flat`
-    resamples.
+    Voxels and Gaussians are projected along the exact rays. Functions that need a flat panel raise InputError, and `Scan.to_flat`
+    resamples the scan for them.
 
     Parameters
     ----------
     flat : Geometry
-        With the flat panel, a cone beam. DSO, DSD, dDetector and angles are its own.
+        The cone beam with the flat panel. It defines DSO, DSD, dDetector and angles.
     radius : float
-        Of the cylinder, mm.
+        Radius of the cylinder, mm.
 
     Raises
     ------

@@ -25,7 +25,7 @@ class Grid:
     Parameters
     ----------
     shape : whole number or [3]
-        Voxels, (x, y, z), at least 1. One number may stand for all three, here and below.
+        Voxels (x, y, z), at least 1. Here and below, one number holds for all three.
     spacing : float or [3]
         Voxel size, (x, y, z), mm.
     centre : float or [3]

@@ -14,8 +14,8 @@ from lingo_mi.geometry.rays import Index, Rays, checked_views
 class PosedGeometry(Geometry):
     """A scan with a pose for every view. `Geometry.from_poses` makes a `CircularGeometry` instead if it can.
 
-    What the poses imply is for labels: DSO is the mean distance from the source to the volume's centre, DSD that to the panel's
-    plane, dDetector the mean length of the steps, `angles` the directions to the source as seen from above.
+    Its other numbers follow from the poses, for labels: DSO is the mean distance from the source to the volume's centre, DSD that
+    to the panel's plane, dDetector the mean length of the steps, and `angles` are the directions to the source, seen from above.
 
     Parameters
     ----------

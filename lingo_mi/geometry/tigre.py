@@ -30,8 +30,8 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
     Parameters
     ----------
     geo : tigre.geometry or dict
-        An object or a dict with TIGRE's names, in TIGRE's order, which is turned round. Lengths in mm; DSO, DSD, offOrigin,
-        offDetector, rotDetector and COR once or for every view.
+        An object or a dict with TIGRE's names, in TIGRE's order (z, y, x). Lengths are in mm. DSO, DSD, offOrigin, offDetector,
+        rotDetector and COR hold once or for every view.
     angles : [n] or [n, 3]
         Radians, or Euler angles, as `tigre.Ax` takes them.
 

@@ -40,7 +40,7 @@ def helix(angles: ArrayLike, pitch: float) -> np.ndarray:
     Parameters
     ----------
     angles : array_like
-        [n] radians, beyond 2 pi where it has several turns; those of two turns around z = 0 are -2 pi to 2 pi.
+        [n] radians, beyond 2 pi if there are several turns. Two turns around z = 0 have -2 pi to 2 pi.
 
     Examples
     --------
@@ -83,16 +83,16 @@ def rotation(axis: str, angle: ArrayLike) -> np.ndarray:
 
 
 class Motion(TypedDict, total=False):
-    """What moves a scanner's source and panel off the plain circle: once, or for every view with a first axis of n.
+    """Motions of a scanner's source and panel off the plain circle, once, or for every view with a first axis of n.
 
-    All are 0 where they are not given. The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code),
-    but for `height` and `tilt`, which TIGRE writes as a per-view `offOrigin` and as the second Euler angle, of opposite
-    sign. The beam of a parallel scan is not turned by rotDetector.
+    All are 0 by default. The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code). TIGRE writes
+    `height` as a per-view `offOrigin`, and `tilt` as the second Euler angle with the opposite sign. rotDetector does not turn the
+    beam of a parallel scan.
 
     Parameters
     ----------
     offDetector : array_like
-        (v, u), mm: shift of the panel, positive v up; after its rotation.
+        (v, u), mm: shift of the panel after its rotation, positive v up.
     rotDetector : array_like
         (roll, pitch, yaw), radians: the panel is turned by Rz(roll) Ry(pitch) Rx(yaw) about its centre, in the frame (towards the
         source, u, up). Roll turns it about the vertical, yaw in its own plane.
@@ -101,7 +101,7 @@ class Motion(TypedDict, total=False):
     height : array_like
         Shift of source and panel along z, mm (a helix).
     tilt : array_like
-        Radians by which the source is lifted out of the plane of rotation, the panel sunk (laminography).
+        Radians by which the source is lifted out of the plane of rotation and the panel lowered (laminography).
     """
 
     offDetector: ArrayLike
@@ -131,7 +131,7 @@ def scanner_rays(
     Raises
     ------
     InputError
-        If an argument has neither one value nor one a view.
+        If an argument has neither one value nor one for every view.
 
     Examples
     --------

@@ -54,23 +54,23 @@ Fit = Callable[[Scan, Callable[[int, int], None]], Callable[[Grid], np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Chosen(Reconstruction):
-    """A `Reconstruction` by `Best`, with what it was chosen by.
+    """A `Reconstruction` by `Best`, with the trials that led to it.
 
     Parameters
     ----------
     plan : tuple[Trial, ...]
-        The settings tried, a `Trial` each, in this order.
+        A `Trial` for each setting, in the order of the work.
     taken : int
-        Number of the one that was taken.
+        Index of the chosen trial.
     error : ndarray or None
-        float32 [x, y, z], density per mm: see `error_map`.
+        Map of errors, float32 [x, y, z], density per mm (`error_map`).
     meaning : str
-        Of the numbers: 'means' over the voxels' cubes, or 'values' at their centres, see `Best.voxels`.
+        What each number is: 'means' over the voxels' cubes, or 'values' at their centres (`Best.voxels`).
 
     Examples
     --------
-    >>> found = lm.reconstruct(scan, lm.Best())
-    >>> print(found.report())
+    >>> result = lm.reconstruct(scan, lm.Best())
+    >>> print(result.report())
     """
 
     plan: tuple[Trial, ...] = ()
@@ -80,7 +80,7 @@ class Chosen(Reconstruction):
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of the scan's own voxels, mm
 
     def report(self) -> str:
-        """What was tried, one line each: setting, voxels, passes, and how far the held-out views are off (`Score`)."""
+        """One line for each trial: setting, voxels, passes, and the error of the held-out views (`Score`)."""
         lines = []
         for i, trial in enumerate(self.plan):
             size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.spacing)
@@ -91,7 +91,7 @@ class Chosen(Reconstruction):
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
-        """The plan as plain values, for a JSON file; with a check sum of the volume that it made."""
+        """The plan as plain values for a JSON file, with a check sum of its volume."""
         return dict(
             volume=values_digest(self.volume),
             score='|A x - b| / |b| of the held-out views, weighted by the root of the frequency, after every pass',
@@ -104,7 +104,7 @@ class Chosen(Reconstruction):
     def save(
         self, path: str | PathLike, *, units: str = '1/mm', mu_water: float | None = None, force: bool = False
     ) -> Path:
-        """Write the volume, see `Reconstruction.save`, and beside it the map of errors and the plan; returns the volume's path.
+        """Write the volume (`Reconstruction.save`), and beside it the map of errors and the plan. Return the volume's path.
 
         For V.nii.gz these are V-error.nii.gz, always per mm, and V-plan.json.
         """
@@ -123,40 +123,39 @@ class Chosen(Reconstruction):
 
 @dataclass(frozen=True)
 class Best(Algorithm):
-    """ASD-POCS, its refinements and priors, chosen by measured views that are held out. It needs no cloud and no truth.
+    """ASD-POCS, its refinements and priors, chosen by held-out views. It needs neither a cloud nor the truth.
 
-    1. One view of `held_out` is put aside. The others are reconstructed by `ASDPOCS`; after every pass the volume's projections
-       are compared with the views put aside (`held_out.Score`), and the passes end when these are predicted no better.
-    2. From there, steps as in `Refined` (changes weighted by `structure`, corrections for the error of Joseph's projector), but
-       over-relaxed, are tried on the scan's voxels and on `finer` times smaller ones. If passes after the first one
-       gain little, noise limits them, and more total variation is tried.
-    3. With `prior`, `PenalisedLeastSquares` is tried with it, and the same views choose its strength. With `cloud`, a cloud of
-       Gaussians is fitted to them, and the best of these refinements is tried from its volume.
-    4. The setting that predicts the views best, with its number of passes, is applied to all views.
+    1. One view in `held_out` is held out. `ASDPOCS` reconstructs from the others. After every pass, the volume's projections are
+       compared with the held-out views (`held_out.Score`). The passes end when they no longer predict these views better.
+    2. Steps as in `Refined` follow (changes weighted by `structure`, corrections for the error of Joseph's projector), but
+       over-relaxed, on the scan's voxels and on `finer` times smaller ones. If passes after the first one gain little, noise
+       limits them, and `Best` tries more total variation.
+    3. With `prior`, it tries `PenalisedLeastSquares`, and the held-out views choose the strength. With `cloud`, it fits a cloud
+       of Gaussians to the other views, and tries the best of these refinements from the cloud's volume.
+    4. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
-    Smaller voxels are taken for objects finer than the voxels, whose detail the voxels would turn into streaks. The scan's own
-    voxels are taken for objects that have no such detail. Streaks lie along the views that were reconstructed from, and other
-    views show little of them: so the scan's own voxels must be better by `MARGIN`.
+    Smaller voxels suit objects finer than the voxels, because voxels turn such detail into streaks. Streaks lie along the views
+    of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by `MARGIN`.
 
     Parameters
     ----------
     niter : int
-        Passes of a refinement, at most, at least 1.
+        Largest number of passes of a refinement, at least 1.
     finer : int
-        Parts along each side of a voxel to try, at least 1 (1: the scan's voxels only); memory grows with its cube.
+        Parts along each side of a smaller voxel, at least 1. 1 tries only the scan's voxels. Memory grows with the cube.
     held_out : int
-        One view in so many is held out, at least 2.
+        One view in `held_out` is held out, at least 2.
     cloud : bool
-        Whether to try the volume of a fitted cloud as a start; it takes two fits.
+        Whether to try the volume of a fitted cloud as a start, which takes two fits.
     seed : int
-        Of the random orders, at least 0.
+        Seed of the random orders, at least 0.
     voxels : {'means', 'values', 'finer'}
-        What a number means where smaller voxels are taken. 'means': the mean over the voxel's cube, for looking, measuring and
-        comparing. 'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`); every
-        setting is then judged by the views that these values predict, ASD-POCS with its full passes among them. 'finer': the
-        smaller voxels themselves. Where the scan's own voxels are taken, numbers are values at the centres.
+        What a number means if smaller voxels win. 'means': the mean over the voxel's cube, to view, measure and compare.
+        'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`). The held-out
+        views then judge every setting, and ASD-POCS with all its passes, by the projections of these values. 'finer': the smaller
+        voxels themselves. If the scan's own voxels win, numbers are values at the centres.
     prior : Prior, optional
-        To try beside the rest.
+        A prior to try beside the other settings.
 
     Raises
     ------
@@ -173,8 +172,8 @@ class Best(Algorithm):
     >>> import lingo_mi as lm
     >>> from lingo_mi.phantoms import make, x3d_scan
     >>> measured = x3d_scan.scan(make('foot', 24), views=10, pixels=48).train
-    >>> found = lm.reconstruct(measured, lm.Best(niter=5), progress=False)
-    >>> len(found.plan) >= 3, found.error.shape
+    >>> result = lm.reconstruct(measured, lm.Best(niter=5), progress=False)
+    >>> len(result.plan) >= 3, result.error.shape
     (True, (24, 24, 24))
     """
 
@@ -404,10 +403,10 @@ def _best(refinements: Sequence[Trial]) -> Trial:
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
-    """How far a volume can be believed: its difference from one of fewer views, root mean square around each voxel.
+    """Where a volume is uncertain: its difference from a volume of fewer views, root mean square around each voxel.
 
-    Both float32 [x, y, z], density per mm, and so the result. It is large where views decide, small where all agree. It ranks
-    the voxels; the size of the error it does not tell: what all views lack, both volumes lack.
+    Both volumes and the result are float32 [x, y, z], density per mm. The map ranks the voxels. It does not tell the size of the
+    error, because both volumes lack what no view shows.
     """
     square = ndimage.gaussian_filter((volume - fewer) ** 2, SPREAD)
     return np.sqrt(np.maximum(square, 0))

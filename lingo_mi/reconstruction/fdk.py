@@ -210,10 +210,10 @@ class FDK(Algorithm):
 
     with the pixel size tau at the axis and the distance w of x from the source along the central ray, over DSO.
 
-    Short scans (Parker) and offset panels (Wang) are weighted, see `ray_weights`. Projections of a turned or tilted panel are
-    first resampled to an upright one (`rectified`). The views together must cover the whole width of the object; truncated
-    rows are filtered as they are. A view adds nothing to voxels outside its panel. With one detector row, only the slice in
-    the plane of the fan is meaningful.
+    Short scans get Parker's weights, and offset panels Wang's (`ray_weights`). Projections of a turned or tilted panel are
+    first resampled to an upright one (`rectified`). The views together must cover the whole width of the object, because
+    truncated rows are not extrapolated. A view adds nothing to voxels outside its panel. With one detector row, only the slice
+    in the plane of the fan is meaningful.
 
     Use it for hundreds of views, or if time is short. Few views cause streaks, and the ramp amplifies noise.
 
@@ -223,11 +223,11 @@ class FDK(Algorithm):
     Parameters
     ----------
     filter : str
-        Apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth; TIGRE's
-        'ram_lak' and 'shepp_logan' are known too.
+        Apodisation of the ramp: 'ram-lak' (none), 'shepp-logan', 'cosine', 'hamming' or 'hann', from sharp to smooth. TIGRE's
+        names 'ram_lak' and 'shepp_logan' are accepted, too.
     fill : bool
-        Whether pixels that are not valid are interpolated along their rows and over views, with a warning; without, a scan that
-        has such pixels is refused.
+        Whether invalid pixels are interpolated along their rows and over views, with a warning. If not, a scan with invalid
+        pixels is refused.
 
     Raises
     ------

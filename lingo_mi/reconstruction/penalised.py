@@ -38,28 +38,30 @@ WEIGHTS = 'known', 'photons', 'equal'
 class PenalisedLeastSquares(Algorithm):
     """Least squares with a prior: minimises 1/2 (A x - b)^T W (A x - b) + strength max(A^T W b) R(x) over 0 <= x <= `upper`.
 
-    A step is one of gradient descent, of length 1 / |A^T W A|, then the proximal map of the prior; Nesterov's momentum
-    accelerates it (FISTA), and restarts when it points uphill. A prior's gradient joins that of the data.
+    The proximal map of the prior follows each step of gradient descent, whose length is 1 / |A^T W A|. The gradient of a prior's
+    smooth part is added to that of the data. Nesterov's momentum accelerates the steps (FISTA), and restarts when it points
+    uphill.
 
     Parameters
     ----------
     prior : Prior
-        `TV` (total variation), another one of `lingo_mi.reconstruction.priors`, or one of your own.
+        `TV` (total variation), another one of `lingo_mi.reconstruction.priors`, or one that you wrote.
     strength : float, optional
-        Of the prior, relative to max(A^T W b), so that it does not depend on units. None: of `PATH`, the strongest that predicts
-        held-out views nearly as well as the best one (`held_out.Score`); this takes up to three times as long.
+        Strength of the prior relative to max(A^T W b), so that it does not depend on units. None: the strongest of `PATH` that
+        predicts held-out views nearly as well as the best one (`held_out.Score`), in up to three times the time.
     niter : int
-        Iterations, at least 1; each takes one projection and one backprojection of all views.
+        Iterations, at least 1. Each takes one projection and one backprojection of all views.
     upper : float, optional
         Largest density, 1/mm, above 0.
     finer : int
-        Parts along each side of a voxel, at least 1. The volume is their mean over each voxel. For objects finer than the voxels.
+        Parts along each side of a voxel, at least 1, for objects finer than the voxels. The volume is the mean of a voxel's
+        parts.
     held_out : int
-        One view in so many is held out to choose the strength, at least 2.
+        One view in `held_out` is held out to choose the strength, at least 2.
     weights : {'known', 'photons', 'equal'}
-        W: the same for all rays ('equal'), or the share of photons that a ray keeps, exp(-b), to which the variance of a line
-        integral is inverse ('photons'). 'known': 'photons' for a scan whose detector says how many it counts, else 'equal'. The
-        mean of W over the rays is 1.
+        W. 'equal': the same for all rays. 'photons': the fraction of photons that a ray transmits, exp(-b), because the variance
+        of a line integral is inversely proportional to it. 'known': 'photons' if the detector of the scan names its photons,
+        otherwise 'equal'. The mean of W over the rays is 1.
 
     References
     ----------
@@ -70,15 +72,15 @@ class PenalisedLeastSquares(Algorithm):
     Raises
     ------
     InputError
-        For an option out of its range; without a strength for a scan of fewer than four views.
+        For an option out of its range, and for a scan of fewer than four views without a strength.
 
     Examples
     --------
     >>> import lingo_mi as lm
     >>> from lingo_mi.phantoms import make, x3d_scan
     >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-    >>> found = lm.reconstruct(measured, lm.PenalisedLeastSquares(lm.TV(), strength=1e-4, niter=20), progress=False)
-    >>> found.residuals[-1] < 0.05
+    >>> result = lm.reconstruct(measured, lm.PenalisedLeastSquares(lm.TV(), strength=1e-4, niter=20), progress=False)
+    >>> result.residuals[-1] < 0.05
     True
     """
 

@@ -227,11 +227,11 @@ class OSSART(Sweeps):
     noneg : bool
         Whether negative densities are set to zero after every update.
     OrderStrategy : str
-        Of the blocks: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`.
+        Order of the blocks: 'ordered', 'random' (another one in every pass) or 'angularDistance' (`blocks`).
     tol : float
-        Stop when |A x - b| / |b| is no larger; 0: never.
+        Stop when |A x - b| / |b| falls to this value; with 0, never.
     seed : int
-        Of the random order, from 0 on.
+        Seed of the random order, at least 0.
 
     Raises
     ------
@@ -243,8 +243,8 @@ class OSSART(Sweeps):
     >>> import lingo_mi as lm
     >>> from lingo_mi.phantoms import make, x3d_scan
     >>> measured = x3d_scan.scan(make('foot', 24), views=40, pixels=48).train
-    >>> found = lm.reconstruct(measured, lm.OSSART(niter=4, blocksize=5), progress=False)
-    >>> found.volume.shape, found.residuals[-1] < 0.05
+    >>> result = lm.reconstruct(measured, lm.OSSART(niter=4, blocksize=5), progress=False)
+    >>> result.volume.shape, result.residuals[-1] < 0.05
     ((24, 24, 24), True)
     """
 
@@ -279,7 +279,7 @@ class SART(Sweeps):
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
-    Use it for few clean views, which few passes match closely. With noise, use fewer passes or a smaller lmbda.
+    Use it for few clean views, which it matches closely after a few passes. With noise, use fewer passes or a smaller lmbda.
 
     Andersen and Kak, "Simultaneous algebraic reconstruction technique", Ultrasonic Imaging 6 (1984).
 
@@ -294,11 +294,11 @@ class SART(Sweeps):
     noneg : bool
         Whether negative densities are set to zero after every update.
     OrderStrategy : str
-        Of the views: 'ordered', 'random' (drawn anew every pass) or 'angularDistance', see `blocks`.
+        Order of the views: 'ordered', 'random' (another one in every pass) or 'angularDistance' (`blocks`).
     tol : float
-        Stop when |A x - b| / |b| is no larger; 0: never.
+        Stop when |A x - b| / |b| falls to this value; with 0, never.
     seed : int
-        Of the random order, from 0 on.
+        Seed of the random order, at least 0.
 
     Raises
     ------
@@ -310,9 +310,9 @@ class SART(Sweeps):
     >>> import lingo_mi as lm
     >>> from lingo_mi.phantoms import make, x3d_scan
     >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-    >>> found = lm.reconstruct(measured, lm.SART(niter=3), progress=False)
-    >>> better = lm.reconstruct(measured, lm.SART(niter=3, lmbda=0.5), start=found, progress=False)
-    >>> better.residuals[-1] < found.residuals[-1] < 0.05
+    >>> result = lm.reconstruct(measured, lm.SART(niter=3), progress=False)
+    >>> better = lm.reconstruct(measured, lm.SART(niter=3, lmbda=0.5), start=result, progress=False)
+    >>> better.residuals[-1] < result.residuals[-1] < 0.05
     True
     """
 
@@ -358,7 +358,7 @@ class SIRT(Sweeps):
     noneg : bool
         Whether negative densities are set to zero after every update.
     tol : float
-        Stop when |A x - b| / |b| is no larger; 0: never.
+        Stop when |A x - b| / |b| falls to this value; with 0, never.
 
     Raises
     ------
@@ -370,8 +370,8 @@ class SIRT(Sweeps):
     >>> import lingo_mi as lm
     >>> from lingo_mi.phantoms import make, x3d_scan
     >>> measured = x3d_scan.scan(make('foot', 24), views=20, pixels=48).train
-    >>> found = lm.reconstruct(measured, lm.SIRT(niter=10, lmbda=1.9, lmbda_red=1.0), progress=False)
-    >>> found.residuals[-1] < 0.2 * found.residuals[0]
+    >>> result = lm.reconstruct(measured, lm.SIRT(niter=10, lmbda=1.9, lmbda_red=1.0), progress=False)
+    >>> result.residuals[-1] < 0.2 * result.residuals[0]
     True
     """
 

@@ -1,4 +1,4 @@
-"""What is known of a volume besides its projections: priors, for `PenalisedLeastSquares`."""
+"""Priors for `PenalisedLeastSquares`: knowledge of a volume besides its projections."""
 
 from lingo_mi.reconstruction.priors.denoiser import Denoiser, NonLocalMeans
 from lingo_mi.reconstruction.priors.generalised_variation import TGV

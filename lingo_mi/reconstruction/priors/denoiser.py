@@ -1,4 +1,4 @@
-"""Denoisers in the place of a proximal map (plug and play)."""
+"""Denoisers that replace a proximal map (plug and play)."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from lingo_mi.reconstruction.priors.prior import Prior, clipped
 
 @dataclass
 class Denoiser(Prior):
-    """A denoiser in the place of a proximal map (plug and play).
+    """A denoiser that replaces a proximal map (plug and play).
 
     Parameters
     ----------
     function : callable
-        Called as function(volume, strength) with float32 [x, y, z], densities per mm, and a number in 1/mm that says how much to
-        smooth; returns an array of the same shape.
+        It is called as function(volume, strength) with float32 [x, y, z], densities per mm, and a number in 1/mm that sets how
+        much to smooth. It returns an array of the same shape.
 
     Raises
     ------
     InputError
-        Where the function cannot be called; in a reconstruction where it fails, or returns another shape, NaN or infinity.
+        If the function cannot be called. In a reconstruction, if it fails or returns another shape, NaN or infinity.
 
     References
     ----------
@@ -75,9 +75,9 @@ class NonLocalMeans(Denoiser):
     Parameters
     ----------
     patch : int
-        Voxels along a side of the surroundings that are compared, odd, at least 1.
+        Side of the compared surroundings in voxels, odd, at least 1.
     distance : int
-        Voxels to either side that are searched, at least 1.
+        Distance in voxels up to which other voxels are compared, at least 1.
 
     Raises
     ------

@@ -22,15 +22,15 @@ PAIRS = (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)
 class TGV(Prior):
     """Total generalised variation of second order: the least of |differences - v| + second |symmetric derivative of v| over v.
 
-    A slope costs nothing, an edge as much as for `TV`. It suits objects whose density varies smoothly within parts. Voxels count
-    as cubes.
+    A slope costs nothing, and an edge costs as much as in `TV`. It suits objects whose density varies smoothly within parts.
+    Voxels are treated as cubes.
 
     Parameters
     ----------
     second : float
-        How much the second derivative counts, above 0.
+        Weight of the second derivative, above 0.
     inner : int
-        Steps of the primal-dual method in a call, at least 1. A call goes on from the variables of the one before.
+        Steps of the primal-dual method in a call, at least 1. A call continues from the variables of the previous one.
 
     Raises
     ------

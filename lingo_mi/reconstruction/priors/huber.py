@@ -15,12 +15,12 @@ from lingo_mi.reconstruction.priors.prior import Prior, check_positive
 class Huber(Prior):
     """Huber's function of the lengths of the differences between neighbouring voxels: quadratic up to `delta`, linear above.
 
-    It smooths noise and keeps edges, without the steps that total variation makes of slopes. It is smooth: R has a gradient.
+    It smooths noise and preserves edges, and does not turn slopes into steps, as total variation does. R has a gradient.
 
     Parameters
     ----------
     delta : float
-        Length up to which a difference counts as noise, 1/mm, above 0. The smaller, the more iterations are needed.
+        Length up to which a difference counts as noise, 1/mm, above 0. A smaller delta needs more iterations.
 
     Raises
     ------

@@ -12,15 +12,15 @@ from lingo_mi.reconstruction.parameters import LARGE, check_range
 
 
 class Prior:
-    """What is known of a volume besides its projections: a function R of it, for `PenalisedLeastSquares`.
+    """Knowledge of a volume besides its projections: a function R of the volume, for `PenalisedLeastSquares`.
 
-    A kind of your own derives from this class and defines `prox`, or `gradient` and `curvature`, or all three where R is a sum
-    of a smooth part and another one. This class itself is R = 0. Volumes are mi.Float [x * y * z], z fastest, densities per mm.
+    To write a prior, derive from this class and define `prox`, or `gradient` and `curvature`, or all three if R is the sum of a
+    smooth part and another one. This class itself is R = 0. Volumes are mi.Float [x * y * z], z fastest, densities per mm.
 
     Attributes
     ----------
     curvature : float
-        A bound on the second derivatives of the smooth part, mm; 0 without one.
+        A bound on the second derivatives of the smooth part, mm, or 0 without a smooth part.
 
     Examples
     --------
@@ -35,14 +35,14 @@ class Prior:
     curvature: float = 0.0
 
     def prox(self, x: mi.Float, strength: float, size: tuple[int, int, int], upper: float = inf) -> mi.Float:
-        """The z in [0, upper] with the least 1/2 |z - x|^2 + strength R(z), R without its smooth part.
+        """The z in [0, upper] that minimises 1/2 |z - x|^2 + strength R(z), R without its smooth part.
 
         Parameters
         ----------
         x : mi.Float
             Densities, evaluated.
         strength : float
-            Of the prior, at least 0.
+            Strength of the prior, at least 0.
         size : tuple of int
             Voxels along x, y and z.
         upper : float
@@ -58,7 +58,7 @@ class Prior:
         return z
 
     def gradient(self, x: mi.Float, size: tuple[int, int, int]) -> mi.Float | None:
-        """The gradient of the smooth part of R; None where it has none. x and size are as for `prox`."""
+        """The gradient of the smooth part of R, or None without a smooth part. x and size are as for `prox`."""
         return None
 
     def begin(self) -> None:

@@ -19,7 +19,7 @@ from lingo_mi.reconstruction.priors.prior import Prior, check_positive
 class PriorSum(Prior):
     """Several priors at once: the sum of weight times R.
 
-    Gradients add up. Of several proximal maps, that of the sum is found by those of the parts in turn, each on what the others
+    Gradients add up. The proximal map of the sum is computed by applying the maps of the priors in turn, each to what the others
     leave (Dykstra's algorithm).
 
     Parameters
@@ -29,7 +29,7 @@ class PriorSum(Prior):
     weights : sequence of float, optional
         One for each prior, above 0 (default: 1).
     inner : int
-        Turns in a call, at least 1. A call goes on from the variables of the one before.
+        Turns in a call, at least 1. A call continues from the variables of the previous one.
 
     Raises
     ------

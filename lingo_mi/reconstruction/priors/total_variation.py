@@ -1,4 +1,4 @@
-"""Total variation, and one that counts less or more along a direction (Dr.Jit)."""
+"""Total variation, also with another weight along a direction (Dr.Jit)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from lingo_mi.reconstruction.priors.prior import Prior, check_positive, clipped
 class TV(Prior):
     """Isotropic total variation: the sum of the lengths of the differences between neighbouring voxels.
 
-    It suits objects of uniform parts. Voxels count as cubes.
+    It suits objects of uniform parts. Voxels are treated as cubes.
 
     Parameters
     ----------
     inner : int
-        Steps of the dual problem in a call, at least 1. A call goes on from the dual variables of the one before.
+        Steps of the dual problem in a call, at least 1. A call continues from the dual variables of the previous one.
 
     Raises
     ------
@@ -92,15 +92,15 @@ class TV(Prior):
 class DirectionalTV(TV):
     """Total variation whose differences along a direction count `weight` times, for limited arcs.
 
-    Edges that no view of the arc runs along are invisible: their normals are near the middle view's direction. A weight above 1
-    along this direction takes the smear there that the missing views leave.
+    A limited arc does not show edges to which no ray is tangent. Their normals are near the direction of the middle view. A
+    weight above 1 along this direction removes the smear that the missing views leave there.
 
     Parameters
     ----------
     direction : sequence of float
-        Of three numbers along x, y and z; its length does not matter. Source to panel of the arc's middle view.
+        From source to panel in the middle view of the arc: x, y and z of a vector of any length.
     weight : float
-        Above 0; 1 is `TV`.
+        Weight along the direction, above 0. A weight of 1 is `TV`.
     inner : int
         As for `TV`.
 

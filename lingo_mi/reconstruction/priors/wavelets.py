@@ -19,10 +19,10 @@ MODE = 'periodization'  # the one whose transform is orthonormal
 
 @dataclass
 class Wavelets(Prior):
-    """The sum of the absolute wavelet coefficients, but for the coarsest ones; the transform is orthonormal.
+    """The sum of the absolute wavelet coefficients without the coarsest ones, for an orthonormal transform.
 
-    The proximal map is a soft threshold. A call shifts the volume by another offset, since the blocks of a fixed one would show
-    (cycle spinning). Bounds on the densities are applied after the threshold.
+    The proximal map is a soft threshold. Each call shifts the volume by another offset, because the blocks of a fixed offset
+    would show (cycle spinning). Bounds on the densities are applied after the threshold.
 
     Parameters
     ----------
