@@ -178,11 +178,11 @@ def load_raw(
     Parameters
     ----------
     frames : path-like
-        A folder of images (.tif, .edf, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, DICOM (a file or a folder), .npy
-        [n, v, u], or HDF5 as NXtomo or DXchange.
+        A folder of images (.tif, .edf, .png, .jp2, .his, .hnd, .hnc, .xim), a multi-page .tif, a .edf, DICOM (a file or a
+        folder), Zeiss' .txrm, .npy [n, v, u], or HDF5 as NXtomo or DXchange.
     geometry : path-like or Geometry or None
-        The geometry of whole frames: a `Geometry`, a .yml, Nikon's .xtekct, or RTK's .xml. None takes it from the file of the
-        frames, such as DICOM.
+        The geometry of whole frames: a `Geometry`, a .yml, a scanner's file (Nikon's .xtekct, NSI's .nsipro, Bruker's .log, GE's
+        .pca), or RTK's .xml. None takes it from the file of the frames, such as DICOM or .txrm.
     progress : bool
         Whether to show a progress bar on standard error.
     options

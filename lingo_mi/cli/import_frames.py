@@ -24,13 +24,14 @@ def parser() -> Parser:
     add = p.add_argument
     add(
         'frames',
-        help='a folder of .tif, .edf, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, DICOM (a file or a folder), '
-        '.npy [n, v, u], or .h5 / .nxs',
+        help='a folder of .tif, .edf, .png, .jp2, .his, .hnd, .hnc or .xim images, a multi-page .tif, a .edf, DICOM (a file or a '
+        "folder), Zeiss' .txrm, .npy [n, v, u], or .h5 / .nxs",
     )
     add(
         '--geometry',
         metavar='F',
-        help="of the whole frames: .yml, Nikon's .xtekct, or RTK's .xml (default: what the frames' own file says, as of DICOM)",
+        help="of the whole frames: .yml, a scanner's .xtekct (Nikon), .nsipro (NSI), .log (Bruker) or .pca (GE), or RTK's .xml "
+        "(default: what the frames' own file says: DICOM, .txrm)",
     )
     add(
         '--out',

@@ -107,22 +107,10 @@ _KEYS = {
 
 
 MOST_LISTED = 1000  # poses in a geometry file
-FRAMES = {
-    '.tif',
-    '.tiff',
-    '.edf',
-    '.his',
-    '.hnd',
-    '.hnc',
-    '.xim',
-    '.h5',
-    '.hdf5',
-    '.hdf',
-    '.nxs',
-    '.nx',
-    '.dcm',
-    '.ima',
-}  # raw
+FRAMES = {  # raw ones
+    *('.tif', '.tiff', '.edf', '.png', '.jp2', '.j2k', '.jpx', '.his', '.hnd', '.hnc', '.xim'),
+    *('.h5', '.hdf5', '.hdf', '.nxs', '.nx', '.dcm', '.ima', '.txrm', '.xrm'),
+}
 VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 

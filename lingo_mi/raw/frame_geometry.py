@@ -15,12 +15,20 @@ from lingo_mi.files import scanner_dict
 from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
 from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, Grid
 from lingo_mi.geometry.curved import slid
+from lingo_mi.raw.bruker import read_skyscan_log
 from lingo_mi.raw.nikon import read_numbers, read_xtekct
+from lingo_mi.raw.nsi import read_nsipro
 from lingo_mi.raw.options import Options
+from lingo_mi.raw.phoenix import read_pca
 from lingo_mi.raw.recording import Recording, Taken
 
 # Files that say where a scanner took its frames, but for voxels, by suffix.
-SCANNER_FILES: dict[str, Callable[[Path], Taken]] = {'.xtekct': read_xtekct}
+SCANNER_FILES: dict[str, Callable[[Path], Taken]] = {
+    '.xtekct': read_xtekct,  # Nikon
+    '.nsipro': read_nsipro,  # North Star Imaging
+    '.log': read_skyscan_log,  # Bruker
+    '.pca': read_pca,  # GE, Waygate
+}
 KNOWN = ', '.join(('.yml', *SCANNER_FILES, '.xml (RTK)'))
 
 

@@ -1,4 +1,4 @@
-"""Files and folders of raw frames: TIFF, EDF, those that RTK reads, .npy and HDF5 here, others in a file of their own."""
+"""Files and folders of raw frames: TIFF, EDF, RTK's, .npy and HDF5 here, others in files of their own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
-from lingo_mi.raw import dicom
+from lingo_mi.raw import dicom, pictures, zeiss
 from lingo_mi.raw.recording import Frames, Recording, checked
 from lingo_mi.storage.file_access import one_line, optional, reading
 
@@ -217,12 +217,14 @@ def _unit(data):
 IMAGES: dict[str, Callable[[Path], np.ndarray]] = {
     **dict.fromkeys(('.tif', '.tiff'), read_tiff_file),
     '.edf': _edf_image,
+    **dict.fromkeys(pictures.SUFFIXES, pictures.read_picture),
     **dict.fromkeys(('.his', '.hnd', '.hnc', '.xim'), _rtk_image),  # Elekta's and Varian's
 }
 FILES: dict[str, Callable[[Path], Recording]] = {
     '.npy': _array,
     **dict.fromkeys(('.tif', '.tiff'), _tiff),
     '.edf': _edf,
+    **dict.fromkeys(zeiss.SUFFIXES, zeiss.open_txrm),
     **dict.fromkeys(dicom.SUFFIXES, dicom.open_file),
     **dict.fromkeys(('.h5', '.hdf5', '.hdf', '.nxs', '.nx'), _hdf5),
 }

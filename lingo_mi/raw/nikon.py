@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import configparser
 import re
-import warnings
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.raw.recording import Taken
-from lingo_mi.storage.file_access import one_line, reading
+from lingo_mi.raw.settings import Settings
+from lingo_mi.storage.file_access import reading
 
 
 def read_xtekct(path: PathLike | str) -> Taken:
@@ -26,52 +25,29 @@ def read_xtekct(path: PathLike | str) -> Taken:
     InputError
         If the file is missing or damaged, or lacks a number.
     """
-    path = Path(path)
-    parser = configparser.ConfigParser(strict=False, interpolation=None)
-    with reading(path):
-        try:
-            parser.read_string(path.read_text(encoding='utf-8', errors='replace'))
-        except configparser.Error as error:
-            raise InputError(f'{path}: is no .xtekct file ({one_line(error)[:120]})') from None
-    if not parser.has_section('XTekCT'):
-        raise InputError(f'{path}: has no section [XTekCT]; give the .xtekct of the scan')
-    section = parser['XTekCT']
-
-    def number(name, default=None):
-        try:
-            value = float(section[name]) if default is None or name in section else float(default)
-        except KeyError:
-            raise InputError(f'{path}: {name} is missing; give the .xtekct of the scan') from None
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            raise InputError(f'{path}: {name} must be a number, not {section[name]!r}')
-        return value
-
-    n = number('Projections')
-    DSO, DSD = number('SrcToObject'), number('SrcToDetector')
-    if not 1 <= n <= MOST_VIEWS or not DSD >= DSO > 0:
-        raise InputError(f'{path}: needs Projections from 1 to {MOST_VIEWS} and SrcToDetector >= SrcToObject > 0')
-    top, bottom = number('CentreOfRotationTop', 0), number('CentreOfRotationBottom', 0)
+    section = 'XTekCT'
+    settings = Settings.read(path, '.xtekct', section)
+    number = partial(settings.number, section)
+    n, DSO, DSD = settings.circle((section, 'Projections'), (section, 'SrcToObject'), (section, 'SrcToDetector'))
+    top, bottom = number('CentreOfRotationTop', 0.0), number('CentreOfRotationBottom', 0.0)
     unread = [
         name
         for name in ('DetectorOffsetX', 'DetectorOffsetY', 'ObjectOffsetX', 'ObjectTilt', 'ObjectRoll')
-        if number(name, 0)
+        if number(name, 0.0)
     ]
     if top != bottom:
         unread.append('the slope between CentreOfRotationTop and CentreOfRotationBottom')
-    if unread:
-        warnings.warn(f'{path}: {", ".join(unread)} is not read: calibrate the scan if its axis is off', stacklevel=2)
+    settings.warn_unread(unread)
     values = dict(
         DSO=DSO,
         DSD=DSD,
         nDetector=[int(number('DetectorPixelsY')), int(number('DetectorPixelsX'))],
         dDetector=[number('DetectorPixelSizeY'), number('DetectorPixelSizeX')],
-        angles=(number('InitialAngle', 0) + number('AngularStep') * np.arange(int(n))).tolist(),
+        angles=(number('InitialAngle', 0.0) + number('AngularStep') * np.arange(n)).tolist(),
     )
     if top + bottom:
         values['COR'] = (top + bottom) / 2 * DSO / DSD
-    return Taken(values, columns=-1, white=number('WhiteLevel', 0) or None)
+    return Taken(values, columns=-1, white=number('WhiteLevel', 0.0) or None)
 
 
 def read_numbers(path: PathLike | str) -> np.ndarray:

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 import lingo_mi as lm
 from helpers.raw_frames import raw_frames
@@ -98,6 +99,29 @@ def test_edf(tmp_path, raw, scan_yml):
     for i, image in enumerate(raw.views):
         edf(data=image).write(str(tmp_path / 'views' / f'{i}.edf'))
     check(load(tmp_path / 'views', scan_yml, **save(tmp_path, raw)), raw)
+
+
+@pytest.mark.parametrize(('suffix', 'dtype'), [('png', np.uint8), ('png', np.uint16), ('jp2', np.uint16)], ids=str)
+def test_pictures(tmp_path, suffix, dtype):
+    stack = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (11, 12, 9)).astype(dtype)
+    for i, image in enumerate(stack):
+        Image.fromarray(image).save(tmp_path / f'a{i}.{suffix}')
+    found = open_recording(tmp_path).views
+    assert (len(found), found.shape, found.dtype) == (11, (12, 9), dtype)
+    np.testing.assert_array_equal([found[i] for i in range(11)], stack)
+    (tmp_path / f'a3.{suffix}').write_bytes((tmp_path / f'a3.{suffix}').read_bytes()[:-40])
+    with pytest.raises(InputError, match='a3'):
+        open_recording(tmp_path).views[3]
+    (tmp_path / f'a0.{suffix}').write_bytes(b'none')
+    with pytest.raises(InputError, match=f'a0.{suffix}: is damaged '):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize('mode', ['RGB', 'P', 'LA', '1'])
+def test_pictures_in_colours(tmp_path, mode):
+    Image.new(mode, (9, 12)).save(tmp_path / 'a.png')
+    with pytest.raises(InputError, match=f'a.png: holds {mode} pixels .*; write counts as 8 or 16 bits of grey'):
+        open_recording(tmp_path)
 
 
 def write_his(path, image):
