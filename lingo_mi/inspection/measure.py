@@ -28,6 +28,11 @@ BRIGHT, FLAT = 0.85, 0.25  # air in intensities: this part of the highest, and w
 DARK = 0.7  # of the air in intensities: the object lies below
 HALF_TURN = 175  # degrees: views of less do not tell the axis
 WIDE = 2  # half a panel over its distance from the source, which no panel has
+BLOCK = (
+    5,
+    3,
+)  # pixels along the edge of the panel and across, of which the median is taken: a noisy pixel is not the object
+SURE = 6  # standard deviations above air that are the object
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
 
 
@@ -300,32 +305,55 @@ def open_beam(scan: Scan) -> float | None:
 
 
 def _border(p, valid, high):
-    nu = p.shape[2]
-    edge = max(1, nu // 64)
-    sides = np.concatenate([p[:, :, :edge][valid[:, :, :edge]], p[:, :, -edge:][valid[:, :, -edge:]]])
-    if not sides.size:
+    p = np.where(valid, p, np.nan)
+    ends = _outer(np.swapaxes(p, 1, 2)) if p.shape[1] >= 3 else None
+    sides = _outer(p)
+    values = sides[np.isfinite(sides)]
+    if not values.size:
         return None
-    low = np.percentile(sides, 5)
-    near = sides[sides <= low + 0.1 * (high - low)]
-    even = low < 0.5 * high and near.size > 0.9 * sides.size  # all around: air, but not at 0
+    low = np.percentile(values, 5)
+    near = values[values <= low + 0.1 * (high - low)]
+    even = low < 0.5 * high and near.size > 0.9 * values.size  # all around: air, but not at 0
     air = spread = None
     if low <= 0.2 * high or even:
         air = float(np.median(near))
-        spread = _air_spread(p, valid, edge, low + 0.1 * (high - low))
-    limit = (air or 0.0) + 0.1 * high
-
-    def cut(part):
-        return int(((p[part] > limit) & valid[part]).any((1, 2)).sum())
-
-    return Border(air, spread, cut(np.s_[:, :, [0, -1]]), cut(np.s_[:, [0, -1], :]) if p.shape[1] >= 3 else 0)
+        spread = _air_spread(p, low + 0.1 * (high - low))
+    return Border(
+        air, spread, *(0 if x is None else int(_reaches(x, air or 0.0, 0.1 * high).sum()) for x in (sides, ends))
+    )
 
 
-def _air_spread(p, valid, edge, limit):
-    """Standard deviation of the views' air levels, those of pixels near the sides that are below the limit."""
-    near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2)
-    near = np.where(np.concatenate([valid[:, :, :edge], valid[:, :, -edge:]], 2), near, np.inf).reshape(len(p), -1)
-    levels = [np.median(view[view < limit]) for view in near if (view < limit).sum() > 8]
-    return None if len(levels) < len(p) / 2 else float(np.std(levels))
+def _outer(p):
+    """Medians of `BLOCK` pixels at the left and right edge of the views, [view, row, side], NaN where none is known."""
+    long, deep = (min(size, have) for size, have in zip(BLOCK, p.shape[1:]))
+    edges = np.stack([p[:, :, :deep], p[:, :, -deep:]], 2)[:, : p.shape[1] // long * long]
+    blocks = edges.reshape(len(p), -1, long, 2, deep).swapaxes(2, 3).reshape(len(p), -1, 2, long * deep)
+    return _medians(blocks)
+
+
+def _medians(blocks):
+    """Along the last axis, of what is not NaN."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', RuntimeWarning)  # of blocks of NaN alone
+        return np.nanmedian(blocks, -1)
+
+
+def _reaches(outer, air, limit):
+    """In which views an edge, `_outer`, is higher than air by the limit and by the noise, bool [view]."""
+    steps = np.abs(np.diff(outer, axis=1 if outer.shape[1] > 1 else 0))
+    noise = np.median(steps[np.isfinite(steps)]) / 0.954 if np.isfinite(steps).any() else 0.0  # 0.954: of a Gaussian
+    return (outer > air + max(limit, SURE * noise)).any((1, 2))
+
+
+def _air_spread(p, limit):
+    """Standard deviation of the views' air levels, those of pixels near the sides that are below the limit, without its noise."""
+    edge = max(1, p.shape[2] // 64)
+    near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2).reshape(len(p), -1)
+    air = [known for view in near if (known := view[view < limit]).size > 8]
+    if len(air) < len(p) / 2:
+        return None
+    noise = np.mean([np.pi / 2 * view.var() / view.size for view in air])  # of a median
+    return float(np.sqrt(max(np.var([np.median(view) for view in air]) - noise, 0.0)))
 
 
 def _black_and_doubled(p, valid, mass):
@@ -384,7 +412,7 @@ def _plane(scan: Scan, air: float) -> Plane | Obstacle:
     row = row[:, : columns * by].reshape(len(p), columns, by).mean(2)
     u = (np.arange(columns) + 0.5) * by * du - nu * du / 2 + geometry.offDetector[1]
     peak = np.percentile(row, 99.5)
-    if row[:, [0, -1]].max() > 0.15 * peak:
+    if _reaches(_outer(row[:, None]), 0.0, 0.15 * peak).any():
         return 'truncation'
     return Plane(row, geometry.angles, u, geometry.DSD if geometry.mode == 'cone' else 0.0)
 

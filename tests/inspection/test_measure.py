@@ -112,6 +112,38 @@ def test_air_and_truncation(foot):
     assert any('left or right edge' in line and '--method lingo also needs -D' in line for line in advised(cut))
 
 
+def noisy(p, level, kind):
+    """Noise of this part of the highest line integral, or of the beam's photons, for an object that lets 5 % through."""
+    rng = np.random.default_rng(1)
+    if kind == 'equal':
+        return p + rng.normal(0, level * p.max(), p.shape)
+    return -np.log(np.maximum(rng.poisson(np.exp(-3 * p / p.max()) / level**2), 0.5) * level**2)
+
+
+@pytest.mark.parametrize(('mode', 'kind'), [('cone', 'equal'), ('parallel', 'photons')])
+@pytest.mark.parametrize('level', [0.01, 0.02, 0.05])
+def test_noisy_pixels_are_not_the_object(mode, level, kind):
+    """Neither at the edge, nor where the axis is measured; an object that is there is found in as many views."""
+    scan = scanned('foot', mode, 60)
+    assert advised(lm.Scan(scan.geometry, noisy(scan.projections, level, kind))) == []
+    for part in (np.s_[:, :, 30:66], np.s_[:, 50:, :]):
+        p = scan.projections[part]
+        geometry = replace(scan.geometry, nDetector=p.shape[1:])
+        found, quiet = (measure(lm.Scan(geometry, q)).border for q in (noisy(p, level, kind), p))
+        for name in ('cut_sides', 'cut_ends'):
+            expected = getattr(quiet, name)
+            assert abs(getattr(found, name) - expected) <= 0.1 * len(scan), name
+        assert max(quiet.cut_sides, quiet.cut_ends) > 20
+
+
+def test_an_object_at_a_corner_of_the_edge(foot):
+    """Five rows and two columns of a single view, and two pixels of another."""
+    p = foot.projections.copy()
+    p[3, 40:45, :2] = p.max()
+    p[5, 40, :2] = p.max()
+    assert measure(lm.Scan(foot.geometry, p)).border.cut_sides == 1
+
+
 def test_pixels_that_are_not_valid_disagree_with_nothing(foot):
     valid = np.ones(foot.projections.shape, bool)
     valid[:, :, 30] = False
