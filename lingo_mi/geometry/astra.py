@@ -11,7 +11,11 @@ nothing about where a row lies: vectors made by ASTRA's own `geom_2vec` have v a
 both mean the same as long as they stay with their projections. `circle` and `views` reverse ASTRA's rows, so that its scanners
 are this package's.
 
-ASTRA documentation, "3D geometries"; `astra.functions.geom_2vec` and `astra.create_vol_geom`.
+A geometry of two dimensions, `fanflat`, `parallel`, or their vectors (source or ray, centre, u), is that of a panel of one row
+before a volume of one slice at z = 0: `sinogram[:, None]` goes with it. ASTRA's image is then `volume[:, ::-1, 0].T`, its first
+row at the largest y. `to_vectors(rays, (1, columns))[:, [0, 1, 3, 4, 6, 7]]` are the vectors of two dimensions.
+
+ASTRA documentation, "2D geometries" and "3D geometries"; `astra.functions.geom_2vec` and `astra.create_vol_geom`.
 """
 
 from __future__ import annotations
@@ -40,6 +44,8 @@ VECTORS = {
     'parallel3d_vec': 'parallel',
     'cyl_cone_vec': 'cone',
 }  # of scans with a pose for every view
+# Types of two dimensions, and those of three that they are with one row.
+IN_PLANE = {'fanflat': 'cone', 'parallel': 'parallel3d', 'fanflat_vec': 'cone_vec', 'parallel_vec': 'parallel3d_vec'}
 
 
 def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]) -> Geometry:
@@ -51,9 +57,10 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     Parameters
     ----------
     proj_geom : dict
-        Of the type 'cone', 'cone_vec', 'cyl_cone_vec', 'parallel3d' or 'parallel3d_vec'; lengths as they are.
+        Of the type 'cone', 'cone_vec', 'cyl_cone_vec', 'parallel3d' or 'parallel3d_vec', or in two dimensions 'fanflat',
+        'fanflat_vec', 'parallel' or 'parallel_vec'; lengths as they are.
     vol_geom : dict
-        Of `astra.create_vol_geom` in three dimensions.
+        Of `astra.create_vol_geom`. In two dimensions, its slice is as thick as a pixel is wide.
     **voxels
         Instead of vol_geom: either grid, or nVoxel, dVoxel and offOrigin, as of `Geometry.cone`.
 
@@ -71,6 +78,7 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     """
     if (vol_geom is None) == (not voxels):
         raise InputError('an ASTRA geometry needs its voxels: give either vol_geom, or grid, or both nVoxel and dVoxel')
+    proj_geom = in_space(proj_geom)
     voxel_grid = grid_of(voxels) if vol_geom is None else grid(vol_geom)
     if kind_of(proj_geom) in CIRCLES:
         return CircularGeometry(**circle(proj_geom), grid=voxel_grid)
@@ -122,6 +130,32 @@ def _bent_towards_source(rays):
     return np.sum(np.cross(rays.u, rays.v) * (rays.source - rays.corner), 1) > 0
 
 
+def in_space(proj_geom: dict) -> dict:
+    """A dict of three dimensions: of a panel of one row, as high as a pixel is wide, where it has two.
+
+    Raises
+    ------
+    InputError
+        If a number is missing, or the vectors are no poses.
+    """
+    kind = kind_of(proj_geom)
+    if kind not in IN_PLANE:
+        return proj_geom
+    flat = dict(type=IN_PLANE[kind], DetectorRowCount=1, DetectorColCount=_number(proj_geom, 'DetectorCount'))
+    if not kind.endswith('_vec'):
+        width = _number(proj_geom, 'DetectorWidth')
+        return {**proj_geom, **flat, 'DetectorSpacingX': width, 'DetectorSpacingY': width}
+    vectors = limits.lengths('Vectors', _given(proj_geom, 'Vectors'))
+    if vectors.ndim != 2 or vectors.shape[1] != 6:
+        raise InputError(
+            f'the Vectors of {kind} must be 6 numbers for every view, not an array of shape {vectors.shape}'
+        )
+    out = np.zeros((len(vectors), 12))
+    out[:, [0, 1, 3, 4, 6, 7]] = vectors
+    out[:, 11] = np.linalg.norm(vectors[:, 4:], axis=1)
+    return {**flat, 'Vectors': out}
+
+
 def circle(proj_geom: dict) -> dict[str, Any]:
     """The scanner of a dict of the types `CIRCLES`, as the numbers of a `CircularGeometry`; ASTRA's rows reversed.
 
@@ -157,7 +191,8 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     """
     kind = kind_of(proj_geom)
     if kind not in VECTORS:
-        raise InputError(f'an ASTRA geometry must be of the type {", ".join(CIRCLES | VECTORS)}, not {shown(kind)}')
+        known = ', '.join(CIRCLES | VECTORS | IN_PLANE)
+        raise InputError(f'an ASTRA geometry must be of the type {known}, not {shown(kind)}')
     nDetector, vectors, radius = _panel(proj_geom), _given(proj_geom, 'Vectors'), None
     if kind == 'cyl_cone_vec':
         vectors = limits.lengths('Vectors', vectors)
@@ -182,11 +217,12 @@ def grid(vol_geom: dict) -> Grid:
     Raises
     ------
     InputError
-        If it has two dimensions only, or a number is missing or makes no grid.
+        If a number is missing or makes no grid.
     """
-    if not isinstance(vol_geom, Mapping) or 'GridSliceCount' not in vol_geom:
-        raise InputError('the ASTRA volume has no GridSliceCount: give one of three dimensions')
     window = _given(vol_geom, 'option')
+    if 'GridSliceCount' not in vol_geom:  # of two dimensions
+        half = (_number(window, 'WindowMaxX') - _number(window, 'WindowMinX')) / _number(vol_geom, 'GridColCount') / 2
+        vol_geom, window = {**vol_geom, 'GridSliceCount': 1}, {**window, 'WindowMinZ': -half, 'WindowMaxZ': half}
     counts = np.array([_number(vol_geom, f'Grid{name}Count') for name in ('Col', 'Row', 'Slice')])
     low, high = (np.array([_number(window, f'Window{end}{axis}') for axis in 'XYZ']) for end in ('Min', 'Max'))
     if not np.all(counts >= 1):

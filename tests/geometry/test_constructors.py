@@ -385,15 +385,44 @@ def test_astra_vectors_both_ways(parallel):
         same_rays(g.rays(), f)
 
 
+PLANE = dict(
+    GridColCount=5, GridRowCount=6, option=dict(WindowMinX=-1.5, WindowMaxX=3.5, WindowMinY=-8.0, WindowMaxY=4.0)
+)
+
+
+@pytest.mark.parametrize('kind', ['fanflat', 'parallel'])
+def test_astra_in_two_dimensions(kind):
+    """Its rays by `astra.functions.geom_2vec` of both types, and by its vectors, in the plane z = 0 of the one slice."""
+    proj = dict(type=kind, DetectorWidth=2.0, DetectorCount=24, ProjectionAngles=ANGLES)
+    if kind == 'fanflat':
+        proj |= dict(DistanceOriginSource=900, DistanceOriginDetector=500)
+    g = Geometry.from_astra(proj, PLANE)
+    assert isinstance(g, CircularGeometry) and (g.nDetector, g.dDetector) == ((1, 24), (2, 2))
+    assert (g.grid.shape, g.grid.spacing, g.grid.centre) == ((5, 6, 1), (1, 2, 1), (1, -2, 0))
+    s, c = np.sin(ANGLES), np.cos(ANGLES)
+    far = (900, 500) if kind == 'fanflat' else (1, 0)
+    vectors = np.stack([far[0] * s, -far[0] * c, -far[1] * s, far[1] * c, 2 * c, 2 * s], 1)
+    np.testing.assert_allclose(
+        np.abs(astra.to_vectors(g.rays(), g.nDetector)[:, [0, 1, 3, 4, 6, 7]]), np.abs(vectors), atol=1e-9
+    )
+    again = Geometry.from_astra(dict(type=kind + '_vec', DetectorCount=24, Vectors=vectors), PLANE)
+    assert isinstance(again, CircularGeometry)
+    same_rays(again.rays(), g.rays())
+    row = g.rays().corner + g.rays().v / 2
+    np.testing.assert_allclose(row[:, 2], 0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     'proj, more, match',
     [
-        (dict(type='fanflat'), dict(vol_geom=VOLUME), "must be of the type cone, .*not 'fanflat'"),
+        (dict(type='sparse_matrix'), dict(vol_geom=VOLUME), "must be of the type cone, .*not 'sparse_matrix'"),
+        (dict(type='fanflat', DetectorCount=4), dict(vol_geom=VOLUME), 'has no DetectorWidth'),
+        (dict(type='fanflat_vec', DetectorCount=4, Vectors=[[1, 2]]), GRID, '6 numbers for every view'),
         (dict(type='cone'), dict(vol_geom=VOLUME), 'has no Distance'),
         (PLAIN['cone'], {}, 'needs its voxels'),
         (PLAIN['cone'], dict(vol_geom=VOLUME, **GRID), 'needs its voxels'),
         (PLAIN['cone'], dict(nVoxel=4), 'needs its voxels'),
-        (PLAIN['cone'], dict(vol_geom=dict(GridRowCount=4, GridColCount=4)), 'three dimensions'),
+        (PLAIN['cone'], dict(vol_geom=dict(GridRowCount=4, GridColCount=4)), 'has no option'),
         (dict(type='cone_vec', DetectorRowCount=2, DetectorColCount=2, Vectors=[[1, 2]]), GRID, '12 numbers'),
     ],
 )
