@@ -317,6 +317,18 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
+def write_pickle(path: PathLike | str, data: dict[str, Any]) -> None:
+    """Writes a dictionary of plain data and arrays that Python reads under NumPy 1 and 2, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    with replacing(path) as temporary, open(temporary, 'wb') as stream:
+        _Pickler(stream, protocol=5).dump(data)
+
+
 def write_naf(path: PathLike | str, dataset: Dataset) -> None:
     """Writes a pickle that NAF, SAX-NeRF and R2-Gaussian read, under NumPy 1 and 2, whole or not at all.
 
@@ -350,5 +362,4 @@ def write_naf(path: PathLike | str, dataset: Dataset) -> None:
             data[name] = {'projections': scan.projections / np.float32(1000), 'angles': scan.geometry.angles}
     if dataset.volume is not None:
         data['image'] = np.asarray(dataset.volume, np.float32)
-    with replacing(path) as temporary, open(temporary, 'wb') as stream:
-        _Pickler(stream, protocol=5).dump(data)
+    write_pickle(path, data)

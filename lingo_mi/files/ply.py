@@ -51,7 +51,15 @@ _TYPES = {
 }
 
 
-def _check(where, centres, scales, quaternions, density, name='density'):
+def check_cloud(
+    where: PathLike | str,
+    centres: np.ndarray,
+    scales: np.ndarray,
+    quaternions: np.ndarray,
+    density: np.ndarray,
+    name: str = 'density',
+) -> None:
+    """Raises InputError unless these are N Gaussians, as of `write_ply`. name: what the message calls the density."""
     n = len(density)
     if n == 0:
         raise InputError(f'{where}: the cloud is empty; at least one Gaussian is needed')
@@ -99,7 +107,7 @@ def write_ply(
     density = density.reshape(-1) if density.shape[1:] == (1,) else density
     if density.ndim != 1:
         raise InputError(f'{path}: density must have one dimension, not the shape {density.shape}')
-    _check(path, centres, scales, quaternions, density)
+    check_cloud(path, centres, scales, quaternions, density)
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     depth = np.maximum(density, 0) * np.sqrt(2 * np.pi) * np.exp(np.log(scales).mean(1))
     # logit(1 - exp(-t)) = log(exp(t) - 1), limited to where viewers' sigmoid does not saturate
@@ -133,7 +141,7 @@ def write_radiance_ply(
         As `write_ply` does.
     """
     centres, scales, quaternions, opacity = (np.asarray(a, float) for a in (centres, scales, quaternions, opacity))
-    _check(path, centres, scales, quaternions, opacity, 'opacity')
+    check_cloud(path, centres, scales, quaternions, opacity, 'opacity')
     quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     opacity = np.clip(opacity, 1e-12, 1 - 1e-12)  # the ends have no logit
     rest = np.zeros((len(opacity), _REST))
@@ -271,5 +279,5 @@ def read_ply(path: PathLike | str) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     with np.errstate(over='ignore'):
         scales = np.exp(take(_SCALE))
     cloud = take(_CENTRE), scales, take((*_ROT[1:], _ROT[0])), rows['density'].astype(np.float32)
-    _check(path, *cloud)
+    check_cloud(path, *cloud)
     return cloud

@@ -9,9 +9,10 @@ import numpy as np
 from scipy import ndimage
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start.density import fitted_factor, sampled_density
 from lingo_mi.fitting.start.number import NumberedStart
-from lingo_mi.fitting.start.start import Render, StartingCloud, neighbour_distance
+from lingo_mi.fitting.start.start import Render, StartingCloud
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.lingo.masks import masks, truncated
 from lingo_mi.lingo.voxel_filter import valid_voxels, voxel_centres

@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start.number import NumberedStart
-from lingo_mi.fitting.start.start import Render, StartingCloud, neighbour_distance
+from lingo_mi.fitting.start.start import Render, StartingCloud
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.lingo.voxel_filter import voxel_centres
 from lingo_mi.reconstruction.fdk import FDK

@@ -9,9 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start.density import fitted_factor, sampled_density
 from lingo_mi.fitting.start.number import NumberedStart
-from lingo_mi.fitting.start.start import Render, StartingCloud, neighbour_distance
+from lingo_mi.fitting.start.start import Render, StartingCloud
 from lingo_mi.lingo.density import mean_pixel
 from lingo_mi.lingo.masks import Masks, masks, truncated
 from lingo_mi.lingo.scaling import occupancy, scale_factor, scaled_grid

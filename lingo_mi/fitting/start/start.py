@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
 
 from lingo_mi.fitting.options.part import Part
 from lingo_mi.geometry.base import Geometry
@@ -84,16 +82,3 @@ class Start(Part, ABC):
     def limited(self, most: int) -> Start:
         """The same with at most so many Gaussians, if their number is an option."""
         return self
-
-
-def neighbour_distance(points: ArrayLike, fallback: float) -> np.ndarray:
-    """Root mean square distance to the three nearest neighbours, [N] (R2-Gaussian's starting scale).
-
-    With fewer than four points, all others are neighbours. A single point gets `fallback`.
-    """
-    points = np.asarray(points, float)
-    k = min(4, len(points))
-    if k < 2:
-        return np.full(len(points), float(fallback))
-    distance = KDTree(points).query(points, k, workers=-1)[0][:, 1:]
-    return np.sqrt(np.mean(distance**2, 1))

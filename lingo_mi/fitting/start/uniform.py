@@ -8,8 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start.number import NumberedStart
-from lingo_mi.fitting.start.start import Render, Start, StartingCloud, neighbour_distance
+from lingo_mi.fitting.start.start import Render, Start, StartingCloud
 from lingo_mi.lingo.voxel_filter import voxel_centres
 from lingo_mi.scan import Scan
 

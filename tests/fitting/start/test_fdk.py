@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start.fdk import FDKStart
-from lingo_mi.fitting.start.start import neighbour_distance
 
 
 def test_points_are_voxels_above_the_threshold():

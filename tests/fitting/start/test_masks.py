@@ -5,10 +5,10 @@ import pytest
 
 from helpers.sphere import sphere_scan
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.start import density as densities
 from lingo_mi.fitting.start.density import FAINTEST
 from lingo_mi.fitting.start.masks import MaskStart, draw_cells
-from lingo_mi.fitting.start.start import neighbour_distance
 from lingo_mi.lingo.density import mean_pixel
 from lingo_mi.lingo.masks import masks
 from lingo_mi.lingo.scaling import occupancy

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from helpers.fits import geometry, tiny_scan
+from lingo_mi.common.neighbours import neighbour_distance
 from lingo_mi.fitting.methods import cloud_method
 from lingo_mi.fitting.methods.by_name import METHODS
-from lingo_mi.fitting.start.start import neighbour_distance
 from lingo_mi.reconstruction.fdk import FDK
 
 
