@@ -257,7 +257,7 @@ class Geometry(ABC):
         Parameters
         ----------
         rays : Rays
-            Of all views, mm.
+            Poses of all views, mm.
         nDetector
             Pixels, (v, u).
         **voxels

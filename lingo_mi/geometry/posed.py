@@ -20,9 +20,9 @@ class PosedGeometry(Geometry):
     Parameters
     ----------
     poses : Rays
-        Of all views, mm.
+        Poses of all views, mm.
     nDetector, grid
-        As of `Geometry`.
+        As in `Geometry`.
 
     Raises
     ------
