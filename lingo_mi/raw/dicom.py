@@ -43,7 +43,7 @@ def is_dicom(path: Path) -> bool:
     """Whether a file is in DICOM's format, by its suffix or its first bytes: scanners often write no suffix."""
     if path.suffix.lower() in SUFFIXES:
         return True
-    if not path.is_file():
+    if not path.is_file() or path.name.upper() == 'DICOMDIR':  # the index of a disk
         return False
     with reading(path), open(path, 'rb') as stream:
         return stream.read(_PREAMBLE + 4)[_PREAMBLE:] == b'DICM'

@@ -163,6 +163,7 @@ def test_single_frames_and_what_turns_them(tmp_path):
         counts = np.rint(4000 * np.exp(-p[k : k + 1, :, ::-1]))
         toward = dict(PatientOrientation=[('P', 'R', 'A')[k], 'F'], InstanceNumber=k + 1)
         write_xa(tmp_path / 'run' / f'{9 - k}.dcm', counts, primary[k], **toward)
+    (tmp_path / 'run' / 'DICOMDIR').write_bytes(bytes(128) + b'DICM')
     scan = load(tmp_path / 'run', i0=4000)
     np.testing.assert_allclose(scan.projections, p[:, :, ::-1], atol=4e-4)
     np.testing.assert_allclose(scan.geometry.angles, np.radians(primary - 90), atol=1e-9)
