@@ -50,6 +50,7 @@ def test_every_ray_of_a_ct_pd_scan(tmp_path, flying, shape, stored):
         np.testing.assert_allclose(directions(source, points), expected, atol=1e-6)
 
 
+@pytest.mark.filterwarnings('ignore:.*projections may be truncated')
 def test_a_helical_ct_pd_scan_is_reconstructed(tmp_path, monkeypatch):
     """Two balls, their line integrals by a closed form; the command imports the folder, CGLS finds densities and places."""
     scanner = CTPD(views=90, flying=True)
