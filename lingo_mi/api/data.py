@@ -10,14 +10,14 @@ import numpy as np
 
 from lingo_mi.common import parsing
 from lingo_mi.common.arrays import as_numpy
-from lingo_mi.common.errors import InputError, require_type, shown
+from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import nearest, whole_number
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import ensure_variant, one_at_a_time
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
 from lingo_mi.geometry.trajectories import spread
-from lingo_mi.phantoms import DENSEST, Phantom, make
+from lingo_mi.phantoms import Phantom, make
 from lingo_mi.phantoms.x3d_scan import project_phantom
 from lingo_mi.phantoms.x3d_scan import scan as x3d_scan
 from lingo_mi.projectors import grid
@@ -239,7 +239,4 @@ def phantom(name: str, size: int = 256, seed: int = 0, *, attenuation: str = 'x3
     --------
     >>> foot = lm.phantom('foot', size=96)
     """
-    if attenuation not in ('x3d', 'real'):
-        raise InputError(f"attenuation must be 'x3d' or 'real', not {shown(attenuation)}")
-    made = make(name, size, seed)
-    return made if attenuation == 'x3d' else made.scaled(DENSEST)
+    return make(name, size, seed, attenuation)

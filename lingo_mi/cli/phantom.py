@@ -30,8 +30,9 @@ examples:
 
 The scan is X3D's: a cone beam, DSD 1500 mm, DSO 1000 mm, 512 x 512 pixels of 1 mm (1.48 mm for the chest),
 training views evenly over [0, 180) degrees and as many random ones held out. Values are densities in [0, 1]
-and line integrals in density times mm. shepp_logan, gaussians and mesh are projected exactly, foot and chest
-as trilinear voxels."""
+and line integrals in density times mm, larger than any scanner measures; --attenuation real makes them those
+of dense bone, per mm. shepp_logan, gaussians and mesh are projected exactly, foot and chest as trilinear
+voxels."""
 
 SUMMARY = {
     'foot': 'right foot and ankle: bones with trabeculae, soft tissue (256 mm)',
@@ -60,6 +61,12 @@ def parser() -> Parser:
         default=0,
         metavar='S',
         help='texture, vessels, random Gaussians and held-out angles (default 0)',
+    )
+    p.add_argument(
+        '--attenuation',
+        choices=phantoms.ATTENUATIONS,
+        default='x3d',
+        help="x3d: densities in [0, 1], X3D's convention; real: these times 0.0618 per mm, dense bone at 60 keV (default x3d)",
     )
     p.add_argument(
         '--out', type=Path, metavar='F.nii.gz', help='where to write the volume; for mesh and gaussians also F.ply'
@@ -138,10 +145,13 @@ def bolts_beside(path: Path) -> Path:
 def write_ply(path: Path, phantom: phantoms.Phantom) -> None:
     """The phantom's own form: Gaussians, or the flange and its bolts."""
     analytic: Any = phantom.analytic  # of the class of its own module
+    scale = 1.0
+    if isinstance(analytic, phantoms.Scaled):
+        analytic, scale = analytic.thing, analytic.factor
     if phantom.name == 'gaussians':
         from lingo_mi.files.ply import write_ply
 
-        write_ply(path, analytic.centres, analytic.scales, analytic.quaternions, analytic.density)
+        write_ply(path, analytic.centres, analytic.scales, analytic.quaternions, analytic.density * scale)
         print(f'{path}: {len(analytic)} Gaussians')
         return
     from lingo_mi.phantoms.mesh import bolts
@@ -158,13 +168,13 @@ def main() -> None:
         print(listing())
         return
     check(args)
-    phantom = phantoms.make(args.name, args.size, args.seed)
+    phantom = phantoms.make(args.name, args.size, args.seed, args.attenuation)
     if args.out and args.out.suffix == '.ply':
         write_ply(args.out, phantom)
     elif args.out:
         from lingo_mi.files.volumes import write_volume
 
-        write_volume(args.out, phantom.data, phantom.grid, 'normalised')
+        write_volume(args.out, phantom.data, phantom.grid, 'normalised' if args.attenuation == 'x3d' else '1/mm')
         print(f'{args.out}: {args.name}, {args.size}^3 voxels of {phantom.spacing[0]:g} mm')
     if args.projections:
         from lingo_mi.common.progress import Progress

@@ -268,7 +268,7 @@ class Fit(FittedModel):
             centre=scanner.grid.centre,
             pixel=scanner.dDetector,
             scanner=self.geometry,
-            cloud_unit='density at the centre [1/mm]' if has_volume else 'opacity',
+            cloud_unit='' if has_volume else 'opacity',
             command=numbers.get('command', ''),
             **more,
         )

@@ -20,12 +20,13 @@ import numpy as np
 
 from lingo_mi.common import notebook
 from lingo_mi.common.arrays import short_repr
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import Geometry, Grid
 
 # Of a density of 1, per mm, where densities are real: 2000 HU, dense cortical bone, with water of 0.0206 per mm at 60 keV (NIST,
 # X-ray mass attenuation coefficients). R2-Gaussian's rule maps Hounsfield units to [0, 1] with the same upper end.
 DENSEST = 3 * 0.0206
+ATTENUATIONS = 'x3d', 'real'
 _NAMES = ('chest', 'foot', 'gaussians', 'mesh', 'shepp_logan')
 
 
@@ -98,20 +99,24 @@ def require_name(name: str) -> None:
         raise InputError(f'there is no phantom {name!r}: choose one of {", ".join(_NAMES)}')
 
 
-def make(name: str, size: int, seed: int = 0) -> Phantom:
+def make(name: str, size: int, seed: int = 0, attenuation: str = 'x3d') -> Phantom:
     """The phantom `name` on size^3 voxels.
 
     Parameters
     ----------
     seed : int
         Non-negative integer; ignored by phantoms without randomness (mesh, shepp_logan).
+    attenuation : {'x3d', 'real'}
+        Densities in [0, 1], X3D's convention; or these times `DENSEST`, per mm.
 
     Raises
     ------
     InputError
-        For an unknown name, a size outside 8..512 or a negative seed.
+        For an unknown name or attenuation, a size outside 8..512 or a negative seed.
     """
     require_name(name)
+    if attenuation not in ATTENUATIONS:
+        raise InputError(f"attenuation must be 'x3d' or 'real', not {shown(attenuation)}")
     try:
         size, seed = operator.index(size), operator.index(seed)
     except TypeError:
@@ -122,4 +127,5 @@ def make(name: str, size: int, seed: int = 0) -> Phantom:
         raise InputError(f'the seed must not be negative, not {seed}')
     module = importlib.import_module(f'.{name}', __name__)
     data, side, analytic = module.build(size, seed)
-    return Phantom(data, (side / size,) * 3, name, analytic)
+    made = Phantom(data, (side / size,) * 3, name, analytic)
+    return made if attenuation == 'x3d' else made.scaled(DENSEST)

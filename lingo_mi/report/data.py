@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, brief
 from lingo_mi.geometry.base import Geometry
+
+OPAQUE = 20.0  # a line integral that no detector measures: of 5e8 photons, one comes through
+REAL, X3D = 'density [1/mm]', "density [X3D's scale, 0 to 1]"
+
+
+def quantity_of(volume: np.ndarray, spacing: ArrayLike) -> str:
+    """What a volume [x, y, z] holds: attenuation per mm, or densities on X3D's scale, which no scanner could measure."""
+    along = [float(volume.sum(i, dtype=float).max() * step) for i, step in enumerate(np.asarray(spacing))]
+    return REAL if max(along) < OPAQUE else X3D
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +30,7 @@ class ReportData:
                     entries are listed with the settings. `history` is a list of dicts with `iteration`,
                     `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None.
                     `residual_by_view` is a list of the residual of each of `views`, rms
-    volume          [x, y, z] density, 1/mm; None for a cloud without densities
+    volume          [x, y, z] density, 1/mm or on X3D's scale (`quantity`); None for a cloud without densities
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
@@ -31,7 +42,7 @@ class ReportData:
     views_angles    [n] degrees
     pixel           size of a detector pixel, (v, u), mm
     cloud_centres   [N, 3] centres of the Gaussians, mm
-    cloud_density   [N] density at their centres, 1/mm, or the quantity that `cloud_unit` names
+    cloud_density   [N] density at their centres, or the quantity that `cloud_unit` names
     cloud_scales    [N, 3] standard deviations, mm, and
     cloud_quaternions [N, 4] (x, y, z, w), for ellipsoids in place of points; None: points only
     scanner         the geometry of the fitted views, for the drawings of source and panel
@@ -57,7 +68,7 @@ class ReportData:
     pixel: tuple[float, float] = (1.0, 1.0)
     cloud_centres: np.ndarray | None = None
     cloud_density: np.ndarray | None = None
-    cloud_unit: str = 'density at the centre [1/mm]'
+    cloud_unit: str = ''
     cloud_scales: np.ndarray | None = None
     cloud_quaternions: np.ndarray | None = None
     scanner: Geometry | None = None
@@ -65,10 +76,16 @@ class ReportData:
     error_map: np.ndarray | None = None
     history: list[dict] = field(init=False)
 
+    @cached_property
+    def quantity(self) -> str:
+        """What the volume holds, with its unit: see `quantity_of`."""
+        known = self.volume if self.truth is None else self.truth
+        return REAL if known is None else quantity_of(known, self.preview * np.asarray(self.spacing))
+
     @property
     def reference(self) -> str:
         """What the views are that the rendered ones are compared with: those of a known object are simulated, as a rule."""
-        return 'Measured' if self.truth is None else 'Reference'
+        return 'Measured' if self.truth is None and self.quantity == REAL else 'Reference'
 
     def __post_init__(self):
         def fix(name, shape):
@@ -109,5 +126,7 @@ class ReportData:
         for name in ('volume', 'views'):
             if getattr(self, name) is not None and getattr(self, name).size == 0:
                 raise InputError(f'{name} of the report is empty')
+        if not self.cloud_unit:
+            object.__setattr__(self, 'cloud_unit', self.quantity.replace('density', 'density at the centre'))
         object.__setattr__(self, 'title', brief(self.title, 120))
         object.__setattr__(self, 'history', list(self.metrics.get('history') or []))

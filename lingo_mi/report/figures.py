@@ -112,7 +112,7 @@ def draw_slices(fig: Any, data: Any) -> None:
                 ax.set_xlabel(f'{across} [mm]')
             else:
                 ax.tick_params(labelbottom=False)
-        _bar(fig, drawn, list(grid[row]), 'Δ density [1/mm]' if kind == 'Difference' else 'density [1/mm]')
+        _bar(fig, drawn, list(grid[row]), ('Δ ' if kind == 'Difference' else '') + data.quantity)
 
 
 def draw_views(fig: Any, data: Any) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from lingo_mi.common.notebook import grey_range
 from lingo_mi.geometry.base import Geometry
-from lingo_mi.report.data import ReportData
+from lingo_mi.report.data import REAL, ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
 from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, block_means, preview
 from lingo_mi.report.planes import planes, richest
@@ -43,6 +43,7 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
             arrays,
             'Truth' if data.truth is not None else None,
             of=(data.shape, data.preview),
+            quantity=data.quantity,
         )
         if data.error_map is not None:
             known['slices'] |= error_maps({'Error map': data.error_map}, known['slices'], arrays)
@@ -69,6 +70,7 @@ def slice_payload(
     reference: str | None = None,
     budget: float = VOLUME_BYTES,
     of: tuple | None = None,
+    quantity: str = REAL,
 ) -> dict:
     """Volumes [x, y, z] on one grid, with one scale, as previews where they would take more than `budget` bytes.
 
@@ -80,6 +82,8 @@ def slice_payload(
         The volume that the others are compared with.
     of : tuple or None
         The grid's shape, and n, where the volumes are means of n^3 of its voxels already.
+    quantity : str
+        What they hold, with its unit.
     """
 
     def candidates():
@@ -106,7 +110,7 @@ def slice_payload(
         axes=axes,
         start=start,
         window=[float(x) for x in window],
-        unit='1/mm',
+        quantity=quantity,
         volumes=[dict(name=name, array=f'volume{i}') for i, name in enumerate(small)],
         reference=list(small).index(reference) if reference else None,
     )
@@ -285,7 +289,7 @@ def _surfaces(data: ReportData, arrays: Arrays) -> list[dict]:
         key = f'surface{len(out)}'
         arrays.add(key + 'points', points, float(points.min()), float(points.max()))
         arrays.add(key + 'faces', faces.astype(float), 0, 65535)
-        out.append(dict(name=name, level=least, array=key))
+        out.append(dict(name=name, level=least, unit='/mm' if data.quantity == REAL else '', array=key))
     return out
 
 

@@ -16,6 +16,7 @@ from lingo_mi.files.slabs import plan_and_error_map
 from lingo_mi.files.volumes import Volume, read_volume
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.report import template
+from lingo_mi.report.data import quantity_of
 from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text
 from lingo_mi.report.packing import Arrays
 from lingo_mi.report.payload import colour_maps, error_maps, slice_payload, view_payload
@@ -125,7 +126,14 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
                 )
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]
         data = {name: volume.data for name, volume in volumes.items()}
-        known['slices'] = slice_payload(data, first.spacing, middle, arrays, 'Truth' if truth is not None else None)
+        known['slices'] = slice_payload(
+            data,
+            first.spacing,
+            middle,
+            arrays,
+            'Truth' if truth is not None else None,
+            quantity=quantity_of(next(iter(data.values())), first.spacing),
+        )
         maps = {
             f'Error map: {name}': r.error_map.data
             for name, r in named.items()

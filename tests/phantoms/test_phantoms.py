@@ -12,8 +12,10 @@ import pytest
 import lingo_mi as lm
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
+from lingo_mi.files.ply import read_ply
+from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import CircularGeometry, Grid
-from lingo_mi.phantoms import chest, foot, gaussians, mesh, shepp_logan
+from lingo_mi.phantoms import DENSEST, chest, foot, gaussians, mesh, shepp_logan
 from lingo_mi.phantoms import x3d_scan as scanning
 
 SIZES = 64, 128
@@ -304,3 +306,28 @@ def test_real_attenuation_is_that_of_bone(name):
     np.testing.assert_allclose(scans[1], bone * scans[0], rtol=1e-5)
     with pytest.raises(InputError, match="attenuation must be 'x3d' or 'real'"):
         lm.phantom(name, size=16, attenuation='hu')
+
+
+def test_script_writes_real_attenuation(tmp_path, monkeypatch):
+    """As volume and as Gaussians, by the name that Python and scenes have for it."""
+    for out in ('foot.nii.gz', 'gaussians.ply'):
+        name = out.split('.')[0]
+        for kind in ('x3d', 'real'):
+            target = tmp_path / f'{kind}_{out}'
+            arguments = [name, '--size', '16', '--attenuation', kind, '--out', str(target)]
+            assert _run_here(monkeypatch, *arguments) == 0
+    volumes = [read_volume(tmp_path / f'{kind}_foot.nii.gz') for kind in ('x3d', 'real')]
+    np.testing.assert_allclose(volumes[1].data, DENSEST * volumes[0].data, rtol=1e-6)
+    assert [v.unit for v in volumes] == ['normalised', '1/mm']
+    clouds = [read_ply(tmp_path / f'{kind}_gaussians.ply')[3] for kind in ('x3d', 'real')]
+    np.testing.assert_allclose(clouds[1], DENSEST * clouds[0], rtol=1e-6)
+
+
+def test_scenes_of_real_attenuation():
+    small = dict(size=16, pixels=16, pixel_size=32, voxels=16, voxel_size=16, views=2, test_views=1)
+    x3d, real = (
+        lm.simulate('x3d_foot', parameters=small | more, progress=False) for more in ({}, dict(attenuation='real'))
+    )
+    np.testing.assert_allclose(real.train.projections, DENSEST * x3d.train.projections, rtol=1e-5)
+    with pytest.raises(Exception, match="attenuation must be 'x3d' or 'real', not 'unreal'"):
+        lm.simulate('x3d_foot', parameters=small | dict(attenuation='unreal'), progress=False)

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.report import figures, planes
@@ -291,3 +292,15 @@ def test_import_leaves_matplotlib_alone():
     code = f"import sys, {modules}\nprint('matplotlib' in sys.modules)"
     out = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
     assert out == 'False\n'
+
+
+@pytest.mark.parametrize(('factor', 'unit'), [(1.0, '1/mm'), (10.0, "X3D's scale, 0 to 1")])
+def test_densities_that_no_scanner_measures_have_no_unit(factor, unit, tmp_path):
+    """Nor are their views measured."""
+    data = content(truth=None, volume=factor * phantom())
+    assert data.quantity == f'density [{unit}]' and data.cloud_unit == f'density at the centre [{unit}]'
+    assert data.reference == ('Measured' if factor == 1 else 'Reference')
+    page = report_page(data)
+    assert unit in page and ('1/mm' in page) == (factor == 1)
+    figures.draw_slices(figure := Figure(), data)
+    assert f'density [{unit}]' in [axes.get_ylabel() for axes in figure.axes]

@@ -114,7 +114,7 @@ class Slices {
       return row;
     });
     this.rows[0].setAttribute('aria-live', 'polite');
-    made.append(text('caption', 'Density in 1/mm', { style: 'text-align: left; color: var(--soft)' }), top, body);
+    made.append(text('caption', this.known.quantity, { style: 'text-align: left; color: var(--soft)' }), top, body);
     return made;
   }
 
@@ -354,7 +354,7 @@ class Slices {
       difference: pixelsOfDifferences(this.maps.difference, array.step, this.largest, false),
       error: pixelsOfDifferences(this.maps.error, array.step, this.largest, true),
     };
-    this.scales.replaceChildren(scaleBar(this.maps.grey, 'density [1/mm]', ...this.window));
+    this.scales.replaceChildren(scaleBar(this.maps.grey, this.known.quantity, ...this.window));
     if (this.layers.some((l) => l.kind === 'difference')) {
       this.scales.append(
         scaleBar(this.maps.difference, 'difference', -this.largest, this.largest),

@@ -121,7 +121,7 @@ class Space {
     shape.computeVertexNormals();
     const look = { color: [0xb9c6d6, 0xf0dcb8][i], side: THREE.DoubleSide, transparent: i === 0, opacity: i === 0 ? 0.45 : 1, depthWrite: i > 0 };
     this.parts[surface.name] = new THREE.Mesh(shape, new THREE.MeshLambertMaterial(look));
-    this.said.push(`${surface.name}: density ${shown(surface.level, surface.level / 1000)}/mm.`);
+    this.said.push(`${surface.name}: density ${shown(surface.level, surface.level / 1000)}${surface.unit}.`);
   }
 
   addScanner(scanner) {
