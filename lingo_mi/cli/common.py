@@ -155,7 +155,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar='MU',
         help='attenuation of water per mm: a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to '
-        'densities in [0, 1]); and for --units hu',
+        'densities in [0, 1]); and of what --units hu writes, also of a --volume per mm',
     )
     parser.add_argument(
         '--units',
@@ -246,7 +246,11 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
         check_memory(thinned(dataset.train.geometry, slab))
         warn_if_truncated(dataset.train.geometry)
         return dataset
-    volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype, args.spacing) if args.volume else None
+    volume = None
+    if args.volume:
+        # With --units hu, --mu-water may be of what is written alone.
+        only_hu = args.units != 'hu'
+        volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype, args.spacing, only_hu=only_hu)
     return take_scan(scene, views or 0, volume, seed, truth=not slab)
 
 

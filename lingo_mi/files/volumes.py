@@ -87,7 +87,7 @@ def centred_affine(shape: Sequence[int], spacing: ArrayLike) -> np.ndarray:
 # ---- values ------------------------------------------------------------------------------------------------
 
 
-def _density(data, path, hu, mu_water):
+def _density(data, path, hu, mu_water, only_hu):
     """(float32 density, unit) by rules 2 and 3 of the module."""
     low, high = float(data.min()), float(data.max())
     if hu is None:
@@ -106,7 +106,7 @@ def _density(data, path, hu, mu_water):
         if mu_water is not None:
             return np.maximum((data + 1000) * np.float32(mu_water / 1000), 0), '1/mm'
         return (np.clip(data, -1000, 2000) + 1000) / 3000, 'normalised'
-    if mu_water is not None:
+    if mu_water is not None and only_hu:
         raise InputError(
             f'{path}: mu_water={mu_water:g} was given, but the values ({low:g} to {high:g}) do not '
             'look like Hounsfield units; leave it out, or in Python say hu=True'
@@ -114,6 +114,11 @@ def _density(data, path, hu, mu_water):
     if not high > 0:
         raise InputError(f'{path}: the volume is empty: no value is above 0')
     keep = data.dtype.kind == 'f' and high <= 1
+    if mu_water is not None and not keep:
+        raise InputError(
+            f"{path}: its values, up to {high:g}, are no attenuation per mm, so that units='hu' cannot be written: leave out "
+            'units and mu_water'
+        )
     data = np.maximum(data.astype(np.float32), 0)
     return (data if keep else data / np.float32(high)), 'normalised'
 
@@ -176,6 +181,7 @@ def read_volume(
     dtype: Any = None,
     spacing: ArrayLike | None = None,
     hu: bool | None = None,
+    only_hu: bool = True,
 ) -> Volume:
     """Reads a CT volume; the format follows from the name.
 
@@ -198,6 +204,8 @@ def read_volume(
         ImageJ or OME wrote it.
     hu : bool or None
         Whether the values are Hounsfield units, if that is not clear from the values.
+    only_hu : bool
+        Whether `mu_water` is refused for other values. If not, floats up to 1 are read as densities per mm.
 
     Raises
     ------
@@ -271,7 +279,7 @@ def read_volume(
         if (of_file := Unit.described(unit)) is not None:
             density, unit = of_file.densities(density), PER_MM.description
     else:
-        density, unit = _density(data, path, hu, mu_water)
+        density, unit = _density(data, path, hu, mu_water, only_hu)
     x, y, z = (float(s) for s in sides)
     return Volume(np.ascontiguousarray(density, np.float32), (x, y, z), affine, unit)
 

@@ -1,9 +1,12 @@
 """Volumes in other units, and as DICOM: read back by this package and by others."""
 
+import argparse
+
 import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.cli.common import read_input
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.slabs import write_slabs
 from lingo_mi.files.units import PER_MM, Unit, unit_of
@@ -127,3 +130,27 @@ def test_slabs_make_the_same_series(found, series, tmp_path):
     write_slabs(tmp_path / 'v.dicom', GRID, slabs, unit_of('hu', WATER))
     for a, b in zip(sorted(series.iterdir()), sorted((tmp_path / 'v.dicom').iterdir())):
         assert pydicom.dcmread(a).PixelData == pydicom.dcmread(b).PixelData
+
+
+@pytest.mark.parametrize(
+    ('values', 'expected'),
+    [
+        (lambda mu: 1000 * (mu / WATER - 1), 1.0),  # Hounsfield units
+        (lambda mu: mu, 1.0),  # per mm
+        (lambda mu: np.uint8(10_000 * mu), None),
+        (lambda mu: 100 * mu, None),
+    ],
+)
+def test_a_volume_to_scan_and_to_write_in_hounsfield_units(tmp_path, monkeypatch, values, expected):
+    """--volume with --units hu and --mu-water: what has no unit of attenuation is refused, in one line that helps."""
+    monkeypatch.setattr('lingo_mi.scene.simulate.take_scan', lambda scene, views, volume, *_, **__: volume.data)
+    mu = np.zeros((8, 8, 8), np.float32)
+    mu[2:6, 2:6, 2:6] = 0.02
+    np.save(tmp_path / 'v.npy', values(mu))
+    given = dict(volume=str(tmp_path / 'v.npy'), projections=None, shape=None, dtype=None, spacing=[4.0], units='hu')
+    args = argparse.Namespace(**given, mu_water=WATER)
+    if expected is None:
+        with pytest.raises(InputError, match="no attenuation per mm, so that units='hu' cannot be written"):
+            read_input(args, None, 0)
+    else:
+        np.testing.assert_allclose(read_input(args, None, 0), expected * mu, atol=1e-6)
