@@ -12,6 +12,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.slices import by_number, read_dicom_file
+from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.raw import dicom_ct_pd, dicom_xa
 from lingo_mi.raw.recording import Frames, Recording, Taken, checked
 from lingo_mi.storage.file_access import one_line, optional, reading
@@ -82,6 +83,8 @@ def open_dicom(path: Path, files: Iterable[Path]) -> Recording:
         if not header.get('Rows') or not header.get('Columns') or header.get('SamplesPerPixel', 1) != 1:
             raise InputError(f'{file}: has no image of one value a pixel; take it out of the folder')
         count = checked(file, lambda: int(header.get('NumberOfFrames') or 1))
+        if not 1 <= count <= MOST_VIEWS:
+            raise InputError(f'{file}: NumberOfFrames (0028,0008) must be from 1 to {MOST_VIEWS}, not {count}')
         numbers = checked(file, lambda: own.numbers(file, header))
         found.append((header.get('InstanceNumber'), file, count, numbers))
     assert kind is not None

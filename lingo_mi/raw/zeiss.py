@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.raw.recording import Frames, Recording, Taken
 from lingo_mi.storage.file_access import optional
 
@@ -36,6 +37,8 @@ def open_txrm(path: Path) -> Recording:
     n, rows, columns = (
         _integer(path, ole, f'ImageInfo/{name}') for name in ('NoOfImages', 'ImageHeight', 'ImageWidth')
     )
+    if not 1 <= n <= MOST_VIEWS or not rows or not columns:
+        raise InputError(f'{path}: says {n} frames of {rows} x {columns} pixels; is damaged, copy it again')
 
     def frames(names, kind):
         dtype = _TYPES.get(_integer(path, ole, kind))

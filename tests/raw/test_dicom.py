@@ -204,6 +204,7 @@ def test_enhanced_angiography(tmp_path):
         (dict(PixelIntensityRelationship='DISP'), "is 'DISP', and no ModalityLUTSequence"),
         (dict(PixelIntensityRelationshipSign=-1), 'its pixels fall with the intensity'),
         (dict(ImagePositionPatient=[0, 0, 0]), 'is no projection, but a slice or a volume'),
+        (dict(NumberOfFrames=2_000_000_000), 'NumberOfFrames .* must be from 1 to 100000'),
         (dict(SamplesPerPixel=3), 'has no image of one value a pixel'),
     ],
     ids=str,

@@ -90,6 +90,7 @@ def test_an_ultra_has_a_parallel_beam(tmp_path):
         (dict(ImageInfo__Angles=np.zeros(5, '<f4')), 'ImageInfo/Angles is cut off'),
         (dict(ImageInfo__PixelSize=np.float32(np.nan)), 'ImageInfo/PixelSize holds no finite numbers'),
         (dict(ImageInfo__DataType=np.uint32(3)), r'DataType must be 5 \(uint16\) or 10'),
+        (dict(ImageInfo__NoOfImages=np.uint32(2**31)), 'says 2147483648 frames of 24 x 40 pixels'),
         (dict(ImageInfo__NoOfImages=None), 'ImageInfo/NoOfImages is missing'),
         (dict(ImageInfo__StoRADistance=np.zeros(6, '<f4')), 'StoRADistance must not be zero'),
     ],
