@@ -178,6 +178,11 @@ def test_the_order_of_cells():
     assert cells[:6] == [Volume(measured, a) for a in alone]  # the others need a cloud
 
 
+def test_controls_have_as_many_iterations_as_asked_for():
+    cells = [group.columns[0].cell('a') for group in groups('controls', [10], [30], [])]
+    assert {tables.method_for(cell, tables.SCALES['small']).iterations for cell in cells} == {30}
+
+
 # ---- interruptions ---------------------------------------------------------------------------------------------------
 
 

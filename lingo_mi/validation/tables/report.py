@@ -141,8 +141,12 @@ def groups(
         ]
     if table == 'controls':
         fields = ('psnr_2d_r2', 'ipsd', 'gaussians', *CT)
+
+        def over(method):  # such a fit keeps its own iterations, see `_fit`
+            return f'{method},iterations={last}' if 'decay_steps=0' in method else method
+
         return [
-            Group(n, row, (Column('fit', _fit(n, method, last), fields),))
+            Group(n, row, (Column('fit', _fit(n, over(method), last), fields),))
             for n in views
             for row, method in CONTROLS.items()
         ]
