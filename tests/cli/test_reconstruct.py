@@ -109,6 +109,7 @@ def test_best(scene, dataset, tmp_path):
     assert code == 2 and 'v-plan.json: exists already' in err and not out.exists()
 
 
+@pytest.mark.thorough
 def test_best_with_a_cloud(scene, tmp_path):
     command = ('--algorithm', 'best', '--out', tmp_path / 'v.nii', '-D', 'niter=2', '-D', 'finer=1', '-D', 'cloud=true')
     code, text, err = run(RECONSTRUCT, scene, *command)

@@ -1,18 +1,23 @@
 """Scans of phantoms on a circle, with air all around the object."""
 
+import functools
+
 import lingo_mi as lm
 from lingo_mi.geometry import circular
 
 PIXELS, SIZE = 96, 40
 
 
+phantom = functools.lru_cache(functools.partial(lm.phantom, size=SIZE))
+
+
 def scanned(name, mode='cone', views=25, total=360.0):
     """A view of 12 degrees half a fan; the panel is higher than the object."""
-    phantom = lm.phantom(name, SIZE)
-    side = max(phantom.spacing) * SIZE
-    sizes = dict(nDetector=(110, PIXELS), nVoxel=SIZE, dVoxel=phantom.spacing, angles=circular(views, total))
+    made = phantom(name)
+    side = max(made.spacing) * SIZE
+    sizes = dict(nDetector=(110, PIXELS), nVoxel=SIZE, dVoxel=made.spacing, angles=circular(views, total))
     if mode == 'cone':
         geometry = lm.Geometry.cone(DSO=4 * side, DSD=6 * side, dDetector=side * 2.4 / PIXELS, **sizes)
     else:
         geometry = lm.Geometry.parallel(dDetector=side * 1.45 / PIXELS, **sizes)
-    return lm.simulate(phantom, geometry, progress=False).train
+    return lm.simulate(made, geometry, progress=False).train

@@ -20,7 +20,7 @@ from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
-FAST = dict(niter=2, completed_niter=0, tviter=2)  # of those that have it
+FAST = dict(niter=2, completed_niter=0, tviter=2, strength=1e-3)  # of those that have it
 
 
 def quick(name):

@@ -42,7 +42,12 @@ from studies.hard_cases.table import markdown, store, stored
 CASES = all_cases()
 
 
-@pytest.mark.parametrize('case', CASES, ids=lambda case: case.name)
+def marked(case):
+    marks = pytest.mark.thorough if case.name == '1 million coincident Gaussians' else ()
+    return pytest.param(case, marks=marks, id=case.name)
+
+
+@pytest.mark.parametrize('case', map(marked, CASES))
 def test_case(case, variant):
     assert not miss(case, measure(case), variant)
 
