@@ -171,6 +171,7 @@ def test_a_cloud_of_nothing(tmp_path):
         (['--views', '9'], '9 views'),
         (['--views', 'x'], '--views'),
         (['--method', 'magic'], "there is no method 'magic'"),
+        (['--method', 'lnigo'], "there is no method 'lnigo', did you mean lingo?"),
         (['--start', 'magic'], "not 'magic'"),
         (['--variant', 'magic'], 'variant'),
         (['--variant', 'scalar_rgb'], 'variant'),
@@ -380,3 +381,11 @@ def test_without_llvm(scene, tmp_path):
     assert done.returncode == 2 and 'karellen-llvm-core' in done.stderr and 'Traceback' not in done.stderr
     assert done.stderr.splitlines()[-1].startswith('error: ')  # below Dr.Jit's own lines
     assert not (tmp_path / 'new').exists()
+
+
+def test_a_folder_of_raw_frames_names_import(tmp_path):
+    (tmp_path / 'frames').mkdir()
+    for i in range(3):
+        (tmp_path / 'frames' / f'{i}.tif').write_bytes(b'II')
+    said = refused(tmp_path, tmp_path / 'frames')
+    assert 'holds raw frames; make a scan of them: lingo-mi import' in said

@@ -39,6 +39,17 @@ def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
     assert 'calibrated_from: scan.npy' in out.with_suffix('.yml').read_text()
 
 
+def test_the_air_level_is_subtracted(fan, monkeypatch, capsys):
+    """Of a scan without frames; the scanner is as it was."""
+    scan = read_scan(fan).train
+    geometry = scan.geometry
+    sound = np.roll(scan.projections, -2, 2)
+    write_scan(fan, lm.Scan(geometry, sound + np.float32(0.05)), 'npy')
+    run(monkeypatch, fan, '--out', fan.with_name('mended.npy'))
+    assert 'air beside the object: +0.05 on average' in capsys.readouterr().out
+    np.testing.assert_allclose(read_scan(fan.with_name('mended.npy')).train.projections, sound, atol=2e-3)
+
+
 def test_history_is_kept_and_what_is_left_out_is_said(fan, monkeypatch, tmp_path):
     write_scan(fan, read_scan(fan).train, 'npy', dict(frames='raw.tif'))
     run(monkeypatch, fan, '--out', tmp_path / 'a.npy')
