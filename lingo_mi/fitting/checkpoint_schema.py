@@ -8,7 +8,7 @@ array.initial                 float32 [M, 3]
 array.order                   whole numbers [K], views that come next
 array.average.*               like values.*, if the fit averages
 array.poses.*                 float64 [views, 3 or 6] and steps, whole numbers [views], if the fit corrects poses
-array.response.*              float64 [rows, numbers], if the fit has a response: air, gain
+array.response.*              float64 [rows, numbers], if the fit has a response: air, gain, pixels
 array.share                   float32 [N], if the fit models two materials
 array.scattered               float64 [2, views, rows, columns], if it models scatter
 extra                         text: plain values as JSON, named in `_PLAIN`
@@ -49,7 +49,7 @@ def require_sound(arrays: dict[str, np.ndarray], plain: Any) -> tuple[Method, Ge
     """
     method, geometry = _require_plain(plain)
     views, steps = plain['seen'], arrays.get('array.poses.steps')
-    expected = _expected(method, views, arrays['born'].size if 'born' in arrays else 0)
+    expected = _expected(method, geometry, views, arrays['born'].size if 'born' in arrays else 0)
     allowed = expected if plain['effects'] else {k: v for k, v in expected.items() if k not in _OF_EFFECTS}
     for name in expected.keys() - {*_OF_EFFECTS} - arrays.keys():
         raise InputError(f'{name} is missing')
@@ -75,7 +75,7 @@ def require_sound(arrays: dict[str, np.ndarray], plain: Any) -> tuple[Method, Ge
     return method, geometry
 
 
-def _expected(method: Method, views: int, count: int) -> dict[str, tuple[str, tuple]]:
+def _expected(method: Method, geometry: Geometry, views: int, count: int) -> dict[str, tuple[str, tuple]]:
     """Type, as NumPy spells it, and shape of every array by name; None is any length."""
     shapes = method.shapes(count)
     entries: dict[str, tuple[str, tuple]] = {'born': ('bool', (count,)), 'array.order': ('int', (None,))}
@@ -94,6 +94,8 @@ def _expected(method: Method, views: int, count: int) -> dict[str, tuple[str, tu
         entries |= {'array.poses.steps': ('int', (views,))}
     varies = dict(air=corrections.fit_air, gain=corrections.fit_gain)
     rows = dict(view=views, smooth=min(SMOOTH, views - 1) + 1)
+    if corrections.fit_pixels != 'off':
+        entries |= {'array.response.pixels': ('float64', (1, math.prod(geometry.nDetector)))}
     return entries | {f'array.response.{k}': ('float64', (rows[x], 1)) for k, x in varies.items() if x != 'off'}
 
 

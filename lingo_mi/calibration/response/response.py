@@ -12,6 +12,7 @@ from lingo_mi.calibration.drift import scan_times
 from lingo_mi.calibration.response.air import Air, Gain
 from lingo_mi.calibration.response.curve import Curve
 from lingo_mi.calibration.response.part import SMOOTH, Place, ResponsePart
+from lingo_mi.calibration.response.pixels import Pixels
 from lingo_mi.calibration.response.scatter import ScatterImage
 from lingo_mi.geometry.base import Geometry
 
@@ -50,6 +51,7 @@ class Response:
         gain: str = 'off',
         curve: int = 0,
         scatter: str = 'off',
+        pixels: str = 'off',
         highest: float = 1.0,
     ) -> Response | None:
         """Nothing found yet. None without any part.
@@ -62,6 +64,8 @@ class Response:
             Number of coefficients, the same in all views.
         scatter : str
             'off', or 'one' for the same image in all views.
+        pixels : str
+            'off', or 'one' for an offset of each pixel, the same in all views.
         highest : float
             The highest line integral, for the curve.
         """
@@ -70,6 +74,7 @@ class Response:
             *([Curve('one', curve, highest)] if curve else []),
             *([ScatterImage(scatter)] if scatter != 'off' else []),
             *([Air(air)] if air != 'off' else []),
+            *([Pixels(pixels, geometry.nDetector)] if pixels != 'off' else []),
         ]
         rows = dict(one=1, smooth=min(SMOOTH, len(geometry) - 1) + 1, view=len(geometry))
         for part in parts:
@@ -87,6 +92,7 @@ class Response:
 
     def fit(self, expected: np.ndarray, measured: np.ndarray, valid: np.ndarray | None = None) -> None:
         """Find all numbers by least squares with Huber's weights: what they make of the expected line integrals is measured.
+        Offsets of pixels are found from what the other parts leave.
 
         Parameters
         ----------
@@ -95,6 +101,13 @@ class Response:
         valid : ndarray or None
             Bool, likewise; None: all.
         """
+        pixels = [part for part in self.parts if isinstance(part, Pixels)]
+        if pixels:
+            others = Response(self.geometry, [part for part in self.parts if not isinstance(part, Pixels)])
+            if others.parts:
+                others.fit(expected, Response(self.geometry, [*pixels]).undone(measured, self.geometry), valid)
+                expected = others.applied(expected, self.geometry)
+            return pixels[0].find(expected, measured, valid)
         every = max(1, int(np.ceil(np.sqrt(measured.size / SAMPLES))))
         rows, columns = (
             slice(every // 2 if n > every else 0, None, every if n > every else 1) for n in measured.shape[1:]

@@ -82,7 +82,8 @@ class DensityMethod(CloudMethod):
         return replace(method, loss=self.loss.limited(len(scan)))
 
     def model(self, geometry: Geometry, unit: float, effects: Effects | None = None) -> DensityModel:
-        response = Response.of(geometry, air=self.corrections.fit_air, gain=self.corrections.fit_gain)
+        own = self.corrections
+        response = Response.of(geometry, air=own.fit_air, gain=own.fit_gain, pixels=own.fit_pixels)
         return DensityModel(self.forward, geometry, unit, effects, response, self.extent)
 
     def poses(self, geometry: Geometry) -> Poses | None:

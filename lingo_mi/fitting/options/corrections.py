@@ -27,15 +27,18 @@ class Corrections(Part):
         Air level of the views: a cubic polynomial in time, or every view for itself.
     fit_gain : {'off', 'smooth', 'view'}
         Gain of the views, likewise.
+    fit_pixels : {'off', 'one'}
+        'one' fits what each pixel adds to its line integrals in all views: gains that the flat fields missed.
     """
 
     RANGES: ClassVar = dict(rate_pose=(0, 1))
-    CHOICES: ClassVar = dict(pose_motion=('view', 'smooth'), fit_air=VARIES, fit_gain=VARIES)
+    CHOICES: ClassVar = dict(pose_motion=('view', 'smooth'), fit_air=VARIES, fit_gain=VARIES, fit_pixels=('off', 'one'))
 
     rate_pose: tuple[float, float] = (0.0, 0.0)
     pose_motion: str = 'view'
     fit_air: str = 'off'
     fit_gain: str = 'off'
+    fit_pixels: str = 'off'
 
     def __post_init__(self):
         super().__post_init__()
@@ -52,4 +55,4 @@ class Corrections(Part):
     @property
     def responds(self) -> bool:
         """Whether a response of the detector is fitted."""
-        return self.fit_air != 'off' or self.fit_gain != 'off'
+        return any(x != 'off' for x in (self.fit_air, self.fit_gain, self.fit_pixels))
