@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -89,7 +90,7 @@ def run(
 
     def after(loss: Any) -> dict:
         if fit.iteration in marks:
-            fit.measure(loss, measure)
+            fit.measure(measure)
         return fit.latest | ({} if search is None else dict(stops_at=last))
 
     _loop(fit, lambda: fit.iteration >= last, after, progress, path)
@@ -167,7 +168,7 @@ class Running:
     iteration : int
         Steps done.
     history : list of dict
-        Measurements over time.
+        Measurements over time. Their loss is the mean over the steps since all views were seen last: single views differ.
     """
 
     def __init__(
@@ -187,6 +188,7 @@ class Running:
         self.stepper = (own or method).stepper(seen)
         self.order: list[int] = []
         self.iteration, self.history, self._seconds = 0, [], 0.0
+        self._losses = deque(maxlen=-(-len(seen) // self.stepper.method.batch))  # of the last pass over the views
         if stored is None:
             state, self.points, self.info = self.stepper.begin(seed)
             self.state = DeviceState(state)
@@ -201,7 +203,7 @@ class Running:
         self._clock = time.perf_counter()
 
     def step(self) -> Any:
-        """Densify if it is due, and make a step. Returns the loss, Float [1], not yet evaluated."""
+        """Densify if it is due, and make a step. Returns the loss, Float [1]."""
         # Before a step, so never after the last one. A longer fit that goes on from there does it first.
         if densified := self.stepper.densified(self.state, self.iteration, self.rng):
             self.state = densified
@@ -212,10 +214,12 @@ class Running:
         views, self.order = self.order[:batch], self.order[batch:]
         loss = self.stepper.step(self.state, views, self.iteration, self.rng)
         self.iteration += 1
+        dr.eval(loss)  # else it would hold the images of its views
+        self._losses.append(loss)
         self.average.add(self.state)
         return loss
 
-    def measure(self, loss: Any, measure: Measure | None) -> None:
+    def measure(self, measure: Measure | None) -> None:
         """Add an entry to the history; the time of `measure` does not count.
 
         Raises
@@ -224,7 +228,7 @@ class Running:
             If the fit has diverged.
         """
         dr.sync_thread()
-        value = float(loss[0])
+        value = float(np.mean([float(loss[0]) for loss in self._losses]))
         if not (np.isfinite(value) and self.state.finite()):  # a Gaussian that is not finite would silently vanish
             raise InputError(
                 f'the fit is no longer finite at iteration {self.iteration}: lower the rates, or check the projections'

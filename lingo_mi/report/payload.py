@@ -54,12 +54,23 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
             reference = data.reference
             images[reference] = data.views_truth
         known['views'] = view_payload(images, data.views_angles, data.pixel, arrays, reference)
+        if data.views_truth is not None and data.views_angles is not None:
+            known['views']['psnr'] = _psnr_by_view(data.views, data.views_truth, data.views_angles)
         if (residuals := data.metrics.get('residual_by_view')) and data.views_angles is not None:
             order = np.argsort(data.views_angles, kind='stable')
             rms = [residuals[i] for i in order]
             known['views']['residual'] = dict(angles=data.views_angles[order].tolist(), rms=rms)
     known['space'] = _space(data, arrays, surfaces)
     return known, arrays
+
+
+def _psnr_by_view(views: np.ndarray, truth: np.ndarray, angles: np.ndarray) -> list[float | None]:
+    """PSNR of each view in the order of their angles, dB, None where it is infinite; full scale is the largest value of all."""
+    peak, found = float(truth.max()), []
+    for i in np.argsort(angles, kind='stable'):
+        error = float(np.mean(np.square(views[i].astype(float) - truth[i])))
+        found.append(10 * float(np.log10(peak**2 / error)) if error > 0 and peak > 0 else None)
+    return found
 
 
 def slice_payload(

@@ -15,7 +15,7 @@ from lingo_mi.report.packing import Arrays
 STYLES = 'vendor/uPlot.min.css', 'page.css'
 LIBRARIES = 'vendor/uPlot.iife.min.js', 'vendor/three.min.js'
 SCRIPTS = (
-    'elements.js', 'decode.js', 'colours.js', 'curves.js', 'slices.js', 'views.js', 'space.js', 'live.js', 'main.js'
+    'elements.js', 'decode.js', 'colours.js', 'curves.js', 'probe.js', 'slices.js', 'views.js', 'space.js', 'live.js', 'main.js'
 )  # fmt: skip
 
 

@@ -133,7 +133,7 @@ def test_a_script_that_is_not_its_own_is_refused(chromium, data, tmp_path):
 
 def test_values_at_the_crosshair_are_those_of_the_volume(page, data):
     """At voxels that keys reach: to half the step that the page says its values have, and the digits that it shows."""
-    step = float(page.locator('#slices .note').text_content().partition('steps of ')[2].partition(' per mm')[0])
+    step = float(page.locator('#slices .note').first.text_content().partition('steps of ')[2].partition(' per mm')[0])
     assert step < 1e-5  # of values up to 0.2
     page.focus('[data-axis="2"]')
     for keys in ([], ['PageUp', 'ArrowLeft'], ['ArrowUp', 'ArrowUp', 'ArrowUp'], ['Home', 'Shift+PageUp']):
@@ -256,10 +256,10 @@ def test_window_level_and_zoom(page):
 
 
 def test_views_are_sorted_and_their_values_those_given(page, data):
-    slider = page.locator('#views input')
+    slider = page.locator('#views input').first
     slider.focus()
     press(page, 'ArrowRight', 'ArrowRight')
-    assert '3 of 7, at 20.0°' in page.locator('#views output').text_content()
+    assert '3 of 7, at 20.0°' in page.locator('#views output').first.text_content()
     box = page.locator('#views canvas').first.bounding_box()
     page.mouse.move(box['x'] + box['width'] * 4.5 / 18, box['y'] + box['height'] * 2.5 / 12)
     settled(page)
@@ -271,7 +271,7 @@ def test_views_are_sorted_and_their_values_those_given(page, data):
 
 
 def test_the_residual_of_each_view_is_beside_its_angle(page):
-    chart = page.locator('#views .chart')
+    chart = page.locator('#views .chart').nth(1)
     chart.focus()
     press(page, 'ArrowRight', 'ArrowRight', 'ArrowRight')
     assert [float(value) for value in chart.locator('.u-value').all_text_contents()] == [20, 4]
@@ -366,3 +366,62 @@ def test_what_is_missing_is_left_out(chromium, tmp_path, changes):
         assert page.locator('#views').is_visible() == (data.views is not None)
         assert page.locator('#curves').is_visible() == bool(data.history)
         press(page, '2', 's', 'c', '9')
+
+
+def test_a_profile_follows_the_crosshair(page, data):
+    """Along x through the crosshair: the values of the volume and of the truth, in mm."""
+    page.evaluate('document.querySelector("canvas[data-axis=\\"2\\"]").focus()')
+    press(page, 'ArrowUp', 'PageUp')
+    _, y, z = at(page)
+    chart = page.locator('#slices .chart').first
+    x, *lines = chart.evaluate('(chart) => chart.plot.data.map((row) => [...row])')
+    places = CENTRE[0] + (np.arange(SHAPE[0]) + 0.5 - SHAPE[0] / 2) * SPACING[0]
+    np.testing.assert_allclose(x, places)
+    for found, volume in zip(lines, (data.volume, data.truth)):
+        np.testing.assert_allclose(found, volume[:, y, z], atol=1e-4)
+
+
+def test_a_region_has_the_statistics_of_its_voxels(page, data):
+    page.get_by_role('button', name='Region').click()
+    page.evaluate('document.querySelector("canvas[data-axis=\\"2\\"]").focus()')
+    first = at(page)
+    press(page, 'a', 'ArrowRight', 'ArrowRight', 'ArrowUp', 'b')
+    last = at(page)
+    voxels = data.volume[first[0] : last[0] + 1, first[1] : last[1] + 1, first[2]]
+    assert voxels.shape == (3, 2)
+    row = page.locator('tr[data-layer=Reconstruction] td')
+    found = [float(cell.text_content()) for cell in row.all()]
+    np.testing.assert_allclose(found, [voxels.mean(), voxels.std(), voxels.min(), voxels.max()], atol=2e-5)
+    assert '3.0 × 3.0 mm, 3 × 2 voxels' in page.locator('#slices caption', has_text='Region').text_content()
+
+
+def test_a_line_is_drawn_and_the_histogram_counts_all_voxels(page, data):
+    page.get_by_role('button', name='Line', exact=True).click()
+    box = page.locator('canvas[data-axis="2"]').bounding_box()
+    page.mouse.move(box['x'] + 0.25 * box['width'], box['y'] + 0.5 * box['height'])
+    page.mouse.down()
+    page.mouse.move(box['x'] + 0.75 * box['width'], box['y'] + 0.5 * box['height'])
+    page.mouse.up()
+    settled(page)
+    charts = page.locator('#slices .chart')
+    x = charts.first.evaluate('(chart) => [...chart.plot.data[0]]')
+    assert x[-1] == pytest.approx(SHAPE[0] * SPACING[0] / 2, abs=SPACING[0])
+    counts = charts.nth(1).evaluate(
+        '(chart) => chart.plot.data.slice(1).map((row) => row.reduce((a, b) => a + (b || 0), 0))'
+    )
+    assert counts == [data.volume.size] * 2
+
+
+def test_psnr_of_each_view_is_in_the_order_of_the_angles(page, data):
+    found = page.locator('#views .chart').first.evaluate('(chart) => [...chart.plot.data[1]]')
+    order = np.argsort(data.views_angles)
+    errors = np.square(data.views - data.views_truth).mean((1, 2))[order]
+    np.testing.assert_allclose(found, 10 * np.log10(data.views_truth.max() ** 2 / errors))
+
+
+def test_the_differences_of_views_have_a_scale_of_their_own(page):
+    slider = page.locator('#views label', has_text='Differences').locator('input')
+    slider.focus()
+    before = page.locator('#views .scales').text_content()
+    press(page, 'ArrowRight', 'ArrowRight')
+    assert page.locator('#views .scales').text_content() != before

@@ -4,7 +4,7 @@ const SERIES = [['loss'], ['psnr_2d', 'psnr_3d'], ['gaussians']];
 const NAMES = { loss: 'Loss', psnr_2d: 'PSNR of held-out views [dB]', psnr_3d: 'PSNR of the volume [dB]', gaussians: 'Gaussians' };
 const LINES = { light: ['#1557a8', '#b3470b', '#1c7245', '#7a3b9c'], dark: ['#8ab8f5', '#ffa366', '#6fd08c', '#d6a5f0'] };
 
-function lineChart(root, label, x, lines, { height = 170, log = false } = {}) {
+function lineChart(root, label, x, lines, { height = 170, log = false, bars = false, gaps = false } = {}) {
   const dark = document.documentElement.dataset.theme === 'dark';
   const ink = colourOf('--soft');
   const grid = { stroke: colourOf('--line'), width: 1 };
@@ -15,7 +15,7 @@ function lineChart(root, label, x, lines, { height = 170, log = false } = {}) {
     width,
     height,
     cursor: { drag: { x: false, y: false } },
-    scales: { x: { time: false }, y: log ? { distr: 3 } : {} },
+    scales: { x: { time: false, ...(bars ? { range: (_, a, b) => [a - 0.6, b + 0.6] } : {}) }, y: log ? { distr: 3 } : bars ? { range: (_, a, b) => [Math.min(0, a), b * 1.05] } : {} },
     axes: [{ ...axis, label, labelFont: '12px system-ui, sans-serif', labelSize: 20, size: 30 }, { ...axis, size: 74 }],
     series: [
       { label, value: (_, v) => number(v) },
@@ -23,8 +23,9 @@ function lineChart(root, label, x, lines, { height = 170, log = false } = {}) {
         label: l.name,
         stroke: l.colour || LINES[dark ? 'dark' : 'light'][i % 4],
         width: 2,
-        spanGaps: true,
-        points: { show: x.length < 40, size: 6 },
+        spanGaps: !gaps,
+        points: { show: x.length < 40 && !bars, size: 6 },
+        ...(bars ? { paths: uPlot.paths.bars({ size: [0.7, 40] }), fill: `${l.colour || LINES[dark ? 'dark' : 'light'][i % 4]}99` } : {}),
         value: (_, v) => number(v),
       })),
     ],

@@ -18,6 +18,8 @@ class Slices {
     this.layer = 0;
     this.other = Math.min(1, this.layers.length - 1);
     this.curtain = 0.5;
+    this.tool = 'cross'; // what a drag with the left button draws
+    this.marks = {}; // the line and the region that were drawn: axis of the slice, and two places in mm
     this.draw = onceAFrame(() => this.paint());
     this.build();
     new ResizeObserver(this.draw).observe(this.grid);
@@ -35,6 +37,7 @@ class Slices {
       Object.assign(input, one === this.levelSlider ? { min: low, max: high } : { max: high - low });
       input.step = (high - low) / 500;
     }
+    this.probe.forget();
     this.draw();
   }
 
@@ -95,7 +98,8 @@ class Slices {
     const compared = this.layers.some((l) => l.kind === 'difference') ? ' Difference: red is too dense, blue too thin.' : '';
     const mapped = this.errorMaps.length ? ' Error map: bright where the volume is least certain; it ranks voxels, and is not the size of their errors.' : '';
     this.note = text('p', `Axes are the scanner's, in mm; z is the axis of rotation. Values are stored in steps of ${step0.toExponential(1)} per mm.${compared}${mapped}${preview}`, { class: 'note' });
-    this.root.replaceChildren(bar, this.grid, places, this.scales, scroll, this.note);
+    this.probe = new Probe(this);
+    this.root.replaceChildren(bar, this.grid, places, this.scales, scroll, this.note, this.probe.root);
     this.arrange(0);
   }
 
@@ -231,6 +235,30 @@ class Slices {
     return voxel.map((i, axis) => centre[axis] + (i + 0.5 - shape[axis] / 2) * spacing[axis]);
   }
 
+  voxelAt(place) {
+    const { shape, spacing, centre } = this.known;
+    return place.map((x, a) => Math.floor((x - centre[a]) / spacing[a] + shape[a] / 2));
+  }
+
+  // A mark of the tool across the middle half of the slice, from which it can be drawn or moved.
+  startMark() {
+    const { shape, spacing, centre, axes } = this.known;
+    const axis = Number(document.activeElement?.dataset.axis ?? axes[0]);
+    const [, across, up] = PLANES[axis];
+    const quarter = [across, up].map((a) => (shape[a] * spacing[a]) / 4);
+    const ends = [-1, 1].map((sign) => centre.map((x, a) => x + sign * (a === across ? quarter[0] : a === up && this.tool === 'region' ? quarter[1] : 0)));
+    this.marks[this.tool] = { axis, from: ends[0], to: ends[1] };
+  }
+
+  // The first or the second end of a line or a region, at the crosshair.
+  markEnd(axis, end) {
+    if (this.tool === 'cross') return;
+    const place = this.millimetres(this.at);
+    const mark = this.marks[this.tool];
+    this.marks[this.tool] = mark?.axis === axis ? { ...mark, [end]: place } : { axis, from: place, to: place };
+    this.draw();
+  }
+
   index([x, y, z]) {
     const [nx, ny] = this.known.shape;
     return x + nx * (y + ny * z);
@@ -259,16 +287,15 @@ class Slices {
       place[up] = this.centre[up] - (event.clientY - box.top - box.height / 2) / scale;
       return { place, scale };
     };
-    const voxel = (place) => {
-      const { shape, spacing, centre } = this.known;
-      return this.at.map((i, a) => (a === axis ? i : Math.floor((place[a] - centre[a]) / spacing[a] + shape[a] / 2)));
-    };
+    const voxel = (place) => this.voxelAt(place).map((i, a) => (a === axis ? this.at[axis] : i));
     const inside = (v) => v.every((i, a) => i >= 0 && i < this.known.shape[a]);
     canvas.addEventListener('pointerdown', (event) => {
       canvas.setPointerCapture(event.pointerId);
       canvas.focus({ preventScroll: true });
-      drag = { kind: event.button === 2 ? 'level' : event.shiftKey || event.button === 1 ? 'pan' : 'cross', x: event.clientX, y: event.clientY, window: [...this.window] };
-      if (drag.kind === 'cross') other.forEach((a) => this.move(a, voxel(placed(event).place)[a]));
+      drag = { kind: event.button === 2 ? 'level' : event.shiftKey || event.button === 1 ? 'pan' : this.tool, x: event.clientX, y: event.clientY, window: [...this.window] };
+      const { place } = placed(event);
+      if (drag.kind === 'cross') other.forEach((a) => this.move(a, voxel(place)[a]));
+      if (drag.kind === 'line' || drag.kind === 'region') this.marks[drag.kind] = { axis, from: place, to: place };
       event.preventDefault();
     });
     canvas.addEventListener('pointermove', (event) => {
@@ -278,6 +305,7 @@ class Slices {
       if (drag) {
         const [dx, dy] = [event.clientX - drag.x, event.clientY - drag.y];
         if (drag.kind === 'cross') other.forEach((a) => this.move(a, found[a]));
+        if (drag.kind === 'line' || drag.kind === 'region') this.marks[drag.kind] = { ...this.marks[drag.kind], to: place };
         if (drag.kind === 'pan') {
           this.centre[across] -= dx / scale;
           this.centre[up] += dy / scale;
@@ -322,6 +350,8 @@ class Slices {
         '=': () => this.zoomAt(1.25, here, [0, 1, 2]),
         '-': () => this.zoomAt(0.8, here, [0, 1, 2]),
         0: () => this.reset(),
+        a: () => this.markEnd(axis, 'from'),
+        b: () => this.markEnd(axis, 'to'),
       };
       if (event.ctrlKey || event.metaKey || event.altKey || !acts[event.key]) return;
       event.preventDefault();
@@ -412,6 +442,7 @@ class Slices {
     if (this.curtainSlider) this.curtainSlider.set(this.curtain, `${Math.round(this.curtain * 100)} %`);
     this.fillReadout(this.rows[0], this.at);
     this.fillReadout(this.rows[1], this.pointer);
+    this.probe.paint();
   }
 
   fillReadout(row, voxel) {
@@ -467,7 +498,26 @@ class Slices {
     };
     line(CROSSHAIR[across], cx, 0, cx, cy - gap, cx, cy + gap, cx, height);
     line(CROSSHAIR[up], 0, cy, cx - gap, cy, cx + gap, cy, width, cy);
+    this.paintMarks(pen, panel, ratio, x, y);
     this.paintLabels(pen, panel, ratio, scale);
+  }
+
+  paintMarks(pen, { axis, across, up }, ratio, x, y) {
+    for (const [kind, mark] of Object.entries(this.marks)) {
+      if (mark.axis !== axis) continue;
+      const [ax, ay, bx, by] = [x(mark.from[across]), y(mark.from[up]), x(mark.to[across]), y(mark.to[up])];
+      for (const [colour, width] of [['rgba(0, 0, 0, .8)', 4], ['#ffd54a', 2]]) {
+        pen.strokeStyle = colour;
+        pen.lineWidth = width * ratio;
+        pen.beginPath();
+        if (kind === 'region') pen.rect(Math.min(ax, bx), Math.min(ay, by), Math.abs(bx - ax), Math.abs(by - ay));
+        else {
+          pen.moveTo(ax, ay);
+          pen.lineTo(bx, by);
+        }
+        pen.stroke();
+      }
+    }
   }
 
   paintLabels(pen, panel, ratio, scale) {

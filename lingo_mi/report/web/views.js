@@ -28,6 +28,15 @@ class Views {
     this.slider = slider('View', 0, count - 1, 1, 0, (v) => this.move(v));
     this.slider.querySelector('input').style.width = '20rem';
     bar.append(this.slider);
+    this.most = (known.window[1] - known.window[0]) / 20;
+    if (known.reference !== null && rows > 1) {
+      const widest = known.window[1] - known.window[0];
+      this.differences = slider('Differences ±', widest / 500, widest / 2, widest / 500, this.most, (v) => {
+        this.most = v;
+        this.draw();
+      });
+      bar.append(this.differences);
+    }
     this.lines = rows === 1;
     this.grid = element('div', { class: 'grid' });
     const said = ['Views that no fit has seen, as line integrals ln(I0/I); v is down, as on the panel.'];
@@ -35,10 +44,14 @@ class Views {
     if (known.binning > 1) said.push(`Each pixel here is the mean of ${known.binning} × ${known.binning}.`);
     this.note = text('p', said.join(' '), { class: 'note' });
     this.byView = element('div', { class: 'chart' });
-    new ResizeObserver(() => this.paintByView()).observe(this.byView);
+    this.psnr = element('div', { class: 'chart' });
+    this.ofViews = element('div', { class: 'pair' });
+    this.ofViews.append(this.psnr, this.byView);
+    this.ofViews.hidden = !known.psnr && !known.residual;
+    new ResizeObserver(() => this.paintByView()).observe(this.ofViews);
     if (this.lines) {
       this.chart = element('div', { class: 'chart' });
-      this.root.replaceChildren(bar, this.chart, this.byView, this.note);
+      this.root.replaceChildren(bar, this.chart, this.ofViews, this.note);
       this.draw();
       return;
     }
@@ -54,7 +67,7 @@ class Views {
     }
     this.readout = text('p', ' ', { class: 'note', 'aria-live': 'polite' });
     this.scales = element('div', { class: 'scales' });
-    this.root.replaceChildren(bar, this.grid, this.scales, this.readout, this.byView, this.note);
+    this.root.replaceChildren(bar, this.grid, this.scales, this.readout, this.ofViews, this.note);
     new ResizeObserver(this.draw).observe(this.grid);
   }
 
@@ -106,10 +119,10 @@ class Views {
     const angle = `${known.angles[this.at].toFixed(1)}°`;
     this.slider.set(this.at, `${this.at + 1} of ${known.shape[0]}, at ${angle}`);
     if (this.lines) return this.paintLines();
-    const width = known.window[1] - known.window[0];
+    this.differences?.set(this.most, shown(this.most, this.most / 100));
     const colours = {
       value: pixelsOfCodes(this.maps.grey, this.images[0].array, ...known.window),
-      difference: pixelsOfDifferences(this.maps.difference, this.images[0].array.step, width / 20, false),
+      difference: pixelsOfDifferences(this.maps.difference, this.images[0].array.step, this.most, false),
     };
     const [, rows, columns] = known.shape;
     for (const panel of this.panels) {
@@ -132,11 +145,14 @@ class Views {
       panel.canvas.setAttribute('aria-label', `${panel.name} view at ${angle}`);
     }
     this.scales.replaceChildren(scaleBar(this.maps.grey, 'ln(I0/I)', ...known.window));
-    if (known.reference !== null) this.scales.append(scaleBar(this.maps.difference, 'difference', -width / 20, width / 20));
+    if (known.reference !== null) this.scales.append(scaleBar(this.maps.difference, 'difference', -this.most, this.most));
   }
 
   paintByView() {
-    const { residual } = this.known;
+    const { residual, psnr } = this.known;
+    this.psnr.hidden = !psnr;
+    this.byView.hidden = !residual || residual.rms.length < 3;
+    if (psnr) lineChart(this.psnr, 'view, by angle', psnr.map((_, i) => i + 1), [{ name: 'PSNR of the view [dB]', values: psnr }], { bars: true });
     if (!residual || residual.rms.length < 3) return;
     lineChart(this.byView, 'angle [°]', residual.angles, [{ name: 'Residual of the view, rms', values: residual.rms }]);
   }
