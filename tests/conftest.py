@@ -7,6 +7,12 @@ from pathlib import Path
 
 import pytest
 
+if hasattr(os, 'sched_setaffinity'):
+    # Processes of pytest-xdist share the cores: threads that wait for each other's cores take a third more time.
+    workers, own = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1')), sorted(os.sched_getaffinity(0))
+    if 1 < workers <= len(own):
+        os.sched_setaffinity(0, own[int(os.environ['PYTEST_XDIST_WORKER'].removeprefix('gw')) :: workers])
+
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
 from helpers.same import STAND_IN, adds_in_any_order
 
@@ -43,17 +49,10 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(scope='session', autouse=True)
 def variant() -> str:
-    """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test.
+    """The variant under test, LINGO_MI_TEST_VARIANT or llvm_ad_mono, active in every test."""
+    from lingo_mi.common.runtime import use_variant
 
-    Processes side by side share the cores, because threads that wait for each other's cores take a third more time. Commands that
-    tests run have all cores.
-    """
-    from lingo_mi.common.runtime import cores, use_threads, use_variant
-
-    name = use_variant(VARIANT)
-    if name.startswith('llvm'):
-        use_threads(max(1, cores() // int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))))
-    return name
+    return use_variant(VARIANT)
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from helpers.script import FIT
 from helpers.script import run as run_script
 from lingo_mi.common.errors import AccuracyWarning, InputError
+from lingo_mi.common.runtime import use_threads
 from lingo_mi.fitting.activations import inverse_scale, inverse_softplus, softplus
 from lingo_mi.fitting.densify import clone, densify, halve, split
 from lingo_mi.fitting.device_state import DeviceState
@@ -40,6 +41,15 @@ from studies.hard_cases.scans import adversarial, fit_to
 from studies.hard_cases.table import markdown, store, stored
 
 CASES = all_cases()
+
+
+@pytest.fixture(scope='module', autouse=True)
+def two_threads(variant):
+    """Sums of many Gaussians are split among the threads, so their errors are those of two threads or more."""
+    before = dr.thread_count()
+    use_threads(max(2, before))
+    yield
+    use_threads(before)
 
 
 def marked(case):
