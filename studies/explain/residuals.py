@@ -23,6 +23,7 @@ from lingo_mi.api.calibration import calibrate
 from lingo_mi.api.fitting import fit
 from lingo_mi.calibration.calibration import Calibration
 from lingo_mi.calibration.drift import Drift
+from lingo_mi.inspection.air import air_of
 from lingo_mi.projectors import grid
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.reconstruction import ASDPOCS, OSSART, run_algorithm
@@ -34,11 +35,12 @@ from studies.cell_files import CellFiles
 
 DRIFT = 3
 # What a row adds -> what the names of its numbers begin with.
+AIR = 'air level'
 ROWS = {
     'as given': (),
     'axis and turn of the panel': ('u', 'yaw'),
     'drift': ('u1', 'u2', 'u3', 'v1', 'v2', 'v3'),
-    'air level': ('air',),
+    AIR: ('air',),
     'gain': ('gain',),
     'curve': ('curve',),
     'scatter': ('scatter',),
@@ -87,16 +89,20 @@ def rows(
 ) -> Iterable[Explained]:
     """The table's rows on voxels, by ASD-POCS, stored below `folder`. The calibration is of `dataset.train`."""
     numbers, names, stored = calibration.found.measured, set(), _Stored(folder, 'corrected', dataset)
+    air, read = None, {}  # read beside the object, and subtracted from its row on
     for name, prefixes in ROWS.items():
+        if name == AIR and calibration.air is not None:
+            air = calibration.air
+            read = dict(read=air.levels.tolist())
         more = {k for k in numbers if k in prefixes or k.rstrip('0123456789_') in prefixes and k[0] not in 'uvy'}
-        if prefixes and not more:
+        if prefixes and not more and not (name == AIR and air):
             continue
         names |= more
         progress(name)
         some = {k: numbers[k] for k in sorted(names)}
-        yield stored.row(name, some, lambda: _judged(name, dataset, _with(calibration, some)))
+        yield stored.row(name, some | read, lambda: _judged(name, dataset, _with(calibration, some, air)))
     progress(NOTHING)
-    yield stored.row(NOTHING, {}, lambda: _judged(NOTHING, _ideal(dataset), _with(calibration, {})))
+    yield stored.row(NOTHING, {}, lambda: _judged(NOTHING, _ideal(dataset), _with(calibration, {}, None)))
 
 
 def cloud_rows(
@@ -159,12 +165,14 @@ class _Stored:
         return Explained(name, found['rms'], np.array(found['view'], np.float32))
 
 
-def _with(calibration, numbers):
-    """A calibration with these numbers alone."""
+def _with(calibration, numbers, air):
+    """A calibration with these numbers, and this air read beside the object, alone."""
     found = calibration.found
     places = {k: v for k, v in numbers.items() if k[0] in 'uvy'}
     response = None if found.response is None else found.response.changed(numbers)
-    return replace(calibration, found=replace(found, drift=Drift.of(found.drift.scan, places), response=response))
+    return replace(
+        calibration, air=air, found=replace(found, drift=Drift.of(found.drift.scan, places), response=response)
+    )
 
 
 def _judged(name, dataset, calibration):
@@ -173,7 +181,8 @@ def _judged(name, dataset, calibration):
     expected = grid.project_volume(volume, corrected.test.geometry)
     if calibration.found.response is not None:
         expected = calibration.found.response.applied(expected, dataset.test.geometry)
-    return _row(name, dataset.test, expected)
+    level = None if calibration.air is None else air_of(dataset.test)
+    return _row(name, dataset.test, expected if level is None else expected + level.image(expected.shape[1:]))
 
 
 def _row(name, test, expected):

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import lingo_mi as lm
 from lingo_mi.calibration.drift import Drift
@@ -33,6 +34,19 @@ def test_a_drift_is_what_explains_it(tmp_path):
     text = explain.report(found, tmp_path, 'corrected')
     assert text.count('\n') >= 5 and json.loads((tmp_path / 'rms.json').read_text())['drift'] == found[2].rms
     assert (tmp_path / 'residuals.png').stat().st_size > 1000 and (tmp_path / 'rms.provenance.json').exists()
+
+
+def test_air_that_is_read_beside_the_object_is_a_row(tmp_path):
+    """It is in the held-out views, too, and in no earlier row."""
+    sound, air = fan(24), np.float32(0.1)
+    dataset = lm.Dataset(*(lm.Scan(s.geometry, s.projections + air) for s in (sound.train, sound.test)))
+    calibration = lm.calibrate(dataset, progress=False)
+    assert calibration.air is not None
+    found = {row.name: row.rms for row in explain.rows(dataset, calibration, tmp_path, progress=lambda name: None)}
+    assert list(found) == ['as given', 'axis and turn of the panel', explain.AIR, explain.NOTHING]
+    assert found[explain.AIR] < 0.8 * found['axis and turn of the panel']
+    quiet = {r.name: r.rms for r in explain.rows(sound, replace(calibration, air=None), tmp_path, lambda name: None)}
+    assert found[explain.AIR] == pytest.approx(quiet['axis and turn of the panel'], rel=0.02)
 
 
 def test_stored_rows_are_those_of_their_scan_and_numbers(tmp_path, monkeypatch):
