@@ -97,7 +97,7 @@ class Probe {
         return voxel.every((v, a) => v >= 0 && v < shape[a]) ? slices.value(l.i, slices.index(voxel)) : null;
       }),
     }));
-    lineChart(this.profile, this.along < 3 ? `${AXES[this.along]} [mm], density [1/mm]` : 'along the line [mm], density [1/mm]', x, lines, { height: 200 });
+    lineChart(this.profile, `${this.along < 3 ? AXES[this.along] : 'along the line'} [mm], ${slices.known.quantity}`, x, lines, { height: 200 });
     const written = (p) => p.map((v) => v.toFixed(1)).join(', ');
     this.said.textContent = `From (${written(from)}) to (${written(to)}) mm, ${length.toFixed(1)} mm: the values of the voxels there, without interpolation.`;
   }
@@ -141,7 +141,7 @@ class Probe {
     });
     const [name] = PLANES[region.axis];
     const mm = sides.map((a, k) => (size[k] * spacing[a]).toFixed(1)).join(' × ');
-    const caption = `Region of the ${name.toLowerCase()} slice: ${mm} mm, ${size.join(' × ')} voxels; density in 1/mm`;
+    const caption = `Region of the ${name.toLowerCase()} slice: ${mm} mm, ${size.join(' × ')} voxels; ${slices.known.quantity}`;
     this.table.replaceChildren(text('caption', caption, { style: 'text-align: left; color: var(--soft)' }), top, ...made);
   }
 
@@ -159,6 +159,6 @@ class Probe {
     });
     this.counts = lines;
     const x = Array.from({ length: BINS }, (_, i) => low + (i + 0.5) * width);
-    lineChart(this.histogram, 'density [1/mm], voxels on a logarithmic scale', x, lines, { height: 200, log: true, gaps: true });
+    lineChart(this.histogram, `${slices.known.quantity}, voxels on a logarithmic scale`, x, lines, { height: 200, log: true, gaps: true });
   }
 }
