@@ -10,13 +10,20 @@ function lineChart(root, label, x, lines, { height = 170, log = false, bars = fa
   const grid = { stroke: colourOf('--line'), width: 1 };
   const number = (v) => (v === null || v === undefined ? '–' : shown(v, Math.abs(v) >= 1000 ? 1 : 0));
   const axis = { stroke: ink, grid, ticks: grid, font: '12px system-ui, sans-serif' };
+  const decades = (_, splits) => splits.map((v) => (Number.isInteger(Math.log10(v)) ? v : null));
+  const powers = {
+    filter: decades,
+    grid: { ...grid, filter: decades },
+    ticks: { ...grid, filter: decades },
+    values: (_, splits) => splits.map((v) => v?.toLocaleString('en', { notation: 'compact' }) ?? ''),
+  };
   const width = Math.max(240, root.clientWidth);
   const options = {
     width,
     height,
     cursor: { drag: { x: false, y: false } },
     scales: { x: { time: false, ...(bars ? { range: (_, a, b) => [a - 0.6, b + 0.6] } : {}) }, y: log ? { distr: 3 } : bars ? { range: (_, a, b) => [Math.min(0, a), b * 1.05] } : {} },
-    axes: [{ ...axis, label, labelFont: '12px system-ui, sans-serif', labelSize: 20, size: 30 }, { ...axis, size: 74 }],
+    axes: [{ ...axis, label, labelFont: '12px system-ui, sans-serif', labelSize: 20, size: 30 }, { ...axis, size: 74, ...(log ? powers : {}) }],
     series: [
       { label, value: (_, v) => number(v) },
       ...lines.map((l, i) => ({

@@ -97,7 +97,7 @@ class Slices {
     const preview = known.preview > 1 ? ` A preview: each voxel here is the mean of ${known.preview}³ of the volume's.` : '';
     const compared = this.layers.some((l) => l.kind === 'difference') ? ' Difference: red is too dense, blue too thin.' : '';
     const mapped = this.errorMaps.length ? ' Error map: bright where the volume is least certain; it ranks voxels, and is not the size of their errors.' : '';
-    this.note = text('p', `Axes are the scanner's, in mm; z is the axis of rotation. Values are stored in steps of ${step0.toExponential(1)} per mm.${compared}${mapped}${preview}`, { class: 'note' });
+    this.note = text('p', `Axes are the scanner's, in mm; z is the axis of rotation. Values are stored in steps of ${step0.toExponential(1)}.${compared}${mapped}${preview}`, { class: 'note' });
     this.probe = new Probe(this);
     this.root.replaceChildren(bar, this.grid, places, this.scales, scroll, this.note, this.probe.root);
     this.arrange(0);
