@@ -20,6 +20,11 @@ NEEDS = {
     '14_odl': ('odl',),
     '15_unrolled': ('torch',),
 }
+QUICK = '01_first_fit', '06_spectrum_and_detector', '08_mitsuba_scene', '09_gradient_check'
+
+
+def marked(path):
+    return pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.thorough)
 
 
 def is_name(node):
@@ -31,7 +36,7 @@ def test_there_are_examples():
     assert len(EXAMPLES) >= 8
 
 
-@pytest.mark.parametrize('path', EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', map(marked, EXAMPLES))
 def test_example(path, variant, monkeypatch, tmp_path):
     """Without an error, with something to see in each, and without a warning of matplotlib or NumPy."""
     for module in NEEDS.get(path.stem, ()):

@@ -136,7 +136,8 @@ def complete_views(scan: Scan, fit: Fit, views: int) -> Scan:
     InputError
         For fewer views than were measured, for more than a scan may have, and for a scan that is not a circle about z.
     """
-    at_turns(scan.geometry, np.zeros(1))  # fails early
+    at_turns(scan.geometry, np.zeros(1))  # fails early, as does the next line
+    require_pixels(scan, 'the completion of a scan')
     if views > MOST_VIEWS:
         raise InputError(f'{views} views were asked for, but a scan has at most {MOST_VIEWS}')
     check_memory(scan.geometry.on(scan.geometry.grid.slab(0, 1)), views=views)  # of the views: no volume is made here

@@ -403,6 +403,7 @@ def test_examples_of_the_docstrings_name_what_exists():
     assert {word.removeprefix('lm.').split('.')[0].strip('(),') for word in used} <= set(lm.__all__)
 
 
+@pytest.mark.thorough
 def test_a_result_with_modelled_effects_is_loaded(tmp_path):
     """A checkpoint does not keep them; the result.xml beside it does."""
     sizes = dict(pixels=24, pixel_size=12, voxels=16, voxel_size=2.4)

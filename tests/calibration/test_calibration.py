@@ -170,6 +170,7 @@ def test_drift_is_found_and_held_out_views_get_theirs():
         assert np.linalg.norm(error, axis=1).max() < 0.1 * pixel
 
 
+@pytest.mark.thorough
 def test_a_sound_scan_is_left_as_it_is():
     geometry, data = scanner(30)
     scan = scanned(geometry, data, Panel())
@@ -196,6 +197,7 @@ def responding(numbers, **parts):
     return lm.Scan(geometry, response.applied(p, geometry)), p
 
 
+@pytest.mark.thorough
 def test_curve_of_the_detector():
     """A fifth of the highest line integral is missing: three quarters of the error go, and a coefficient is told to 0.03."""
     scan, p = responding({'curve0': -0.08}, curve=1)
@@ -204,6 +206,7 @@ def test_curve_of_the_detector():
     assert np.std(found.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
 
 
+@pytest.mark.thorough
 def test_gain_over_time():
     """A gain that falls and rises by 4 %: its polynomials to 0.01."""
     true = dict(gain1=-0.02, gain2=0.02, gain3=0.0)
@@ -213,6 +216,7 @@ def test_gain_over_time():
     assert np.std(found.corrected(scan).projections - p) < 0.5 * np.std(scan.projections - p)
 
 
+@pytest.mark.thorough
 def test_scattered_light_is_not_negative():
     """Light that is missing, most of it in the panel's middle, is no scatter: the scan stays as it is, and the lines say why."""
     scan, _ = responding({'scatter0_0': -0.02, 'scatter0_3': 0.01}, scatter='one')
@@ -309,6 +313,7 @@ def test_bad_input():
         lm.calibrate(lm.Scan(geometry, np.zeros_like(scan.projections)))
 
 
+@pytest.mark.thorough
 def test_a_drift_that_no_view_shows_is_not_found():
     """A rod along the axis looks the same however high the panel is."""
     geometry = lm.Geometry.parallel(

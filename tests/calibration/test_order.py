@@ -83,6 +83,7 @@ def test_a_first_view_out_of_place():
     assert fault.startswith('view 0: ')
 
 
+@pytest.mark.thorough
 def test_a_calibration_warns(foot):
     with pytest.warns(UserWarning, match='with reversed angles'):
         lm.calibrate(placed(foot, np.arange(24)[::-1]), progress=False)

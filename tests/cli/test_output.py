@@ -41,6 +41,7 @@ def refused(code, err, *words):
     assert len(err) < 308 and all(word in err for word in words), err
 
 
+@pytest.mark.thorough
 def test_force_leaves_foreign_files_alone(scene, result):
     mine = [result / '.writable', result / 'views' / 'mine.exr', result / 'metrics.json.partial', result / 'notes']
     for path in mine:
@@ -106,6 +107,7 @@ def test_one_writer_at_a_time(scene, result, tmp_path):
     assert contents(result) == before
 
 
+@pytest.mark.thorough
 def test_a_killed_fit_holds_no_lock(scene, tmp_path):
     long = scene, '--iterations', '1000000', '-D', 'n_points=100', '--out', tmp_path / 'a'
     process = fit_process(*long, '-D', 'checkpoint_seconds=0')

@@ -220,6 +220,7 @@ print(before, peak())
 
 
 @pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
+@pytest.mark.thorough
 def test_memory_is_that_of_a_slab(tmp_path):
     """A volume of sixteen times the slices, 134 MB, takes no more."""
     command = [sys.executable, '-c', PROGRAM, str(tmp_path), '512']

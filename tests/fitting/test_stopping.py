@@ -42,6 +42,7 @@ def whole(scan):
     return run(scan, METHOD, seed=3)
 
 
+@pytest.mark.thorough
 def test_it_stops_at_the_step_of_the_least_error(whole):
     errors, steps = whole.search['errors'], whole.search['iterations']
     assert steps == list(range(10, steps[-1] + 1, 10)) and steps[-1] == whole.steps + 30 < 160

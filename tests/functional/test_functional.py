@@ -277,6 +277,7 @@ def test_within_a_jitted_function_of_jax():
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6 * (np.abs(b).max() if adds_in_any_order() else 1))
 
 
+@pytest.mark.thorough
 def test_a_training_loop_in_torch():
     """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
     torch = framework('torch')

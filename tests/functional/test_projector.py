@@ -191,6 +191,7 @@ def test_tensors_of_other_types_and_layouts():
     torch.testing.assert_close(A(t) + 1, out)
 
 
+@pytest.mark.thorough
 def test_within_torch_compile():
     torch = framework('torch')
     A = Projector(GEOMETRIES['cone'])
@@ -454,6 +455,7 @@ if __name__ == '__main__':
 
 
 @pytest.mark.skipif(not hasattr(os, 'fork'), reason='there is no fork here')
+@pytest.mark.thorough
 def test_workers_of_a_data_loader(tmp_path):
     framework('torch')
     program = tmp_path / 'loaded.py'

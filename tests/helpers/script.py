@@ -49,7 +49,7 @@ _build = functools.lru_cache(foot.build)
 def _foot(size, seed):
     """The foot, made once: it takes a second, even of 24 voxels a side, and hundreds of commands start with it."""
     data, *rest = _build(size, seed)
-    return data.copy(), *rest
+    return data.copy('K'), *rest
 
 
 def fit(*args, report=False):

@@ -134,6 +134,7 @@ def write_his(path, image):
     path.write_bytes(bytes(header) + image.astype('<u2').tobytes())
 
 
+@pytest.mark.thorough
 def test_frames_that_rtk_reads(tmp_path):
     pytest.importorskip('itk')
     frames = np.random.default_rng(0).integers(0, 60_000, (11, 8, 8))

@@ -80,6 +80,7 @@ def test_the_score_is_the_error_of_the_volume_smooth_or_not():
     assert measure(system.start(truth)) < 1e-4  # float32
 
 
+@pytest.mark.thorough
 def test_finer_voxels_for_finer_objects_only():
     for parts in (1, 2):
         scan, truth = scanned(parts)
@@ -130,6 +131,7 @@ def test_a_cloud_needs_a_fit():
         run_algorithm(scanned(1)[0], Best(cloud=True))
 
 
+@pytest.mark.thorough
 def test_the_cloud_is_fitted():
     scan, truth = scanned(2)
     found = lm.reconstruct(scan, Best(niter=3, cloud=True), progress=False)
@@ -137,6 +139,7 @@ def test_the_cloud_is_fitted():
     assert psnr_3d(found.volume, truth) > 30
 
 
+@pytest.mark.thorough
 def test_noise_stops_it_early():
     clean, noisy = (run_algorithm(scanned(1, photons)[0], Best(niter=8)) for photons in (0, 300.0))
     assert noisy.plan[0].niter < clean.plan[0].niter
@@ -154,6 +157,7 @@ def test_with_noise_a_cloud_gets_more_total_variation_too():
     assert best.smooth and found.plan[-1].smooth and found.plan[-1].name == 'refined, smooth, cloud'
 
 
+@pytest.mark.thorough
 def test_the_plan_is_told_and_can_be_kept():
     scan, _ = scanned(1)
     found = run_algorithm(scan, Best(niter=2, finer=1))
@@ -192,6 +196,7 @@ def finer_scan():
     return scan.subset(np.arange(0, 20, 2)), scan.subset(np.arange(1, 20, 2)), truth
 
 
+@pytest.mark.thorough
 def test_values_predict_views_and_means_the_truth(finer_scan):
     """The numbers cannot be good at both: see docs/how_to/best.md."""
     scan, rest, truth = finer_scan

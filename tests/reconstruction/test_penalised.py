@@ -26,7 +26,7 @@ def variation(z):
     return np.sqrt(sum(x**2 for x in d)).sum()
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', [pytest.param('cone', marks=pytest.mark.thorough), 'parallel'])
 def test_a_ball(mode):
     geo = geometry(mode, circular(40, start=3))
     found = run_algorithm(ellipsoids(geo, BALL), PenalisedLeastSquares(strength=1e-4, niter=150))
@@ -65,6 +65,7 @@ def test_the_minimum_does_not_depend_on_the_start(scan):
         assert cost(np.maximum(a + size * truth.max() * rng.normal(size=a.shape), 0)) > least
 
 
+@pytest.mark.thorough
 def test_the_strength_is_chosen(scan):
     """Near the best one of the path, of which the truth knows."""
     scan, truth = scan

@@ -348,6 +348,7 @@ def test_presets_are_described_as_measured(variant):
     assert described == measured and list(measured) == list(PRESETS)
 
 
+@pytest.mark.thorough
 def test_presets_of_two_variants(tmp_path, monkeypatch):
     """The presets alone, by the command: their table with another run's errors, in place of that of the document."""
     found = measure_presets(TINY)

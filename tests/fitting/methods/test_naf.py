@@ -71,6 +71,7 @@ def test_the_published_start_is_half_the_largest_density(scan):
     assert begun.model.unit == 1
 
 
+@pytest.mark.thorough
 def test_from_half_the_largest_density_the_field_is_lost_at_first(learnt):
     """It falls to 0, where the sigmoid has no slope; from the scan's mean, as many steps suffice."""
     scan, fitted = learnt
